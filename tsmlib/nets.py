@@ -1,0 +1,165 @@
+"""Building blocks of the segment models: gated causal layers (Eq. 1), a convolutional encoder, and features. No physics.
+
+Letters in shapes: B batch, P positions in time, C channels, dz latent size.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class GatedLayer(nn.Module):
+    """One dilated causal layer with the gated activation of Eq. 1, a residual and a skip connection.
+
+        h = tanh(W_f * s + V_f z) . sigmoid(W_g * s + V_g z)
+
+    The convolution has two taps, s_{t-d} and s_t. Written as one matrix product over both, the same function serves
+    all positions at once (B, P, C) and a single position (B, C), which is what keeps the two decoding paths equal.
+    """
+
+    def __init__(self, channels: int, dilation: int) -> None:
+        super().__init__()
+        self.dilation = dilation
+        self.taps = nn.Linear(2 * channels, 2 * channels)  # W_f and W_g
+        self.out = nn.Linear(channels, 2 * channels)  # 1x1: residual and skip
+
+    def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
+        filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
+        residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
+        return now + residual, skip
+
+
+Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (B, C), oldest first
+
+
+class CausalDecoder(nn.Module):
+    """P(output | inputs up to now, z): a stack of gated layers whose output at a position sees no later position.
+
+    ``forward`` decodes all positions at once; ``begin`` and ``step`` decode one by one with cached activations, for
+    inputs that depend on earlier outputs. Both compute the same numbers. Receptive field: 1 + sum(dilations).
+    """
+
+    def __init__(
+        self,
+        input_dim: int,
+        output_dim: int,
+        latent_dim: int,
+        *,
+        channels: int = 32,
+        head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
+        dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
+    ) -> None:
+        super().__init__()
+        self.inlet = nn.Linear(input_dim, channels)
+        self.layers = nn.ModuleList(GatedLayer(channels, d) for d in dilations)
+        self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
+        head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
+        self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
+
+    def forward(self, inputs: Tensor, z: Tensor) -> Tensor:
+        """(B, P, input_dim), (B, dz) -> (B, P, output_dim)."""
+        outputs, _ = self._parallel(inputs, z)
+        return outputs
+
+    def begin(self, inputs: Tensor, z: Tensor) -> Cache:
+        """The cache after the known inputs (B, P, input_dim), P >= 0."""
+        _, layer_inputs = self._parallel(inputs, z)
+        return [
+            list(F.pad(s, (0, 0, layer.dilation, 0))[:, -layer.dilation :].unbind(1))
+            for layer, s in zip(self.layers, layer_inputs, strict=True)
+        ]
+
+    def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
+        """One position: (B, input_dim) and ``self.codes(z)`` -> (B, output_dim). Moves ``cache`` one position on."""
+        s = self.inlet(inputs)  # (B, C)
+        total = None
+        for layer, code, window in zip(self.layers, codes.chunk(len(self.layers), dim=-1), cache, strict=True):
+            window.append(s)
+            s, skip = layer(window.pop(0), s, code)
+            total = skip if total is None else total + skip
+        return self.head(total)
+
+    def _parallel(self, inputs: Tensor, z: Tensor) -> tuple[Tensor, list[Tensor]]:
+        s = self.inlet(inputs)  # (B, P, C)
+        layer_inputs, total = [], torch.zeros_like(s)
+        for layer, code in zip(self.layers, self.codes(z)[:, None].chunk(len(self.layers), dim=-1), strict=True):
+            layer_inputs.append(s)
+            earlier = F.pad(s, (0, 0, layer.dilation, 0))[:, : s.shape[1]]
+            s, skip = layer(earlier, s, code)
+            total = total + skip
+        return self.head(total), layer_inputs
+
+
+class Encoder(nn.Module):
+    """Q(Z | segment): 1-D convolutions over time with ReLU, flattened and projected to mean and log variance."""
+
+    def __init__(self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv1d(input_dim, channels, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv1d(channels, channels, 3, padding=1),
+            nn.ReLU(),
+        )
+        self.project = nn.Linear(channels * segment_len, 2 * latent_dim)
+
+    def forward(self, segment: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, H, input_dim) -> mean and log variance of Z, (B, dz) each."""
+        mean, log_variance = self.project(self.convolutions(segment.transpose(1, 2)).flatten(1)).chunk(2, dim=-1)
+        return mean, log_variance
+
+
+def sample_posterior(mean: Tensor, log_variance: Tensor, generator: torch.Generator | None) -> Tensor:
+    """z ~ N(mean, variance) by the reparametrisation trick; the mean itself where there is no generator."""
+    if generator is None:
+        return mean
+    noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+    return mean + (0.5 * log_variance).exp() * noise
+
+
+def kl_from_standard_normal(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(N(mean, variance) || N(0, I)) in nats, summed over the last dimension."""
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
+
+
+class Features(nn.Module):
+    """Physical states as networks and scores see them: angles as cosine and sine, everything standardised.
+
+    The statistics come from training data by ``fit`` and travel with the model. A state dimension that never changes
+    within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out.
+    """
+
+    def __init__(self, state_dim: int, angles: tuple[int, ...]) -> None:
+        super().__init__()
+        self.angles = list(angles)
+        self.others = [d for d in range(state_dim) if d not in angles]
+        self.dim = state_dim + len(angles)
+        self.register_buffer("mean", torch.zeros(self.dim))
+        self.register_buffer("std", torch.ones(self.dim))
+        self.register_buffer("step_std", torch.ones(state_dim))  # of x_{t+1} - x_t, physical units
+
+    def fit(self, states: Tensor) -> Features:
+        """Take the statistics of training states (N, T + 1, dx)."""
+        raw = self._raw(states).flatten(0, 1)
+        self.mean.copy_(raw.mean(0))
+        std = raw.std(0)
+        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+        self.step_std.copy_(states.diff(dim=1).flatten(0, 1).std(0))
+        return self
+
+    @property
+    def scored(self) -> Tensor:
+        """(dim,) bool: features that change within an episode."""
+        moving = self.step_std > 1e-9
+        return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
+
+    def forward(self, states: Tensor) -> Tensor:
+        """(..., dx) -> (..., dim): cosines, sines, the rest; zero mean and unit variance on the training data."""
+        return (self._raw(states) - self.mean) / self.std
+
+    def _raw(self, states: Tensor) -> Tensor:
+        angles = states[..., self.angles]
+        return torch.cat([angles.cos(), angles.sin(), states[..., self.others]], dim=-1)
