@@ -1,0 +1,426 @@
+"""Artefacts: what is written is read back exactly, and nothing damaged, foreign or ill-fitting is ever accepted."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import random
+import resource
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from tsmlib import store
+from tsmlib.store import StoreError
+from tsmlib.trajectory import Trajectories
+
+NAMES = ("joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y")
+UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m")
+
+
+def some_trajectories(n: int = 3, steps: int = 5) -> Trajectories:
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(n, steps + 1, 6)).astype(np.float32)
+    actions = rng.uniform(-1, 1, size=(n, steps, 2)).astype(np.float32)
+    return Trajectories(states, actions, "tsm/Reacher-v0", 0.02, NAMES, UNITS)
+
+
+class Line(torch.nn.Module):
+    def __init__(self, *, inputs: int, outputs: int = 1) -> None:
+        super().__init__()
+        self.inputs, self.outputs = inputs, outputs
+        self.linear = torch.nn.Linear(inputs, outputs)
+
+    def config(self) -> dict[str, Any]:
+        return {"inputs": self.inputs, "outputs": self.outputs}
+
+
+class Curve(Line):
+    pass
+
+
+FINGERPRINT = {"env": "tsm/Reacher-v0", "names": NAMES, "dt": 0.02}
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "thing.safetensors"
+    tensors = {"a": torch.arange(6.0).reshape(2, 3), "n": torch.tensor([3])}
+    store.save(path, tensors, kind="thing", header={"seed": 7})
+    return path
+
+
+# What goes in comes out ----------------------------------------------------------------------------------------------
+
+
+def test_arrays_and_header_come_back_as_they_were(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "er" / "x.safetensors"
+    header = {"seed": 7, "text": 'quotes " and "tsmlib":"{\\"sha256\\":\\"', "nested": {"list": [1, 2.5, None]}}
+    tensors = {"a": torch.randn(3, 4), "b": np.arange(5), "c": np.float32(2.0) * np.ones((2, 0)), "d": torch.ones(())}
+    store.save(path, tensors, kind="thing", header=header)
+    found, found_header = store.load(path, kind="thing")
+    assert found_header == header == store.read_header(path)
+    assert set(found) == set(tensors)
+    for name, value in tensors.items():
+        assert torch.equal(found[name], torch.as_tensor(value))
+        assert found[name].dtype == torch.as_tensor(value).dtype
+
+
+def test_a_view_is_stored_as_its_own_values(tmp_path: Path) -> None:
+    whole = torch.arange(12.0).reshape(3, 4)
+    store.save(tmp_path / "x.safetensors", {"t": whole.T, "row": whole[1]}, kind="k", header={})
+    found, _ = store.load(tmp_path / "x.safetensors", kind="k")
+    assert torch.equal(found["t"], whole.T)
+    assert torch.equal(found["row"], whole[1])
+
+
+def test_any_safetensors_reader_opens_an_artefact(saved: Path) -> None:
+    assert torch.equal(safetensors.torch.load_file(saved)["n"], torch.tensor([3]))
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("x", "y"):
+        store.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories(), {"seed": 1})
+    assert store.sha256(tmp_path / "x.safetensors") == store.sha256(tmp_path / "y.safetensors")
+
+
+def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
+    before = some_trajectories()
+    store.save_trajectories(tmp_path / "x.safetensors", before, {"seed": 1})
+    after = store.load_trajectories(tmp_path / "x.safetensors", env="tsm/Reacher-v0")
+    np.testing.assert_array_equal(after.states, before.states)
+    np.testing.assert_array_equal(after.actions, before.actions)
+    assert after.states.dtype == after.actions.dtype == np.float32
+    assert (after.env, after.dt, after.names, after.units, after.angles) == (
+        (before.env, before.dt, before.names, before.units, before.angles)
+    )
+
+
+def test_a_loaded_model_computes_the_same(tmp_path: Path) -> None:
+    model = Line(inputs=3, outputs=2)
+    store.save_model(tmp_path / "m.safetensors", model, {"fingerprint": FINGERPRINT})
+    again = store.load_model(tmp_path / "m.safetensors", Line, expect=FINGERPRINT)
+    x = torch.randn(4, 3)
+    assert torch.equal(model.linear(x), again.linear(x))
+
+
+def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
+    rows = [
+        {"env": "tsm/Reacher-v0", "metric": "success", "value": np.float32(0.5), "n": 100, "seed": np.int64(0)},
+        {"env": 'a "b", c', "metric": "return_true", "value": -1e-30, "target": 3},
+    ]
+    store.save_table(tmp_path / "t.csv", rows, extra=("target",))
+    found = store.load_table(tmp_path / "t.csv")
+    assert found[0]["value"] == 0.5
+    assert found[0]["n"] == 100
+    assert found[0]["horizon"] == found[0]["target"] == ""
+    assert found[1]["env"] == rows[1]["env"]
+    assert found[1]["value"] == -1e-30
+    assert found[1]["target"] == 3
+
+
+def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
+    value = {"b": [1, 2.5, None, "ü"], "a": {}}
+    store.write_json(tmp_path / "x.json", value)
+    assert store.read_json(tmp_path / "x.json") == value
+
+
+# Damage is found -----------------------------------------------------------------------------------------------------
+
+
+def damage_is_refused(path: Path, damaged: bytes, load: Callable[[Path], Any]) -> None:
+    path.write_bytes(damaged)
+    with pytest.raises(StoreError, match=path.name):
+        load(path)
+
+
+def loaders(tmp_path: Path) -> dict[Path, Callable[[Path], Any]]:
+    """One artefact of each kind, and what loads it."""
+    trajectories, model, table = (tmp_path / name for name in ("t.safetensors", "m.safetensors", "shipped/x.csv"))
+    store.save_trajectories(trajectories, some_trajectories(), {"seed": 1})
+    store.save_model(model, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    store.save_table(table, [{"metric": "success", "value": 0.5}])
+    store.write_manifest(table.parent)
+    return {
+        trajectories: store.load_trajectories,
+        model: lambda path: store.load_model(path, Line),
+        table: store.load_table,
+    }
+
+
+@pytest.mark.parametrize("which", [0, 1, 2], ids=["trajectories", "model", "table"])
+def test_no_flipped_bit_goes_unnoticed(tmp_path: Path, which: int) -> None:
+    path, load = list(loaders(tmp_path).items())[which]
+    data, rng = path.read_bytes(), random.Random(0)
+    header = range(min(8 * 400, 8 * len(data)))  # most of the ways to go wrong are here
+    for bit in rng.sample(header, 400) + rng.sample(range(8 * len(data)), min(400, 8 * len(data))):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        damage_is_refused(path, bytes(flipped), load)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2], ids=["trajectories", "model", "table"])
+def test_no_cut_append_or_zeroed_block_goes_unnoticed(tmp_path: Path, which: int) -> None:
+    path, load = list(loaders(tmp_path).items())[which]
+    data = path.read_bytes()
+    for length in range(0, len(data), max(1, len(data) // 100)):
+        damage_is_refused(path, data[:length], load)
+    for tail in (b"\0", b"\n", b" ", data):
+        damage_is_refused(path, data + tail, load)
+    for start in range(0, len(data) - 16, max(16, len(data) // 50)):
+        if any(data[start : start + 16]):
+            damage_is_refused(path, data[:start] + bytes(16) + data[start + 16 :], load)
+
+
+def test_a_flipped_bit_in_a_manifest_is_found(tmp_path: Path) -> None:
+    store.save_table(tmp_path / "x.csv", [{"metric": "success", "value": 0.5}])
+    store.write_manifest(tmp_path)
+    manifest = tmp_path / store.MANIFEST
+    data = manifest.read_bytes()
+    for bit in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        damage_is_refused(manifest, bytes(flipped), lambda _: store.verify(tmp_path))
+
+
+def test_a_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.safetensors"
+    safetensors.torch.save_file({"a": torch.ones(2)}, path)
+    with pytest.raises(StoreError, match="not written by tsmlib"):
+        store.load(path, kind="thing")
+
+
+def test_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
+    class Payload:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return os.mkdir, (str(tmp_path / "canary"),)
+
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(pickle.dumps({"weights": Payload()}))
+    with pytest.raises(StoreError, match=r"x\.safetensors"):
+        store.load(path, kind="model")
+    assert not (tmp_path / "canary").exists()
+
+
+def test_loading_starts_no_process_and_opens_no_connection(tmp_path: Path) -> None:
+    artefacts = loaders(tmp_path)
+    seen: list[str] = []
+    listening = True
+
+    def hook(event: str, _: tuple[Any, ...]) -> None:
+        if listening and event.startswith(("pickle.", "os.system", "subprocess.", "socket.", "exec", "compile")):
+            seen.append(event)
+
+    sys.addaudithook(hook)
+    for path, load in artefacts.items():
+        load(path)
+    listening = False
+    assert not seen
+
+
+# What does not fit is refused ----------------------------------------------------------------------------------------
+
+
+def test_a_missing_file_names_the_command_that_makes_it(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"none\.safetensors does not exist.*python -m tsmlib run collect"):
+        store.load_trajectories(tmp_path / "none.safetensors")
+
+
+def test_another_kind_is_refused(saved: Path) -> None:
+    with pytest.raises(StoreError, match="holds 'thing', expected 'trajectories'"):
+        store.load_trajectories(saved)
+
+
+def test_trajectories_of_another_environment_are_refused(tmp_path: Path) -> None:
+    store.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
+    with pytest.raises(StoreError, match="of tsm/Reacher-v0, expected tsm/ReacherPush-v0"):
+        store.load_trajectories(tmp_path / "x.safetensors", env="tsm/ReacherPush-v0")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_is_neither_written_nor_read(
+    tmp_path: Path, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, array = tmp_path / "x.safetensors", np.ones((2, 3))
+    array[1, 2] = value
+    with pytest.raises(StoreError, match=r"'w' for .*not finite, the first at index \(1, 2\)"):
+        store.save(path, {"w": array}, kind="model", header={})
+    assert not any(tmp_path.iterdir())
+    with monkeypatch.context() as patch:  # a file that someone else made
+        patch.setattr(store, "_require_finite", lambda *_: None)
+        store.save(path, {"w": array}, kind="model", header={})
+    with pytest.raises(StoreError, match=r"index \(1, 2\)"):
+        store.load(path, kind="model")
+
+
+def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    wrong = {**FINGERPRINT, "env": "tsm/ReacherPush-v0", "past_len": 10}
+    with pytest.raises(StoreError) as caught:
+        store.load_model(path, Line, expect=wrong)
+    message = str(caught.value)
+    assert "env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'" in message
+    assert "past_len is 'not stated' in the file, expected 10" in message
+    assert "dt is" not in message
+
+
+def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    store.save_model(path, Line(inputs=3))
+    with pytest.raises(StoreError, match="holds a Line, expected a Curve"):
+        store.load_model(path, Curve)
+    tensors, header = store.load(path, kind="model")
+    store.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
+    with pytest.raises(StoreError, match="does not fit the present Line"):
+        store.load_model(path, Line)
+    store.save(path, tensors, kind="model", header={**header, "config": {"colour": 4}})
+    with pytest.raises(StoreError, match="does not fit the present Line"):
+        store.load_model(path, Line)
+
+
+def test_a_header_that_is_not_json_is_refused(saved: Path) -> None:
+    before = saved.read_bytes()
+    for header in ({"f": print}, {"x": float("nan")}, {"t": torch.ones(1)}, {("a",): 1}):
+        with pytest.raises(StoreError, match=r"thing\.safetensors cannot be written"):
+            store.save(saved, {"a": torch.ones(1)}, kind="thing", header=header)
+    assert saved.read_bytes() == before
+
+
+def test_a_table_with_a_wrong_column_or_number_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="unknown columns \\['modle'\\]"):
+        store.save_table(tmp_path / "t.csv", [{"modle": "tsm"}])
+    with pytest.raises(StoreError, match="value = nan"):
+        store.save_table(tmp_path / "t.csv", [{"metric": "success", "value": float("nan")}])
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
+    for text in ("", "a,b\n1,2\n", ",".join(store.COLUMNS) + "\n1,2\n", ",".join(store.COLUMNS) + '\n"1'):
+        (tmp_path / "t.csv").write_text(text)
+        with pytest.raises(StoreError, match=r"t\.csv"):
+            store.load_table(tmp_path / "t.csv")
+
+
+# Writing is all or nothing -------------------------------------------------------------------------------------------
+
+
+def only(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(saved: Path) -> None:
+    before = saved.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(StoreError, match=r"cannot write .*thing\.safetensors \(\d+ bytes\): File too large"):
+            store.save(saved, {"a": torch.zeros(10_000)}, kind="thing", header={})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert saved.read_bytes() == before
+    assert only(saved.parent) == [saved.name]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_fault_while_writing_leaves_the_old_file_and_nothing_else(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, call: str, fault: BaseException
+) -> None:
+    def fail(*_: Any) -> None:
+        raise fault
+
+    before = saved.read_bytes()
+    with monkeypatch.context() as patch, pytest.raises((StoreError, KeyboardInterrupt)) as caught:
+        patch.setattr(os, call, fail)
+        store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+    if isinstance(fault, OSError):
+        assert "No space left" in str(caught.value)
+        assert str(saved) in str(caught.value)
+    assert saved.read_bytes() == before
+    assert only(saved.parent) == [saved.name]
+
+
+def test_data_reaches_the_disk_before_its_name_does(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a))[1])
+    store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_an_unwritable_folder_is_one_clear_message(saved: Path) -> None:
+    with pytest.raises(StoreError, match="cannot write .*TSM_RUN_DIR"):
+        store.save(saved / "inside" / "x.safetensors", {"a": torch.ones(1)}, kind="thing", header={})
+    with pytest.raises(StoreError, match="cannot write"):
+        store.write_json("/proc/nowhere/x.json", {})
+
+
+def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    left = saved.with_name(f".{saved.name}.tmp-{child}")
+    left.write_bytes(b"half")
+    store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+    assert only(saved.parent) == [saved.name]
+
+
+# Verification --------------------------------------------------------------------------------------------------------
+
+
+def test_verify_follows_an_artefact_to_what_it_was_made_from(tmp_path: Path) -> None:
+    data, model = tmp_path / "data.safetensors", tmp_path / "models" / "m.safetensors"
+    store.save_trajectories(data, some_trajectories())
+    store.save_model(model, Line(inputs=3), {"inputs": {"../data.safetensors": store.sha256(data)}})
+    assert {path.name for path in store.verify(model)} == {"m.safetensors", "data.safetensors"}
+    store.save_trajectories(data, some_trajectories(n=4))
+    with pytest.raises(StoreError, match="data.safetensors has SHA-256"):
+        store.verify(model)
+    data.unlink()
+    assert [path.name for path in store.verify(model)] == ["m.safetensors"]
+
+
+def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
+    for name in "abc":
+        store.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories())
+    store.save_table(tmp_path / "t.csv", [])
+    store.write_manifest(tmp_path)
+    assert len(store.verify(tmp_path)) == 5
+    (tmp_path / "a.safetensors").write_bytes(b"")
+    (tmp_path / "b.safetensors").unlink()
+    (tmp_path / "t.csv").write_text("x")
+    with pytest.raises(StoreError) as caught:
+        store.verify(tmp_path)
+    for name in ("a.safetensors", "b.safetensors", "t.csv"):
+        assert name in str(caught.value)
+    assert "c.safetensors" not in str(caught.value)
+
+
+def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
+    entries = {"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}
+    text = json.dumps({"files": entries, "sha256": store._entries_digest(entries)})
+    (tmp_path / store.MANIFEST).write_text(text)
+    with pytest.raises(StoreError, match="outside its own folder"):
+        store.verify(tmp_path)
+
+
+def test_verify_does_not_vouch_for_what_it_cannot_check(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(StoreError, match="nothing to check"):
+        store.verify(tmp_path / "notes.txt")
+    with pytest.raises(StoreError, match="does not exist"):
+        store.verify(tmp_path / "nothing")
