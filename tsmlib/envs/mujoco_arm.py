@@ -1,0 +1,226 @@
+"""The arm in MuJoCo: Gymnasium's own Reacher, and the variants with a block edited from it.
+
+The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions, velocities and time are
+the whole state (no automatic reset, no warm start of the constraint solver). All episodes are simulated together by
+``mujoco.rollout`` in C++ threads; memory is bounded by simulating a few hundred episodes at a time.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported; draws without a screen
+
+import gymnasium.envs.mujoco
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from tsmlib.envs.base import (
+    BLOCK_DECAY,
+    BLOCK_MASS,
+    BLOCK_RADIUS,
+    DT,
+    FRICTION,
+    RESTITUTION,
+    WALL,
+    ArmVectorEnv,
+    SimulationUnstable,
+    fingertip,
+    task_of,
+)
+
+ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
+TIMESTEP = (
+    0.002  # s, of the variants; the basic arm keeps its 0.01 s. At 5 m/s a link moves 0.01 m, a third of the block
+)
+PLANE = 0.01  # m, height of the plane in which all centres move
+CONTACT_TIME = 2 * TIMESTEP  # s; the stiffest contact MuJoCo allows at this time step
+SOLIMP = (0.999, 0.9999, 0.001, 0.5, 2)  # nearly rigid: what is left of a squeeze is below a tenth of a millimetre
+WALL_TIME = 6 * TIMESTEP  # s; duration of a bounce
+MAX_SPEED = 1e3  # rad/s or m/s; full torque reaches about 30
+CHUNK = 256  # episodes simulated together: 256 x 100 steps of 10 substeps are 20 MB
+
+
+@cache
+def load_model(env_id: str) -> mujoco.MjModel:
+    """The compiled model of an environment id; shared, so treat it as read-only."""
+    task = task_of(env_id)
+    if task == "reacher":
+        model = mujoco.MjModel.from_xml_path(str(ASSET))
+    else:
+        spec = mujoco.MjSpec.from_file(str(ASSET))
+        spec.delete(spec.body("target"))
+        spec.option.timestep = TIMESTEP
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        _add_block(spec, moving=task == "push")
+        model = spec.compile()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    return model
+
+
+def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
+    """A disc among the arm's links: on two damped slides between four walls, or fixed at its mocap position.
+
+    It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and it
+    is drawn as a cylinder. It cannot leave the plane, and walls are half spaces, so nothing passes them.
+    """
+    block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
+    block.add_geom(
+        name="block",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[BLOCK_RADIUS, 0, 0],
+        mass=BLOCK_MASS,
+        contype=1,
+        conaffinity=0,
+        friction=[FRICTION, 0.1, 0.1],
+        solref=[CONTACT_TIME, 1.0],
+        solimp=SOLIMP,
+        priority=1,  # its parameters rule over those of the links
+        group=3,  # not drawn
+    )
+    block.add_geom(
+        name="block_drawn",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[BLOCK_RADIUS, 0.012, 0],
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
+    )
+    if not moving:
+        return
+    for axis, name in enumerate("xy"):
+        block.add_joint(
+            name=f"block_{name}",
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=np.eye(3)[axis],
+            armature=0.0,
+            damping=BLOCK_MASS / BLOCK_DECAY,
+            limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+        )
+    log_e = np.log(RESTITUTION)
+    damping_ratio = -log_e / np.hypot(np.pi, log_e)  # of the damped spring that returns this share of the speed
+    for name, axis, sign in (("east", 0, 1), ("north", 1, 1), ("west", 0, -1), ("south", 1, -1)):
+        normal = -sign * np.eye(3)[axis]
+        spec.worldbody.add_geom(
+            name=f"wall_{name}",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=sign * WALL * np.eye(3)[axis] + [0, 0, PLANE],
+            zaxis=normal,
+            size=[0.3, 0.3, 0.01],
+            contype=0,
+            conaffinity=1,
+            priority=2,  # walls bounce
+            friction=[0.0, 0.0, 0.0],
+            condim=1,
+            solref=[WALL_TIME, damping_ratio],
+            solimp=SOLIMP,
+            group=3,
+        )
+
+
+class MujocoArm(ArmVectorEnv):
+    """N arms in MuJoCo. ``threads`` simulate at once (default: the processors there are, at most 8)."""
+
+    def __init__(self, num_envs: int, env_id: str, *, threads: int | None = None, **kwargs: Any) -> None:
+        super().__init__(num_envs, env_id, **kwargs)
+        self.model = load_model(env_id)
+        self.frame_skip = round(DT / self.model.opt.timestep)
+        threads = min(threads or min(os.cpu_count() or 1, 8), num_envs)
+        self._data = [mujoco.MjData(self.model) for _ in range(threads)]
+        self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
+        self._physics = np.zeros((num_envs, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        self._obstacle = np.zeros((num_envs, 2))
+        self._renderer: mujoco.Renderer | None = None
+
+    def _start(self, states: np.ndarray) -> None:
+        nq, nv = self.model.nq, self.model.nv
+        self._physics = np.zeros_like(self._physics)  # time, positions, velocities
+        self._physics[:, 1:3] = states[:, :2]
+        self._physics[:, 1 + nq : 3 + nq] = states[:, 2:4]
+        if self.task == "reacher":
+            self._physics[:, 3:5] = self.target  # drawn there; the arm does not feel it
+        elif self.task == "push":
+            self._physics[:, 3:5] = states[:, 6:8]
+            self._physics[:, 1 + nq + 2 : 1 + nq + nv] = states[:, 8:10]
+        else:
+            self._obstacle = states[:, 6:8].copy()
+        self._check(self._physics[:, None], np.full(self.num_envs, -DT), 0)
+
+    def _simulate(self, actions: np.ndarray) -> np.ndarray:
+        states = np.empty((*actions.shape[:2], len(self.names)))
+        ends = np.empty_like(self._physics)
+        for first in range(0, self.num_envs, CHUNK):
+            part = slice(first, first + CHUNK)
+            physics = self._advance(self._physics[part], self._obstacle[part], actions[part])
+            self._check(physics, self._physics[part, 0], first)
+            states[part] = self._to_states(physics, self._obstacle[part])
+            ends[part] = physics[:, -1]
+        self._physics = ends
+        return states
+
+    def _advance(self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps."""
+        control = np.repeat(actions, self.frame_skip, axis=1)
+        spec = mujoco.mjtState.mjSTATE_CTRL.value
+        if self.task == "obstacle":
+            spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
+            position = np.concatenate([obstacle, np.full((len(obstacle), 1), PLANE)], axis=1)
+            control = np.concatenate([control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2)
+        physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
+        return physics[:, self.frame_skip - 1 :: self.frame_skip].copy()
+
+    def _to_states(self, physics: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
+        """MuJoCo states (n, T, ...) to states (n, T, dx)."""
+        nq, nv = self.model.nq, self.model.nv
+        q, dq = physics[..., 1 : 1 + nq], physics[..., 1 + nq : 1 + nq + nv]
+        parts = [q[..., :2], dq[..., :2], fingertip(q[..., :2])]
+        if self.task == "push":
+            parts += [q[..., 2:], dq[..., 2:]]
+        elif self.task == "obstacle":
+            fixed = np.broadcast_to(obstacle[:, None], (*q.shape[:2], 2))
+            parts += [fixed, np.zeros_like(fixed)]
+        return np.concatenate(parts, axis=-1)
+
+    def _check(self, physics: np.ndarray, start_time: np.ndarray, first: int) -> None:
+        """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond `MAX_SPEED`."""
+        nq = self.model.nq
+        clock = start_time[:, None] + DT * np.arange(1, physics.shape[1] + 1)
+        with np.errstate(invalid="ignore"):
+            reasons = (
+                ("the state is not finite", ~np.isfinite(physics).all(axis=-1)),
+                (f"speed above {MAX_SPEED:g} rad/s", (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1)),
+                ("MuJoCo stopped it", np.abs(physics[..., 0] - clock) > DT / 2),
+            )
+        wrong = reasons[0][1] | reasons[1][1] | reasons[2][1]
+        if wrong.any():
+            episode, step = np.argwhere(wrong)[0]
+            reason = next(reason for reason, where in reasons if where[episode, step])
+            raise SimulationUnstable(self.env_id, first + int(episode), int(step), reason)
+
+    def get_state(self) -> np.ndarray:
+        """Snapshot (N, k): MuJoCo's full physics state, then the obstacle's position."""
+        return np.concatenate([self._physics, self._obstacle], axis=1)
+
+    def set_state(self, snapshot: np.ndarray) -> None:
+        """Continue from `get_state`, of this or another environment of the same id and N; bit for bit."""
+        snapshot = np.asarray(snapshot, np.float64)
+        expected = (self.num_envs, self._physics.shape[1] + 2)
+        if snapshot.shape != expected:
+            raise ValueError(f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}")
+        self._physics, self._obstacle = snapshot[:, :-2].copy(), snapshot[:, -2:].copy()
+        self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
+        self._elapsed = self._elapsed or 0
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the threads and release the renderer."""
+        if self._pool is not None:
+            self._pool.close()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
