@@ -11,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from tsmlib.nets import Noise
 from tsmlib.trajectory import Segment, Window
 
 
@@ -20,17 +21,17 @@ class DynamicsModel(Protocol):
     segment_len: int
     past_len: int
 
-    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+    def loss(self, window: Window, generator: Noise) -> Tensor:
         """What training minimises: a scalar for one batch of windows."""
         ...
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """Future states (B, K, dx) under ``actions`` (B, K <= H, du). No generator: the mode; with one: a sample."""
         ...
 
 
 def rollout(
-    model: DynamicsModel, past: Segment, actions: Tensor, *, generator: torch.Generator | None = None
+    model: DynamicsModel, past: Segment, actions: Tensor, *, generator: Noise | None = None
 ) -> Tensor:
     """Chain segments over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
 

@@ -5,9 +5,34 @@ Letters in shapes: B batch, P positions in time, C channels, dz latent size.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """Common random numbers: rows b, b + period, b + 2 period, ... of every batch draw the same noise.
+
+    Planners lay candidates out as (C, B) and use a period of B, so that candidates are compared in the same futures.
+    """
+
+    generator: torch.Generator
+    period: int
+
+
+Noise = torch.Generator | SharedNoise
+
+
+def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
+    """Draw N(0, 1) of ``shape`` with the device and type of ``like``."""
+    if isinstance(noise, SharedNoise):
+        drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
+        return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
+    return torch.randn(shape, generator=noise, device=like.device, dtype=like.dtype)
 
 
 class GatedLayer(nn.Module):
@@ -112,12 +137,9 @@ class Encoder(nn.Module):
         return mean, log_variance
 
 
-def sample_posterior(mean: Tensor, log_variance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """z ~ N(mean, variance) by the reparametrisation trick; the mean itself where there is no generator."""
-    if generator is None:
-        return mean
-    noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-    return mean + (0.5 * log_variance).exp() * noise
+def sample_posterior(mean: Tensor, log_variance: Tensor, generator: Noise) -> Tensor:
+    """z ~ N(mean, variance) by the reparametrisation trick."""
+    return mean + (0.5 * log_variance).exp() * standard_normal(mean.shape, generator, mean)
 
 
 def kl_from_standard_normal(mean: Tensor, log_variance: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tsmlib.nets import CausalDecoder, Encoder, kl_from_standard_normal, sample_posterior
+from tsmlib.nets import CausalDecoder, Encoder, Noise, kl_from_standard_normal, sample_posterior
 from tsmlib.trajectory import Window
 
 
@@ -85,7 +85,7 @@ class ActionPrior(nn.Module):
             segments.append(past_actions)
         return torch.cat(segments, dim=1)
 
-    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+    def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error plus beta KL per segment, free-running within each segment of the window's future."""
         past, loss = window.past.actions, window.past.actions.new_zeros(())
         for future in window.future.actions.split(self.segment_len, dim=1):

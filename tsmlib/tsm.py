@@ -15,7 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tsmlib.nets import CausalDecoder, Encoder, Features, kl_from_standard_normal, sample_posterior
+from tsmlib.nets import (
+    CausalDecoder,
+    Encoder,
+    Features,
+    Noise,
+    kl_from_standard_normal,
+    sample_posterior,
+    standard_normal,
+)
 from tsmlib.trajectory import Segment, Window
 
 
@@ -59,13 +67,13 @@ class TSM(nn.Module):
         """The constructor's arguments, as they travel with the weights."""
         return dict(self._config)
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """(B, L, .), (B, K <= H, du) -> states (B, K, dx). No generator: z = 0; with one: z ~ N(0, I)."""
         shape = (len(actions), self.latent_dim)
         if generator is None:
             z = actions.new_zeros(shape)
         else:
-            z = torch.randn(shape, generator=generator, device=actions.device, dtype=actions.dtype)
+            z = standard_normal(shape, generator, actions)
         return self.decode(past, actions, z)
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
@@ -90,7 +98,7 @@ class TSM(nn.Module):
         """Q(Z | X+): (B, H, dx) -> mean and log variance (B, dz)."""
         return self.encoder(self.features(states))
 
-    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+    def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error plus beta KL per segment, free-running through every segment that the window holds.
 
         The future is a chain of K = n H steps. Each segment's code comes from its own true states, its past from the
@@ -104,7 +112,7 @@ class TSM(nn.Module):
             past = past.then(Segment(predicted, future.actions)).last(self.past_len)
         return loss
 
-    def teacher_forced_loss(self, window: Window, generator: torch.Generator) -> Tensor:
+    def teacher_forced_loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error of one-step increments plus beta KL, with true states as inputs (reading A9)."""
         loss, past = window.past.states.new_zeros(()), window.past
         for future in self._segments(window.future):
@@ -118,7 +126,7 @@ class TSM(nn.Module):
             past = past.then(future).last(self.past_len)
         return loss
 
-    def energy_loss(self, window: Window, generator: torch.Generator) -> Tensor:
+    def energy_loss(self, window: Window, generator: Noise) -> Tensor:
         """Energy score of two free-running samples with codes from the prior, beyond the paper (model tsm+energy).
 
         E|X - x| - |X - X'| / 2 over each whole segment, a strictly proper score: its minimum is the true conditional

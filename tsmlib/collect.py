@@ -1,0 +1,85 @@
+"""collect(): let a controller act in many episodes at once and keep what happened.
+
+Random data, a running planner and a policy under test are the same call with another controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gymnasium
+import numpy as np
+import torch
+from torch import Tensor
+
+from tsmlib.trajectory import Segment, Trajectories, initial_past
+
+Controller = Callable[[Segment], Tensor]  # the past (N, L, .) -> the next K actions (N, K, du), then asked again
+
+
+def collect(
+    env: gymnasium.vector.VectorEnv,
+    controller: Controller,
+    *,
+    horizon: int = 100,  # section 5.1
+    past_len: int = 10,
+    seed: int | None = None,
+    states: np.ndarray | None = None,
+) -> Trajectories:
+    """Run one episode in each of ``env``'s N copies for ``horizon`` steps (dt 0.02 s).
+
+    Episodes start from the environment's own distribution, drawn from ``seed``, or from ``states`` (N, dx).
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
+    start, _ = env.reset(seed=seed, options=None if states is None else {"states": states})
+    action_dim = env.single_action_space.shape[0]
+    past = initial_past(torch.from_numpy(start).float(), past_len, action_dim)
+    seen, done, taken = [start[:, None]], [], 0
+    while taken < horizon:
+        actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
+        reached = env.unwrapped.rollout(actions.numpy())
+        past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
+        seen.append(reached)
+        done.append(actions.numpy())
+        taken += actions.shape[1]
+    arm = env.unwrapped
+    return Trajectories(
+        states=np.concatenate(seen, axis=1, dtype=np.float32),
+        actions=np.concatenate(done, axis=1, dtype=np.float32),
+        env=env.spec.id,
+        dt=arm.dt,
+        names=tuple(arm.names),
+        units=tuple(arm.units),
+        angles=tuple(arm.angles),
+    )
+
+
+def smooth_torques(
+    n: int,
+    horizon: int,
+    *,
+    generator: torch.Generator,
+    action_dim: int = 2,
+    rms: float = 0.1,  # of full torque: few steps at the elbow stop, most objects met (see 01_collect)
+    time_constant: float = 0.08,  # s, of each of the two poles: a cut-off of about 2 Hz
+    dt: float = 0.02,
+) -> Tensor:
+    """Smooth random torques (section 5.1; reading A15): white noise through two poles, (n, horizon, action_dim).
+
+    They start from zero, as the paper's U_0 does, and settle to a root mean square of ``rms``, clipped to [-1, 1].
+    """
+    keep = np.exp(-dt / time_constant)
+    noise = torch.randn(n, horizon, action_dim, generator=generator).numpy()
+    once, twice, torques = np.zeros((n, action_dim)), np.zeros((n, action_dim)), np.empty_like(noise)
+    for step in range(horizon):
+        once = keep * once + (1 - keep) * noise[:, step]
+        twice = keep * twice + (1 - keep) * once
+        torques[:, step] = twice
+    settled = (1 - keep) ** 2 * np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # standard deviation of two equal poles
+    return torch.from_numpy((torques * (rms / settled)).clip(-1, 1).astype(np.float32))
+
+
+def once(actions: Tensor) -> Controller:
+    """The open-loop controller that plays ``actions`` (N, T, du) from the start of an episode."""
+    return lambda past: actions

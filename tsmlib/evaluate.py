@@ -1,0 +1,98 @@
+"""How good predictions are: likelihoods, proper scores and errors against the horizon (sections 5.2 and 5.3.1).
+
+All scores live in the standardised feature space of the training data (reading A13): angles as cosine and sine, unit
+variance, dimensions that never change within an episode left out (A4). Likelihoods are sums over dimensions and means
+over time steps and trajectories (A5). Letters in shapes: S samples, N trajectories, T steps, D scored features.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from tsmlib.dynamics import DynamicsModel, rollout
+from tsmlib.nets import Features
+from tsmlib.trajectory import Segment, Trajectories
+
+
+@torch.no_grad()
+def predict(
+    model: DynamicsModel,
+    features: Features,
+    data: Trajectories,
+    *,
+    samples: int,
+    horizon: int = 90,  # from the first H observed steps to T = 100 (reading A6)
+    seed: int = 0,
+    rows: int = 5000,
+    progress: str = "",
+) -> tuple[Tensor, Tensor]:
+    """Open-loop samples (S, N, T, D) with the true actions after ``past_len`` observed steps, and the truth (N, T, D).
+
+    A sample that is not finite is kept at the edge of the representable range, so that it counts as worst.
+    """
+    past_len = model.past_len
+    whole = data.padded(0)
+    past = Segment(whole.states[:, :past_len], whole.actions[:, :past_len])
+    steps = slice(past_len, past_len + horizon)
+    truth = features(whole.states[:, steps])[..., features.scored]
+    drawn = []
+    for draw in tqdm(range(samples), desc=progress, disable=not progress):
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + draw)
+        states = rollout(model, past, whole.actions[:, steps], generator=generator)
+        drawn.append(features(states)[..., features.scored].nan_to_num(nan=1e6).clamp(-1e6, 1e6))
+    return torch.stack(drawn), truth
+
+
+def ll_paper(samples: Tensor, truth: Tensor, floor: float) -> Tensor:
+    """The paper's protocol: log-likelihood (N, T) under a diagonal Gaussian fitted to the samples at each step.
+
+    floor: a variance added everywhere, one scalar per model fitted on validation (reading A2; ``fit_floor``).
+    """
+    variance = samples.var(0) + floor  # (N, T, D)
+    return _gaussian(truth - samples.mean(0), variance)
+
+
+def ll_shared(samples: Tensor, truth: Tensor, variance: float) -> Tensor:
+    """Log-likelihood (N, T) under one scalar variance around the samples' mean, the same form for every model (A1b)."""
+    return _gaussian(truth - samples.mean(0), truth.new_tensor(variance))
+
+
+def fit_floor(samples: Tensor, truth: Tensor) -> float:
+    """The scalar floor that maximises ``ll_paper`` on validation data, by a fine grid of powers of ten."""
+    grid = torch.logspace(-8, 4, 121)
+    values = torch.stack([ll_paper(samples, truth, float(floor)).mean() for floor in grid])
+    return float(grid[values.argmax()])
+
+
+def fit_shared(samples: Tensor, truth: Tensor) -> float:
+    """The scalar variance that maximises ``ll_shared`` on validation data: the mean squared error."""
+    return float((truth - samples.mean(0)).square().mean())
+
+
+def energy_score(samples: Tensor, truth: Tensor) -> Tensor:
+    """Energy score (N, T) per step, E|X - x| - E|X - X'| / 2 (unbiased); lower is better."""
+    n = len(samples)
+    to_truth = (samples - truth).norm(dim=-1).mean(0)
+    between = torch.zeros_like(to_truth)
+    for shift in range(1, n):
+        between += (samples[shift:] - samples[:-shift]).norm(dim=-1).sum(0)
+    return to_truth - between / (n * (n - 1))
+
+
+def coverage(samples: Tensor, truth: Tensor, level: float = 0.8) -> Tensor:
+    """Share of dimensions (N, T) in which the truth lies within the samples' central interval of ``level``."""
+    low, high = (torch.quantile(samples, q, dim=0) for q in ((1 - level) / 2, (1 + level) / 2))
+    return ((truth >= low) & (truth <= high)).float().mean(-1)
+
+
+def nrmse(samples: Tensor, truth: Tensor) -> Tensor:
+    """Root mean squared error of the samples' mean over training standard deviation, at each step (T,)."""
+    return (truth - samples.mean(0)).square().mean((0, 2)).sqrt()
+
+
+def _gaussian(error: Tensor, variance: Tensor) -> Tensor:
+    return -0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi)).sum(-1)
