@@ -1,0 +1,173 @@
+"""The arm in pymunk (Chipmunk): the same interface and geometry as the MuJoCo arm, and a second opinion on its physics.
+
+Two links turn in the plane. With torques tau and viscous joint damping d, away from contacts and the elbow's limit,
+
+    (I + m l^2) dw_1 = tau_0 - tau_1 - d q'_0 + d q'_1        I dw_2 = tau_1 - d q'_1        q' = (w_1, w_2 - w_1)
+
+where w are the links' speeds in the world, I and d are the armature and damping of Gymnasium's Reacher, and m is the
+second link's mass, which sits in the elbow at distance l from the shoulder. (In MuJoCo the armature is a rotor in each
+joint, so a torque at the elbow does not turn the first link there. Here it does.)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pymunk
+
+from tsmlib.envs.base import (
+    ARM_RADIUS,
+    BLOCK_DECAY,
+    BLOCK_MASS,
+    BLOCK_RADIUS,
+    DT,
+    ELBOW_LIMIT,
+    FRICTION,
+    GEAR,
+    LINK1_CAPSULE,
+    LINK_LENGTHS,
+    RESTITUTION,
+    WALL,
+    ArmVectorEnv,
+    SimulationUnstable,
+)
+
+SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies
+ITERATIONS = 20
+ARMATURE = 1.0  # kg m^2 and
+DAMPING = 1.0  # N m s / rad, both Reacher's
+ELBOW_MASS = 10.0  # kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together
+ANCHOR_MASS = 1e9  # kg; nothing moves the first link off the shoulder, it only turns
+STIFF = 1e-60  # share of an overlap or joint error left after a second: a quarter is corrected in a substep
+SLOP = 1e-5  # m of overlap that Chipmunk tolerates so that contacts persist
+FAR = 1e6  # m
+MAX_JOINT_SPEED = 1e3  # rad/s; full torque throughout reaches about 200
+MAX_BLOCK_SPEED = 100.0  # m/s
+
+ARM, BLOCK, WALLS = 0b001, 0b010, 0b100  # the arm meets the block only, and passes over the walls and itself
+
+
+class PymunkArm(ArmVectorEnv):
+    """N arms in N pymunk spaces, built anew at every reset, so that an episode is a function of its start and actions.
+
+    One space is a few microseconds of C per substep, so the episodes are simulated one after another.
+    """
+
+    def _start(self, states: np.ndarray) -> None:
+        self._episodes = [_Episode(self.task, state) for state in states.tolist()]
+
+    def _simulate(self, actions: np.ndarray) -> np.ndarray:
+        states = np.empty((*actions.shape[:2], len(self.names)))
+        for i, (episode, torques) in enumerate(zip(self._episodes, (GEAR * actions).tolist(), strict=True)):
+            for t, (shoulder, elbow) in enumerate(torques):
+                state = episode.step(shoulder, elbow)
+                if reason := _fault(state):
+                    raise SimulationUnstable(self.env_id, i, t, reason)
+                states[i, t] = state
+        return states
+
+    def get_state(self) -> Any:
+        """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot would be complete."""
+        raise RuntimeError(
+            f"{self.env_id}: pymunk cannot restore an episode in the middle, because the cached contact impulses are "
+            "not accessible. Replay instead: reset(options={'states': <its first states>}) and rollout the same "
+            "actions, which gives the same numbers bit for bit."
+        )
+
+    def set_state(self, snapshot: Any) -> None:
+        """Always RuntimeError, see `get_state`."""
+        self.get_state()
+
+
+class _Episode:
+    """One arm and what it can touch, in a space of its own. ``state`` is a list of dx numbers."""
+
+    def __init__(self, task: str, state: list[float]) -> None:
+        self.space = pymunk.Space()
+        self.space.iterations = ITERATIONS
+        self.space.collision_slop = SLOP
+        self.space.collision_bias = STIFF
+        self._add_arm(*state[:4])
+        self.block: pymunk.Body | None = None
+        self.obstacle: tuple[float, ...] = ()
+        if task == "push":
+            self._add_block(tuple(state[6:8]), tuple(state[8:10]))
+            self._add_walls()
+        elif task == "obstacle":
+            self.obstacle = (*state[6:8], 0.0, 0.0)
+            self._add_disc(self.space.static_body, tuple(state[6:8]))
+
+    def step(self, shoulder: float, elbow: float) -> tuple[float, ...]:
+        """Apply the torques (N m) for one step of DT and give the state."""
+        link1, link2, step = self.link1, self.link2, self.space.step
+        for _ in range(SUBSTEPS):
+            link1.torque = shoulder - elbow
+            link2.torque = elbow
+            step(DT / SUBSTEPS)
+        q, w, reach = link1.angle, link1.angular_velocity, link2.angle
+        tip_x = LINK_LENGTHS[0] * math.cos(q) + LINK_LENGTHS[1] * math.cos(reach)
+        tip_y = LINK_LENGTHS[0] * math.sin(q) + LINK_LENGTHS[1] * math.sin(reach)
+        arm = (q, reach - q, w, link2.angular_velocity - w, tip_x, tip_y)
+        return (*arm, *self.block.position, *self.block.velocity) if self.block else arm + self.obstacle
+
+    def _add_arm(self, q0: float, q1: float, dq0: float, dq1: float) -> None:
+        length = LINK_LENGTHS[0]
+        self.link1, self.link2 = pymunk.Body(ANCHOR_MASS, ARMATURE), pymunk.Body(ELBOW_MASS, ARMATURE)
+        self.link1.angle, self.link1.angular_velocity = q0, dq0
+        self.link2.angle, self.link2.angular_velocity = q0 + q1, dq0 + dq1
+        self.link2.position = length * math.cos(q0), length * math.sin(q0)
+        self.link2.velocity = -dq0 * length * math.sin(q0), dq0 * length * math.cos(q0)
+        elbow = pymunk.PivotJoint(self.link1, self.link2, (length, 0.0), (0.0, 0.0))
+        limit = pymunk.RotaryLimitJoint(self.link1, self.link2, -ELBOW_LIMIT, ELBOW_LIMIT)
+        elbow.error_bias = limit.error_bias = STIFF
+        shoulder_damper = pymunk.DampedRotarySpring(self.space.static_body, self.link1, 0.0, 0.0, DAMPING)
+        elbow_damper = pymunk.DampedRotarySpring(self.link1, self.link2, 0.0, 0.0, DAMPING)
+        shapes = (
+            pymunk.Segment(self.link1, (0.0, 0.0), (length, 0.0), ARM_RADIUS),
+            pymunk.Segment(self.link2, (0.0, 0.0), (LINK1_CAPSULE, 0.0), ARM_RADIUS),
+            pymunk.Circle(self.link2, ARM_RADIUS, (LINK_LENGTHS[1], 0.0)),  # the fingertip
+        )
+        for shape in shapes:
+            shape.filter = pymunk.ShapeFilter(categories=ARM, mask=BLOCK)
+            shape.friction = 1.0  # Chipmunk multiplies the friction, and the elasticity, of the two surfaces
+        self.space.add(self.link1, self.link2, elbow, limit, shoulder_damper, elbow_damper, *shapes)
+
+    def _add_block(self, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+        self.block = pymunk.Body(BLOCK_MASS, math.inf)  # it slides and does not turn
+        self.block.position, self.block.velocity = position, velocity
+        self.space.add(self.block)
+        self._add_disc(self.block, (0.0, 0.0))
+        for anchor in ((FAR, 0.0), (0.0, FAR)):  # a dashpot along x and one along y: drag m / tau without a callback
+            drag = BLOCK_MASS / BLOCK_DECAY
+            self.space.add(pymunk.DampedSpring(self.space.static_body, self.block, anchor, (0.0, 0.0), 0.0, 0.0, drag))
+
+    def _add_disc(self, body: pymunk.Body, centre: tuple[float, ...]) -> None:
+        disc = pymunk.Circle(body, BLOCK_RADIUS, centre)
+        disc.filter = pymunk.ShapeFilter(categories=BLOCK)
+        disc.friction, disc.elasticity = FRICTION, 1.0
+        self.space.add(disc)
+
+    def _add_walls(self) -> None:
+        thick = 0.5  # m, so that nothing passes through
+        far = WALL + thick
+        corners = [(far, far), (-far, far), (-far, -far), (far, -far)]
+        for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+            wall = pymunk.Segment(self.space.static_body, start, end, thick)
+            wall.filter = pymunk.ShapeFilter(categories=WALLS, mask=BLOCK)
+            wall.friction, wall.elasticity = 1.0, RESTITUTION
+            self.space.add(wall)
+
+
+def _fault(state: tuple[float, ...]) -> str | None:
+    """What is wrong with a state, if anything; written so that a comparison with NaN fails."""
+    if not (abs(state[2]) < MAX_JOINT_SPEED and abs(state[3]) < MAX_JOINT_SPEED and math.isfinite(state[0] + state[1])):
+        return f"joint angles {state[:2]} rad, speeds {state[2:4]} rad/s, expected finite and below {MAX_JOINT_SPEED}"
+    if len(state) > 6:
+        x, y, vx, vy = state[6:]
+        if not (abs(x) < WALL and abs(y) < WALL):
+            return f"the block's centre is at {x, y} m, beyond the walls at {WALL} m"
+        if not (abs(vx) < MAX_BLOCK_SPEED and abs(vy) < MAX_BLOCK_SPEED):
+            return f"the block moves at {vx, vy} m/s, expected below {MAX_BLOCK_SPEED}"
+    return None
