@@ -1,0 +1,73 @@
+"""Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify PATH`` hashes again.
+
+Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tsmlib import runs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tsmlib", description="Temporal segment models.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    names = ", ".join(runs.notebooks())
+    run = commands.add_parser("run", help="execute a notebook into runs/<scale>/seed<k>/")
+    run.add_argument("notebook", help=f"{names}, or all")
+    run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
+    run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
+    run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
+    verify = commands.add_parser("verify", help="hash an artefact, or a folder of them, again")
+    verify.add_argument("path", type=Path)
+    arguments = parser.parse_args(argv)
+    try:
+        return _verify(arguments.path) if arguments.command == "verify" else _run(arguments)
+    except runs.ParameterError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (runs.RunError, ValueError) as error:  # ValueError: StoreError
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    present = runs.notebooks()
+    word = arguments.notebook
+    if word != "all" and word not in present:
+        raise runs.ParameterError(f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all.")
+    seed = runs.convert("seed", arguments.seed, int)
+    given: dict[str, str] = {}
+    for item in arguments.given:
+        name, equals, text = item.partition("=")
+        if not equals or name in given or name in ("scale", "seed"):
+            raise runs.ParameterError(
+                f"-p {item!r:.80}: expected NAME=VALUE, each name once, and --scale and --seed for these two."
+            )
+        given[name] = text
+    chosen = list(present.values()) if word == "all" else [present[word]]
+    for notebook in chosen:  # all of them, before the first one starts
+        runs.typed(notebook, given)
+        runs.resolve(notebook.stem, scale=arguments.scale, seed=seed)
+    for notebook in chosen:
+        print(runs.execute(notebook, scale=arguments.scale, seed=seed, given=given))
+    return 0
+
+
+def _verify(path: Path) -> int:
+    from tsmlib import store
+
+    for file in store.verify(path):
+        print(f"ok  {file}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
