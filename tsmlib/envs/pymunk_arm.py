@@ -43,6 +43,7 @@ ANCHOR_MASS = 1e9  # kg; nothing moves the first link off the shoulder, it only 
 STIFF = 1e-60  # share of an overlap or joint error left after a second: a quarter is corrected in a substep
 SLOP = 1e-5  # m of overlap that Chipmunk tolerates so that contacts persist
 FAR = 1e6  # m
+MAX_ANGLE = 1e6  # rad; beyond it, floats no longer resolve the fingertip well
 MAX_JOINT_SPEED = 1e3  # rad/s; full torque throughout reaches about 200
 MAX_BLOCK_SPEED = 100.0  # m/s
 
@@ -56,17 +57,32 @@ class PymunkArm(ArmVectorEnv):
     """
 
     def _start(self, states: np.ndarray) -> None:
-        self._episodes = [_Episode(self.task, state) for state in states.tolist()]
+        self._starts = states.copy()
+        self._history = np.zeros((self.num_envs, 0, 2))  # actions since the reset
+        self._live: list[_Episode | None] = [None] * self.num_envs
 
     def _simulate(self, actions: np.ndarray) -> np.ndarray:
         states = np.empty((*actions.shape[:2], len(self.names)))
-        for i, (episode, torques) in enumerate(zip(self._episodes, (GEAR * actions).tolist(), strict=True)):
+        history = np.concatenate([self._history, actions], axis=1)
+        over = history.shape[1] >= self.max_episode_steps
+        live, self._live = self._live, [None] * self.num_envs  # after a fault every episode is replayed
+        for i, torques in enumerate((GEAR * actions).tolist()):
+            episode = live[i] or self._replayed(i)
             for t, (shoulder, elbow) in enumerate(torques):
                 state = episode.step(shoulder, elbow)
                 if reason := _fault(state):
                     raise SimulationUnstable(self.env_id, i, t, reason)
                 states[i, t] = state
+            live[i] = None if over else episode  # a space holds about 150 kB
+        self._live, self._history = live, history
         return states
+
+    def _replayed(self, i: int) -> _Episode:
+        """Episode i, built at its start and brought to the present."""
+        episode = _Episode(self.task, self._starts[i].tolist())
+        for shoulder, elbow in (GEAR * self._history[i]).tolist():
+            episode.step(shoulder, elbow)
+        return episode
 
     def get_state(self) -> Any:
         """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot would be complete."""
@@ -162,8 +178,11 @@ class _Episode:
 
 def _fault(state: tuple[float, ...]) -> str | None:
     """What is wrong with a state, if anything; written so that a comparison with NaN fails."""
-    if not (abs(state[2]) < MAX_JOINT_SPEED and abs(state[3]) < MAX_JOINT_SPEED and math.isfinite(state[0] + state[1])):
-        return f"joint angles {state[:2]} rad, speeds {state[2:4]} rad/s, expected finite and below {MAX_JOINT_SPEED}"
+    q0, q1, dq0, dq1 = state[:4]
+    if not (abs(q0) < MAX_ANGLE and abs(q1) < ELBOW_LIMIT + 1.0):
+        return f"the joint angles are {q0, q1} rad, and the elbow's limit is {ELBOW_LIMIT} rad"
+    if not (abs(dq0) < MAX_JOINT_SPEED and abs(dq1) < MAX_JOINT_SPEED):
+        return f"the joints turn at {dq0, dq1} rad/s, expected below {MAX_JOINT_SPEED}"
     if len(state) > 6:
         x, y, vx, vy = state[6:]
         if not (abs(x) < WALL and abs(y) < WALL):
