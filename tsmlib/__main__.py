@@ -42,7 +42,9 @@ def _run(arguments: argparse.Namespace) -> int:
     present = runs.notebooks()
     word = arguments.notebook
     if word != "all" and word not in present:
-        raise runs.ParameterError(f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all.")
+        raise runs.ParameterError(
+            f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
+        )
     seed = runs.convert("seed", arguments.seed, int)
     given: dict[str, str] = {}
     for item in arguments.given:

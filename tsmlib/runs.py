@@ -227,6 +227,7 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
             _literally(unfinished),
             values,
             kernel_name="python3",
+            language="python",
             cwd=str(NOTEBOOKS),
             progress_bar={"desc": notebook.stem} if progress else False,
             config=Config({"KernelManager": {"transport_encryption": "auto"}}),  # keeps ipykernel >= 7.3 from warning

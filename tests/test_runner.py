@@ -1,0 +1,339 @@
+"""Running notebooks: parameters are checked before anything exists, and nothing unfinished is ever called complete."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+
+from tsmlib import papermill_plugin, runs
+from tsmlib.__main__ import main
+from tsmlib.runs import ParameterError, RunError, resolve
+
+PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
+
+
+def write_notebook(path: Path, *cells: str, parameters: str = PARAMETERS) -> Path:
+    notebook = nbformat.v4.new_notebook(metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}})
+    notebook.cells = [nbformat.v4.new_code_cell(source) for source in (parameters, *cells)]
+    notebook.cells[0].metadata["tags"] = ["parameters"]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, path)
+    return path
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with two notebooks, and a name for runs in which braces must survive."""
+    monkeypatch.setattr(runs, "NOTEBOOKS", tmp_path / "notebooks")
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path / "runs {x} ü"))
+    write_notebook(tmp_path / "notebooks" / "01_first.ipynb", "result = (scale, seed, rate, name, fast)", "result")
+    write_notebook(tmp_path / "notebooks" / "02_second.ipynb", "1 + 1")
+    return tmp_path
+
+
+def status(place: Path, scale: str = "laptop", seed: int = 0) -> dict[str, Any]:
+    return json.loads((place / "runs {x} ü" / scale / f"seed{seed}" / "status.json").read_text())
+
+
+def untouched(place: Path) -> bool:
+    return not (place / "runs {x} ü").exists()
+
+
+# Where things live ---------------------------------------------------------------------------------------------------
+
+
+def test_a_parameter_beats_the_environment_which_beats_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve("05_control").dir == runs.ROOT / "runs" / "laptop" / "seed0"
+    monkeypatch.setenv("TSM_SCALE", "smoke")
+    monkeypatch.setenv("TSM_RUN_DIR", "/elsewhere")
+    assert resolve("05_control", seed=3).dir == Path("/elsewhere/smoke/seed3")
+    assert resolve("05_control", scale="paper", run_dir="/here").dir == Path("/here/paper/seed0")
+
+
+def test_the_place_of_a_run_does_not_depend_on_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = resolve("05_control")
+    monkeypatch.chdir(tmp_path)
+    assert resolve("05_control") == before
+    assert before.shipped == runs.ROOT / "data" / "pretrained"
+
+
+def test_folders_exist_when_they_are_asked_for_and_not_before(place: Path) -> None:
+    run = resolve("01_first")
+    assert untouched(place)
+    for folder in (run.data, run.models, run.metrics, run.figures):
+        assert folder.is_dir()
+        assert folder.parent == run.dir
+
+
+def test_a_run_picks_by_scale() -> None:
+    assert [resolve("x", scale=scale).pick(smoke=1, laptop=2, paper=3) for scale in runs.SCALES] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        *({"scale": value} for value in ("huge", "../../x", "smoke\n", 1, None, True, "x" * 300, "laptop/..")),
+        *({"seed": value} for value in (-1, 2**31, 1.0, "1", True, None, float("nan"), 10**30)),
+        *({"run_dir": value} for value in ("../x", "a/../b", "~/x", "a\0b", "a\nb", 3, None, "x" * 2000, "a\u202eb")),
+        {"run_dir": str(Path(__file__))},
+    ],
+    ids=lambda bad: repr(bad)[:40],
+)
+def test_bad_settings_are_refused_naming_the_value(bad: dict[str, Any]) -> None:
+    with pytest.raises(ParameterError, match=r"(scale|seed|run_dir) is .*expected"):
+        resolve("05_control", **bad)
+
+
+def test_a_bad_environment_is_refused_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TSM_SCALE", "huge")
+    with pytest.raises(ParameterError, match="TSM_SCALE is 'huge', expected one of smoke, laptop, paper"):
+        resolve("05_control")
+
+
+def test_a_folder_that_cannot_be_made_is_one_clear_message() -> None:
+    with pytest.raises(ParameterError, match=r"cannot make the folder .*TSM_RUN_DIR"):
+        _ = resolve("05_control", run_dir="/proc/nowhere").data
+
+
+# Parameters ----------------------------------------------------------------------------------------------------------
+
+
+def test_values_take_the_type_of_the_default(place: Path) -> None:
+    given = {"seed": "7", "rate": "1e-3", "name": "007", "fast": "True"}
+    assert runs.typed(runs.notebooks()["first"], given) == {"seed": 7, "rate": 0.001, "name": "007", "fast": True}
+
+
+BAD_PARAMETERS = [
+    *("sed=7", "seed", "=3", "seed=3", "scale=smoke", "rate=", "name=a\nb", "name=a\0b", "sizes=[3]", "sizes=3"),
+    *(f"rate={text}" for text in ("nan", "inf", "-inf", "1e999", "true", "0x10", "1_000", "10**9", "[1]", "{}", "1,5")),
+    *(f"fast={text}" for text in ("1", "yes", "", "None")),
+    "seed=1; open('pwned.txt','w').write('x'); y=3",
+    "__class__=3",
+    "run_dir=../../x",
+    "run_dir=~",
+    "name=" + "x" * 2000,
+]
+
+
+@pytest.mark.parametrize("item", BAD_PARAMETERS, ids=lambda item: repr(item)[:40])
+def test_bad_parameters_are_refused_before_any_file_exists(
+    place: Path, item: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "first", "-p", item]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert untouched(place)
+
+
+@pytest.mark.parametrize("seed", ["-1", "2147483648", "1.0", "x", "", "nan", "1e3", "0x10", "9" * 99])
+def test_bad_seeds_are_refused_before_any_file_exists(place: Path, seed: str) -> None:
+    assert main(["run", "first", f"--seed={seed}"]) == 2
+    assert main(["run", "first", "--scale", "huge"]) == 2
+    assert untouched(place)
+
+
+def test_an_unknown_notebook_is_refused_listing_those_that_exist(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "contrl"]) == 2
+    assert "there are first, second, or all" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["x = 1 + y", "import os", "x, y = 1, 2", "x = open('f')", "x ="])
+def test_a_parameters_cell_holds_literals_only(place: Path, source: str) -> None:
+    with pytest.raises(ParameterError, match="parameters cell"):
+        runs.parameters(write_notebook(place / "03_bad.ipynb", parameters=source))
+
+
+# Execution -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_notebook_runs_with_its_parameters_into_its_folder(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "first", "--scale", "smoke", "--seed", "3", "-p", "rate=0.25", "-p", "fast=true"]) == 0
+    executed = place / "runs {x} ü" / "smoke" / "seed3" / "01_first.ipynb"
+    assert capsys.readouterr().out.strip() == str(executed)
+    notebook = nbformat.read(executed, 4)
+    assert notebook.cells[-1].outputs[0].data["text/plain"] == "('smoke', 3, 0.25, 'x', True)"
+    entry = status(place, "smoke", 3)["01_first"]
+    assert entry["state"] == "complete"
+    assert entry["parameters"]["seed"] == 3
+    assert not list(executed.parent.glob(".*.ipynb"))
+
+
+UNFINISHED = {
+    "raises": ("1 / 0", "ZeroDivisionError: division by zero"),
+    "exits": ("import sys; sys.exit(0)", "stopped before its last cell"),
+    "killed": ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "died"),
+}
+
+
+@pytest.mark.parametrize("how", UNFINISHED)
+def test_a_notebook_that_does_not_reach_its_end_failed(place: Path, how: str) -> None:
+    source, message = UNFINISHED[how]
+    notebook = write_notebook(place / "notebooks" / "01_first.ipynb", source, "print('after')")
+    with pytest.raises(RunError, match=rf"01_first failed: [\s\S]*{message}[\s\S]*See .*01_first.ipynb"):
+        runs.execute(notebook, progress=False)
+    assert status(place)["01_first"]["state"] == "failed"
+    assert message in status(place)["01_first"]["error"]
+
+
+def test_running_all_stops_at_the_first_failure(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_notebook(place / "notebooks" / "01_first.ipynb", "1 / 0")
+    assert main(["run", "all"]) == 1
+    assert "ZeroDivisionError" in capsys.readouterr().err
+    assert set(status(place)) == {"01_first"}
+
+
+def start(place: Path) -> subprocess.Popen[bytes]:
+    """A process that runs a notebook which never ends, once its kernel is in that cell."""
+    write_notebook(
+        place / "notebooks" / "01_first.ipynb",
+        f"open({str(place / 'inside')!r}, 'w').write(str(__import__('os').getpid()))\nimport time; time.sleep(60)",
+    )
+    code = (
+        "import sys; from pathlib import Path; from tsmlib import runs; from tsmlib.__main__ import main;"
+        f"runs.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=runs.ROOT, stderr=subprocess.DEVNULL)
+    wait_for(lambda: (place / "inside").exists() and bool((place / "inside").read_text()))
+    return process
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def gone(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_run_is_interrupted_and_its_kernel_goes(place: Path, number: signal.Signals) -> None:
+    process = start(place)
+    process.send_signal(number)
+    assert process.wait(120) == 130
+    assert status(place)["01_first"]["state"] == "interrupted"
+    wait_for(lambda: gone(int((place / "inside").read_text())))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_one_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
+    process = start(place)
+    try:
+        second = runs.notebooks()["second"]
+        with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid}, 01_first"):
+            runs.execute(second, progress=False)
+        assert set(status(place)) == {"01_first"}
+    finally:
+        process.kill()
+        process.wait()
+    assert status(place)["01_first"]["state"] == "running"
+    runs.execute(second, progress=False)
+    assert status(place)["02_second"]["state"] == "complete"
+    os.kill(int((place / "inside").read_text()), signal.SIGKILL)
+
+
+# papermill by itself -------------------------------------------------------------------------------------------------
+
+
+def in_terminal(command: list[str], cwd: Path, environment: dict[str, str]) -> tuple[int, str]:
+    """Exit status and screen of a command typed in a terminal."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.chdir(cwd)
+        os.execve(command[0], command, environment)
+    screen = b""
+    while True:
+        try:
+            block = os.read(terminal, 4096)
+        except OSError:  # the terminal closes with its last process
+            break
+        if not block:
+            break
+        screen += block
+    os.close(terminal)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), screen.decode(errors="replace")
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A small copy of the repository whose package and entry point come before the installed ones."""
+    shutil.copytree(runs.ROOT / "tsmlib", tmp_path / "tsmlib", ignore=shutil.ignore_patterns("__pycache__"))
+    write_notebook(tmp_path / "notebooks" / "01_tiny.ipynb", "1 + 1")
+    info = tmp_path / "tsmlib-9.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tsmlib\nVersion: 9\n")
+    (info / "entry_points.txt").write_text("[papermill.io]\ntsmlib-default-output = tsmlib.papermill_plugin:handler\n")
+    return tmp_path
+
+
+PAPERMILL = str(Path(sys.executable).with_name("papermill"))
+
+
+def test_papermill_with_a_notebook_alone_works_in_a_terminal(clone: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(clone)}
+    code, screen = in_terminal([PAPERMILL, "notebooks/01_tiny.ipynb"], clone, environment)
+    assert code == 0, screen
+    executed = clone / "runs" / "laptop" / "seed0" / "01_tiny.ipynb"
+    assert nbformat.read(executed, 4).cells[-1].outputs[0].data["text/plain"] == "2"
+
+
+def test_papermill_writes_to_a_pipe_as_ever(clone: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(clone)}
+    done = subprocess.run(
+        [PAPERMILL, "notebooks/01_tiny.ipynb"],
+        cwd=clone,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=True,
+    )
+    assert nbformat.reads(done.stdout.decode(), 4).cells[-1].outputs[0].data["text/plain"] == "2"
+    assert not (clone / "runs").exists()
+
+
+def test_other_papermill_commands_are_left_alone(place: Path) -> None:
+    elsewhere = write_notebook(place / "elsewhere" / "01_first.ipynb")
+    here = str(place / "notebooks" / "01_first.ipynb")
+    for argv in (
+        ["papermill"],
+        ["papermill", "--help"],
+        ["papermill", here, "out.ipynb"],
+        ["papermill", here, "-p", "seed", "3"],
+        ["papermill", str(elsewhere)],
+        ["papermill", str(place / "notebooks" / "09_missing.ipynb")],
+        ["pytest", here],
+    ):
+        before = list(argv)
+        papermill_plugin.add_output_path(argv)
+        assert argv == before
+    assert untouched(place)
+    papermill_plugin.add_output_path(argv := ["/bin/papermill", here])
+    assert argv[2].endswith("laptop/seed0/01_first.ipynb")
+    assert "{{x}}" in argv[2]
+
+
+def test_the_installed_package_registers_the_entry_point() -> None:
+    names = [entry.name for entry in importlib.metadata.entry_points(group="papermill.io")]
+    assert "tsmlib-default-output" in names, "install the package first: pip install --no-deps -e ."
