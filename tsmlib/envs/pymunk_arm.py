@@ -64,7 +64,7 @@ class PymunkArm(ArmVectorEnv):
     def _simulate(self, actions: np.ndarray) -> np.ndarray:
         states = np.empty((*actions.shape[:2], len(self.names)))
         history = np.concatenate([self._history, actions], axis=1)
-        over = history.shape[1] >= self.max_episode_steps
+        over = self._history.shape[1] < self.max_episode_steps <= history.shape[1]
         live, self._live = self._live, [None] * self.num_envs  # after a fault every episode is replayed
         for i, torques in enumerate((GEAR * actions).tolist()):
             episode = live[i] or self._replayed(i)
@@ -73,7 +73,7 @@ class PymunkArm(ArmVectorEnv):
                 if reason := _fault(state):
                     raise SimulationUnstable(self.env_id, i, t, reason)
                 states[i, t] = state
-            live[i] = None if over else episode  # a space holds about 150 kB
+            live[i] = None if over else episode  # at the time limit the space, about 150 kB, is given back
         self._live, self._history = live, history
         return states
 
@@ -109,11 +109,11 @@ class _Episode:
         self.block: pymunk.Body | None = None
         self.obstacle: tuple[float, ...] = ()
         if task == "push":
-            self._add_block(tuple(state[6:8]), tuple(state[8:10]))
+            self._add_block((state[6], state[7]), (state[8], state[9]))
             self._add_walls()
         elif task == "obstacle":
             self.obstacle = (*state[6:8], 0.0, 0.0)
-            self._add_disc(self.space.static_body, tuple(state[6:8]))
+            self._add_disc(self.space.static_body, (state[6], state[7]))
 
     def step(self, shoulder: float, elbow: float) -> tuple[float, ...]:
         """Apply the torques (N m) for one step of DT and give the state."""
@@ -150,7 +150,7 @@ class _Episode:
             shape.friction = 1.0  # Chipmunk multiplies the friction, and the elasticity, of the two surfaces
         self.space.add(self.link1, self.link2, elbow, limit, shoulder_damper, elbow_damper, *shapes)
 
-    def _add_block(self, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+    def _add_block(self, position: tuple[float, float], velocity: tuple[float, float]) -> None:
         self.block = pymunk.Body(BLOCK_MASS, math.inf)  # it slides and does not turn
         self.block.position, self.block.velocity = position, velocity
         self.space.add(self.block)
@@ -159,7 +159,7 @@ class _Episode:
             drag = BLOCK_MASS / BLOCK_DECAY
             self.space.add(pymunk.DampedSpring(self.space.static_body, self.block, anchor, (0.0, 0.0), 0.0, 0.0, drag))
 
-    def _add_disc(self, body: pymunk.Body, centre: tuple[float, ...]) -> None:
+    def _add_disc(self, body: pymunk.Body, centre: tuple[float, float]) -> None:
         disc = pymunk.Circle(body, BLOCK_RADIUS, centre)
         disc.filter = pymunk.ShapeFilter(categories=BLOCK)
         disc.friction, disc.elasticity = FRICTION, 1.0

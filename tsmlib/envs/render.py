@@ -58,16 +58,18 @@ def draw_scene(
     if task != "reacher":
         fixed = task == "obstacle"
         face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
-        ax.add_patch(Circle(state[6:8], BLOCK_RADIUS, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))
+        ax.add_patch(Circle((state[6], state[7]), BLOCK_RADIUS, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))
         if fixed:  # a bolt: it does not move
-            ax.add_patch(Circle(state[6:8], 0.25 * BLOCK_RADIUS, fc=INK, ec="none", alpha=alpha, zorder=3))
+            ax.add_patch(Circle((state[6], state[7]), 0.25 * BLOCK_RADIUS, fc=INK, ec="none", alpha=alpha, zorder=3))
     elbow, _, tip = arm_points(state[:2])
     ax.add_patch(Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9))  # the pedestal
     _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)
-    ax.add_patch(Circle(tip, 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3))
+    ax.add_patch(Circle((tip[0], tip[1]), 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3))
     for joint in (np.zeros(2), elbow):
-        ax.add_patch(Circle(joint, 0.5 * ARM_RADIUS, fc="white", ec=INK, lw=0.8, alpha=alpha, zorder=4.4))
+        ax.add_patch(
+            Circle((joint[0], joint[1]), 0.5 * ARM_RADIUS, fc="white", ec=INK, lw=0.8, alpha=alpha, zorder=4.4)
+        )
 
 
 def render_array(state: np.ndarray, env_id: str, target: np.ndarray | None = None, size: int = 480) -> np.ndarray:
@@ -101,7 +103,7 @@ def _target(ax: Axes, centre: np.ndarray, radius: float) -> None:
     """A ring the size of what should reach it, and a cross."""
     from matplotlib.patches import Circle
 
-    ax.add_patch(Circle(centre, radius, fc="none", ec=TARGET, lw=1.6, zorder=5))
+    ax.add_patch(Circle((centre[0], centre[1]), radius, fc="none", ec=TARGET, lw=1.6, zorder=5))
     arm = 0.5 * min(radius, 2 * ARM_RADIUS)
     for dx, dy in ((arm, 0.0), (0.0, arm)):
         ax.plot(centre[0] + np.array([-dx, dx]), centre[1] + np.array([-dy, dy]), color=TARGET, lw=1.6, zorder=5)

@@ -62,15 +62,16 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
         super().__init__(env)
         if isinstance(tau, bool) or not isinstance(tau, int | np.integer) or tau < 0:
             raise ValueError(f"tau is {tau!r}; expected a whole number of steps, at least 0")
-        self.tau = int(tau)
+        if not isinstance(env.action_space, gymnasium.spaces.Box):
+            raise ValueError(f"the action space is {env.action_space}; expected a Box, where zero means no torque")
+        self.tau, self._nothing = int(tau), np.zeros_like(env.action_space.low)
         self._on_the_way: deque[np.ndarray] = deque()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """As the environment's; actions still on the way are forgotten."""
-        space = self.env.action_space
-        self._on_the_way = deque(np.zeros(space.shape, space.dtype) for _ in range(self.tau))
+        self._on_the_way = deque([self._nothing] * self.tau)
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
