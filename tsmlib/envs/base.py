@@ -34,7 +34,7 @@ WALL = 0.28  # the walls' faces, at the inner edge of Reacher's frame; the block
 BLOCK_MASS = 1.0  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
 BLOCK_DECAY = 0.2  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
-FRICTION = 1.0  # Reacher's own; the object does not turn, so it sticks to the arm rather than rolling
+FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
 BLOCK_RING = (0.1, 0.2)  # m; distance of the block's centre from the shoulder at reset: within reach all around
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
 

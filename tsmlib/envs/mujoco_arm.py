@@ -1,8 +1,10 @@
 """The arm in MuJoCo: Gymnasium's own Reacher, and the variants with a block edited from it.
 
-The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions, velocities and time are
-the whole state (no automatic reset, no warm start of the constraint solver). All episodes are simulated together by
-``mujoco.rollout`` in C++ threads; memory is bounded by simulating a few hundred episodes at a time.
+The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions, velocities and time
+are the whole state (no automatic reset, no warm start of the constraint solver). ``mujoco.rollout`` simulates all
+episodes in C++ threads; memory is bounded by passing it a few hundred episodes at a time.
+
+Contacts have no friction: torques of 200 N m are so strong that friction would wedge the arm against the obstacle.
 """
 
 from __future__ import annotations
@@ -25,7 +27,6 @@ from tsmlib.envs.base import (
     BLOCK_MASS,
     BLOCK_RADIUS,
     DT,
-    FRICTION,
     RESTITUTION,
     WALL,
     ArmVectorEnv,
@@ -35,15 +36,16 @@ from tsmlib.envs.base import (
 )
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
-TIMESTEP = (
-    0.002  # s, of the variants; the basic arm keeps its 0.01 s. At 5 m/s a link moves 0.01 m, a third of the block
-)
 PLANE = 0.01  # m, height of the plane in which all centres move
-CONTACT_TIME = 2 * TIMESTEP  # s; the stiffest contact MuJoCo allows at this time step
-SOLIMP = (0.999, 0.9999, 0.001, 0.5, 2)  # nearly rigid: what is left of a squeeze is below a tenth of a millimetre
-WALL_TIME = 6 * TIMESTEP  # s; duration of a bounce
-MAX_SPEED = 1e3  # rad/s or m/s; full torque reaches about 30
-CHUNK = 256  # episodes simulated together: 256 x 100 steps of 10 substeps are 20 MB
+TIMESTEP = 0.00125  # s, of the variants (the basic arm keeps 0.01 s): a fingertip at 30 m/s cannot step past the block
+CONTACT_TIME = 2 * TIMESTEP  # s; the stiffest contact that is stable at this time step, and critically damped
+WALL_TIME = 6 * TIMESTEP  # s; a bounce takes about as long, enough substeps for its restitution to be right
+RIGID = (0.999, 0.9999, 0.001, 0.5, 2)  # solimp: what remains of a squeeze at full torque is below 0.1 mm
+MAX_SPEED = 1e3  # rad/s or m/s; full torque held for a whole episode reaches 180 rad/s
+IMAGE_SIZE = 480  # pixels
+CHUNK = 256  # episodes handed to MuJoCo together: 256 episodes of 100 steps of 16 substeps are 30 MB
+
+_gl_works = True  # until the first failure to get a context
 
 
 @cache
@@ -66,7 +68,7 @@ def load_model(env_id: str) -> mujoco.MjModel:
 def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
     """A disc among the arm's links: on two damped slides between four walls, or fixed at its mocap position.
 
-    It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and it
+    It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and
     is drawn as a cylinder. It cannot leave the plane, and walls are half spaces, so nothing passes them.
     """
     block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
@@ -77,9 +79,9 @@ def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
         mass=BLOCK_MASS,
         contype=1,
         conaffinity=0,
-        friction=[FRICTION, 0.1, 0.1],
+        condim=1,  # no friction
         solref=[CONTACT_TIME, 1.0],
-        solimp=SOLIMP,
+        solimp=RIGID,
         priority=1,  # its parameters rule over those of the links
         group=3,  # not drawn
     )
@@ -116,10 +118,9 @@ def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
             contype=0,
             conaffinity=1,
             priority=2,  # walls bounce
-            friction=[0.0, 0.0, 0.0],
             condim=1,
             solref=[WALL_TIME, damping_ratio],
-            solimp=SOLIMP,
+            solimp=RIGID,
             group=3,
         )
 
@@ -216,6 +217,47 @@ class MujocoArm(ArmVectorEnv):
         self._physics, self._obstacle = snapshot[:, :-2].copy(), snapshot[:, -2:].copy()
         self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
         self._elapsed = self._elapsed or 0
+
+    def _image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Seen from above by MuJoCo's renderer, or drawn by matplotlib where there is no OpenGL."""
+        global _gl_works
+        if _gl_works:
+            try:
+                return self._photograph(state, target)
+            except Exception as error:  # without GL the failure depends on the driver: FatalError, AttributeError, ...
+                _gl_works = False
+                warnings.warn(f"MuJoCo cannot render here ({error}); drawing with matplotlib instead", stacklevel=2)
+        return super()._image(state, target)
+
+    def _photograph(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self.model, IMAGE_SIZE, IMAGE_SIZE)
+        data = self._data[0]
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:2] = state[:2]
+        if self.task == "reacher":
+            data.qpos[2:] = target
+        elif self.task == "push":
+            data.qpos[2:] = state[6:8]
+        else:
+            data.mocap_pos[0, :2] = state[6:8]
+        mujoco.mj_kinematics(self.model, data)
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = 0.0, 0.0, PLANE
+        camera.distance, camera.azimuth, camera.elevation = 0.85, 90.0, -90.0
+        self._renderer.update_scene(data, camera)
+        if self.task != "reacher":  # the variants have no target body
+            scene = self._renderer.scene
+            mujoco.mjv_initGeom(
+                scene.geoms[scene.ngeom],
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                np.full(3, 0.009),
+                np.array([*target, PLANE]),
+                np.eye(3).ravel(),
+                np.array([0.9, 0.2, 0.2, 1.0], np.float32),
+            )
+            scene.ngeom += 1
+        return self._renderer.render()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the threads and release the renderer."""
