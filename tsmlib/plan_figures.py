@@ -1,0 +1,258 @@
+"""Figures of plans: what they earned, what the model promised, the torques, and the film of one.
+
+The paper's figures 6 and 10 and what surrounds them. Reached through ``tsmlib.figures``, where labels are explained.
+Letters in shapes: n targets, T steps, I iterations, dx state size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from tsmlib.style import (
+    COLOURS,
+    NAMES,
+    WIDTH,
+    colour,
+    interval,
+    joint_legend,
+    legend,
+    name,
+    pretty,
+    shaped,
+    styled,
+    tint,
+    torques,
+    words,
+)
+
+Results = Mapping[str, Mapping[str, Mapping[str, np.ndarray | None]]]  # task -> label -> {"true", "predicted"}
+REFERENCES = {"oracle": "-", "zero": "--", "random": ":"}  # drawn as lines: nothing a model could gain or lose
+PLANNER_MARKERS = {"adam": "o", "cem": "s", "mppi": "^", "policy": "D"}
+
+
+def _returns(results: Results) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray | None]]]:
+    """Checked results: task -> label -> (true (n,), predicted (n,) or None)."""
+    checked: dict[str, dict[str, tuple[np.ndarray, np.ndarray | None]]] = {}
+    for task, rows in results.items():
+        checked[task] = {}
+        for label, row in rows.items():
+            words(label)
+            true = shaped(f"results['{task}']['{label}']['true']", row["true"], "n")  # type: ignore[arg-type]
+            given = row.get("predicted")
+            predicted = None if given is None else shaped(f"results['{task}']['{label}']['predicted']", given, "n")
+            if predicted is not None and len(predicted) != len(true):
+                raise ValueError(f"{task}, {label}: {len(true)} true and {len(predicted)} predicted returns")
+            for word, array in (("true", true), ("predicted", predicted)):
+                if array is not None and not np.isfinite(array).all():
+                    raise ValueError(
+                        f"{task}, {label}: {np.sum(~np.isfinite(array))} of {array.size} {word} returns are not "
+                        "finite; a mean over them means nothing. Drop or explain these targets first"
+                    )
+            checked[task][label] = (true, predicted)
+    if not any(checked.values()):
+        raise ValueError("results hold no task with a label: nothing to draw")
+    return checked
+
+
+def _markers(label: str) -> tuple[str, bool]:
+    """The marker of a label's planner and whether it is filled (planned through the action prior)."""
+    rest = words(label)[1].split()
+    marker = next((PLANNER_MARKERS[word] for word in rest if word in PLANNER_MARKERS), "o")
+    return marker, "actions" not in rest
+
+
+def _groups(labels: Sequence[str]) -> tuple[dict[str, float], dict[str, float], float]:
+    """Heights of the rows of a forest plot: label -> y, model -> y of its first row, and the lowest edge."""
+    heights: dict[str, float] = {}
+    heads: dict[str, float] = {}
+    y = 0.0
+    for model in COLOURS:
+        for label in (label for label in labels if words(label)[0] == model):
+            heads.setdefault(model, y)
+            heights[label] = y
+            y += 1.0
+        y += 0.5 if model in heads else 0.0
+    return heights, heads, y - 1.0
+
+
+@styled
+def figure6(results: Results) -> Figure:
+    """Trajectory optimisation (paper, figure 6): the cost of the executed plans and how far the model misjudged it.
+
+    results: task -> label -> {"true": (n,), "predicted": (n,) or None}, undiscounted returns per target. Points are
+    means, bars 95 % t intervals over targets. Labels that start with oracle, zero or random become reference lines
+    (of several oracles the better one). Filled: planned through the action prior (codes); open: raw actions.
+    """
+    checked = _returns(results)
+    methods = {task: [label for label in rows if words(label)[0] not in REFERENCES] for task, rows in checked.items()}
+    lengths = [max(2.0, _groups(labels)[2] + 1.0) for labels in methods.values()]
+    figure, axes = plt.subplots(
+        len(checked), 2, figsize=(WIDTH, sum(0.17 * length + 0.42 for length in lengths) + 0.3), squeeze=False,
+        sharey="row", height_ratios=lengths,
+    )  # fmt: skip
+    used: set[str] = set()
+    for (cost, gap), (task, rows) in zip(axes, checked.items(), strict=True):
+        heights, heads, low = _groups(methods[task])
+        for reference, dashes in REFERENCES.items():
+            means = [-rows[label][0].mean() for label in rows if words(label)[0] == reference]
+            if means:
+                cost.axvline(min(means), color=COLOURS[reference], ls=dashes, lw=1, zorder=1)
+                used.add(reference)
+        for label, y in heights.items():
+            true, predicted = rows[label]
+            marker, filled = _markers(label)
+            look: dict[str, Any] = {"color": colour(label), "marker": marker, "ms": 4.2,
+                    "mfc": colour(label) if filled else "white", "mew": 0.9, "elinewidth": 1.0, "capsize": 0, "ls": "", "zorder": 3}  # fmt: skip
+            shown = [(cost, -true)] + ([(gap, predicted - true)] if predicted is not None else [])
+            for ax, values in shown:
+                mean, half = interval(values)
+                ax.errorbar(mean, y, xerr=half, **look)
+        gap.axvline(0, color="#999999", lw=0.6, zorder=1)
+        for ax in (cost, gap):
+            for y in heights.values():
+                ax.axhline(y, color="#EEEEEE", lw=0.6, zorder=0)
+            ax.spines["left"].set_visible(False)
+            ax.tick_params(axis="y", length=0)
+            ax.margins(x=0.06)
+        cost.set_yticks(list(heights.values()), [", ".join(pretty(words(label)[1])) for label in heights])
+        cost.set_ylim(low + 0.7, -0.7)
+        wide = max((len(text.get_text()) for text in cost.get_yticklabels()), default=0)
+        for model, y in heads.items():
+            cost.annotate(NAMES.get(model, model), (0, y), (-3.6 * wide - 8, 0), xycoords=("axes fraction", "data"),
+                          textcoords="offset points", ha="right", va="center_baseline", fontsize=7,
+                          color=COLOURS[model], weight="bold")  # fmt: skip
+        cost.set_title(f"{task.capitalize()}: true cost (lower is better)")
+        gap.set_title(f"{task.capitalize()}: exploitation gap (nearer 0 is better)")
+        cost.set_xlabel("−return of the executed plan")
+        gap.set_xlabel("predicted − true return")
+    dark = COLOURS["data"]
+    handles = [Line2D([], [], color=COLOURS[r], ls=REFERENCES[r], lw=1, label=name(r)) for r in REFERENCES if r in used]
+    for fill, text in ((dark, "through the action prior"), ("white", "raw actions")):
+        handles.append(Line2D([], [], color=dark, ls="", marker="o", ms=4.2, mfc=fill, mew=0.9, label=text))
+    legend(figure, handles)
+    return figure
+
+
+@styled
+def predicted_vs_true(results: Results) -> Figure:
+    """What the model promised against what the arm got, one dot per target; the line to the diagonal is the gap.
+
+    results as in ``figure6``; labels without predictions are left out.
+    """
+    checked = {task: {label: row for label, row in rows.items() if row[1] is not None}
+               for task, rows in _returns(results).items()}  # fmt: skip
+    checked = {task: rows for task, rows in checked.items() if rows}
+    if not checked:
+        raise ValueError("no label has predicted returns: nothing to compare with the true ones")
+    columns = min(4, max(len(rows) for rows in checked.values()))
+    heights = {task: -(-len(rows) // columns) for task, rows in checked.items()}
+    size = WIDTH / max(columns, 3)
+    figure = plt.figure(figsize=(size * columns, 1.02 * size * sum(heights.values()) + 0.2 * len(heights)))
+    grid = figure.add_gridspec(sum(heights.values()), columns)
+    first = 0
+    for task, rows in checked.items():
+        everything = np.concatenate([part for row in rows.values() for part in row if part is not None])
+        edge = 0.04 * np.ptp(everything) + 1e-9
+        limits = (everything.min() - edge, everything.max() + edge)
+        for i, (label, (true, predicted)) in enumerate(rows.items()):
+            assert predicted is not None
+            ax = figure.add_subplot(grid[first + i // columns, i % columns])
+            ax.plot(limits, limits, color="#999999", lw=0.7, zorder=1)
+            ax.vlines(true, true, predicted, color=tint(colour(label), 0.35), lw=0.6, zorder=2)
+            ax.scatter(true, predicted, s=7, color=colour(label), linewidths=0, zorder=3)
+            ax.set_title(name(label), fontsize=7)
+            ax.annotate(f"mean gap {np.mean(predicted - true):+.2f}", (0.97, 0.05), xycoords="axes fraction",
+                        ha="right", fontsize=6.5)  # fmt: skip
+            ax.set(xlim=limits, ylim=limits, aspect="equal")
+            ax.locator_params(nbins=5)
+            ax.set_xlabel("true return" if i + columns >= len(rows) else "")
+            ax.set_ylabel("" if i % columns else f"{task.capitalize()}: predicted return")
+        first += heights[task]
+    return figure
+
+
+@styled
+def gap_against_iterations(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """Does more optimisation help the arm or only the model? Returns, and the gap between them, along the iterations.
+
+    curves: label -> {"iterations": (I,), "true": (I, n), "predicted": (I, n)}, returns of the plans so far per target.
+    """
+    figure, (returns, gap) = plt.subplots(1, 2, figsize=(WIDTH, 2.2), width_ratios=(1.15, 1))
+    handles = []
+    drawn: dict[str, int] = {}
+    for label, curve in curves.items():
+        steps, main, model = shaped(f"{label}: iterations", curve["iterations"], "I"), colour(label), words(label)[0]
+        true = shaped(f"{label}: true", curve["true"], f"{len(steps)} n")
+        predicted = shaped(f"{label}: predicted", curve["predicted"], f"{len(steps)} {true.shape[1]}")
+        marker = "os^D"[drawn.get(model, 0) % 4]
+        drawn[model] = drawn.get(model, 0) + 1
+        look: dict[str, Any] = {"color": main, "marker": marker, "markevery": max(1, len(steps) // 6), "ms": 3.2}
+        returns.plot(steps, true.mean(1), **look)
+        returns.plot(steps, predicted.mean(1), ls="--", **look | {"mfc": "white"})
+        middle, half = np.array([interval(row) for row in predicted - true]).T
+        gap.plot(steps, middle, **look)
+        gap.fill_between(steps, middle - half, middle + half, color=main, alpha=0.18, lw=0)
+        handles.append(Line2D([], [], color=main, marker=marker, ms=3.2, label=name(label)))
+    gap.axhline(0, color="#999999", lw=0.6)
+    returns.set(xlabel="iterations of the planner", ylabel="mean return", title="return")
+    gap.set(xlabel="iterations of the planner", ylabel="predicted − true return", title="exploitation gap")
+    dark = COLOURS["data"]
+    handles += [Line2D([], [], color=dark, label="executed"), Line2D([], [], color=dark, ls="--", label="predicted")]
+    legend(figure, handles, columns=5)
+    return figure
+
+
+@styled
+def plan_actions(data_actions: np.ndarray, prior_plan: np.ndarray, direct_plan: np.ndarray, dt: float,
+                 label: str = "tsm") -> Figure:  # fmt: skip
+    """What the action prior does to a plan (paper, figure 10): torques of the data, of a plan over latent codes and of
+    a plan over raw actions, each (T, 2) in [-1, 1]; dt in s. The number is the mean change from step to step."""
+    figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 1.6), sharey=True)
+    shown = (("training data", data_actions, COLOURS["data"]), ("planned over latent codes", prior_plan, colour(label)),
+              ("planned over raw actions", direct_plan, colour(label)))  # fmt: skip
+    for ax, (title, actions, main) in zip(axes, shown, strict=True):
+        actions = shaped(title, actions, "T 2")
+        torques(ax, actions, dt, main)
+        ax.set_title(title)
+        change = np.abs(np.diff(actions, axis=0)).mean() if len(actions) > 1 else 0.0
+        ax.set_title(f"mean |Δu| {change:.3f}", loc="right", fontsize=6.5, color="#555555")
+        ax.set_xlabel("time (s)")
+    axes[0].set_ylabel("torque (share of full)")
+    joint_legend(figure)
+    return figure
+
+
+@styled
+def plan_strip(
+    draw: Callable[[Axes, np.ndarray, np.ndarray], object], predicted_states: np.ndarray, true_states: np.ndarray,
+    target: np.ndarray, times: Sequence[int], dt: float = 0.02,
+) -> Figure:  # fmt: skip
+    """A filmstrip: what the model dreamt above, what the arm did below, at the steps ``times``.
+
+    draw(ax, state (dx,), target (2,)) paints one scene; predicted_states and true_states: (T, dx); dt in s.
+    """
+    predicted = shaped("predicted_states", predicted_states, "T dx")
+    true = shaped("true_states", true_states, f"{len(predicted)} {predicted.shape[1]}")
+    outside = [step for step in times if not 0 <= step < len(true)]
+    if outside or not len(times):
+        raise ValueError(f"times {list(times)} must be steps between 0 and {len(true) - 1}")
+    width = min(WIDTH, 1.4 * len(times) + 0.2)
+    figure, axes = plt.subplots(2, len(times), figsize=(width, 2 * width / len(times) + 0.15), squeeze=False,
+                                layout="compressed")  # fmt: skip
+    for row, states, title in zip(axes, (predicted, true), ("model", "simulator"), strict=True):
+        for ax, step in zip(row, times, strict=True):
+            draw(ax, states[step], np.asarray(target))
+            ax.set(aspect="equal", xticks=(), yticks=(), xlabel="", ylabel="", title="")
+            ax.set_axis_on()
+            ax.spines[:].set(visible=True, color="#CCCCCC")
+        row[0].set_ylabel(title, fontsize=7.5)
+    for ax, step in zip(axes[0], times, strict=True):
+        ax.set_title(f"{step * dt:.2f} s", fontsize=7)
+    return figure
