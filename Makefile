@@ -1,0 +1,43 @@
+# Two commands do everything on a fresh machine: `make control` and `make test`. The first use of either builds .venv.
+
+PYTHON ?= python3
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+
+.PHONY: help collect train control test lint clean
+
+help:
+	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
+	@echo "make collect   collect data      (notebooks/01_collect.ipynb)"
+	@echo "make train     train the models  (notebooks/02_train.ipynb)"
+	@echo "make test      all tests, then all notebooks cut down"
+	@echo "make lint      style and types"
+	@echo "make clean     remove .venv and caches; runs/ stays"
+
+collect train control: $(READY)
+	$(PY) -m tsmlib run $@
+
+test: $(READY)
+	$(PY) -m pytest
+	$(PY) -m pytest --nbval-lax notebooks
+
+lint: $(READY)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -not -path './runs/*' -prune -exec rm -rf {} +
+
+# torch goes first and by itself, so that a CPU build of it is kept where one is found.
+$(READY): environment.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "tsmlib needs Python 3.11 or newer, found `$(PYTHON) --version 2>&1`. Name another: make PYTHON=python3.12" >&2; exit 1; }
+	@echo "Building $(VENV) from environment.lock: about a minute, once."
+	$(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --quiet `grep '^torch==' environment.lock`
+	$(PY) -m pip install --quiet -r environment.lock
+	$(PY) -m pip install --quiet --no-deps --no-build-isolation -e .
+	@touch $@

@@ -1,0 +1,71 @@
+"""Notebooks: stored clean, written to one pattern, and run in order through papermill at the smallest scale."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+
+from tsmlib import runs, store
+
+NOTEBOOKS = list(runs.notebooks().values())
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def code(path: Path) -> Iterator[Any]:
+    return (cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code")
+
+
+def plain(source: str) -> str:
+    """Python without the lines that only IPython understands."""
+    return "\n".join(line for line in source.splitlines() if not line.lstrip().startswith(("%", "!")))
+
+
+@each_notebook
+def test_a_notebook_names_the_kernel_that_every_environment_has(path: Path) -> None:
+    metadata = nbformat.read(path, 4).metadata
+    assert metadata.kernelspec.name == "python3"
+    assert metadata.kernelspec.get("language", metadata.get("language_info", {}).get("name")) == "python"
+    assert "papermill" not in metadata
+
+
+@each_notebook
+def test_a_notebook_is_stored_without_outputs(path: Path) -> None:
+    nbformat.validate(json.loads(path.read_text()))
+    for cell in code(path):
+        assert not cell.outputs
+        assert cell.execution_count is None
+
+
+@each_notebook
+def test_a_notebook_calls_the_library_and_defines_nothing(path: Path) -> None:
+    for cell in code(path):
+        for node in ast.walk(ast.parse(plain(cell.source))):
+            assert not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef), cell.source
+
+
+@each_notebook
+def test_a_notebook_takes_a_scale_a_seed_and_a_folder(path: Path) -> None:
+    defaults = runs.parameters(path)
+    assert {"scale": "", "seed": 0, "run_dir": ""}.items() <= defaults.items()
+    assert {type(value) for value in defaults.values()} <= {str, int, float, bool}
+
+
+@pytest.mark.skipif("config.option.nbval or config.option.nbval_lax", reason="this session runs them already")
+@pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks")
+def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    for path in NOTEBOOKS:
+        runs.execute(path, scale="smoke", progress=False)
+        rows = store.load_table(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv")
+        assert rows
+        assert {row["scale"] for row in rows} == {"smoke"}
+    status = store.read_json(tmp_path / "smoke" / "seed0" / "status.json")
+    assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
+    store.verify(tmp_path)
+    assert not list(tmp_path.rglob("*.tmp-*"))

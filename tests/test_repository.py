@@ -1,0 +1,112 @@
+"""The repository keeps its promises: pins, layout, imports that point one way, commands that the README names."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import tsmlib
+from tsmlib.runs import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MODULES = sorted((ROOT / "tsmlib").rglob("*.py"))
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "environment.lock").read_text().splitlines()
+    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_the_lock_holds_exact_versions_and_no_addresses() -> None:
+    text = (ROOT / "environment.lock").read_text()
+    for name, version in pins().items():
+        assert re.fullmatch(r"[A-Za-z0-9._-]+", name)
+        assert re.fullmatch(r"[0-9][0-9a-z.]*", version), f"{name}=={version}"
+        assert not name.startswith(("nvidia", "triton", "cuda"))
+    assert "://" not in text
+    assert "--hash" not in text
+    assert pins()["torch"] == "2.13.0"
+
+
+def test_the_lock_covers_every_dependency() -> None:
+    wanted = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]
+    names = {re.split(r"[<>=!~\[ ]", line)[0].lower().replace("_", "-") for line in wanted}
+    assert names <= {name.lower().replace("_", "-") for name in pins()}
+
+
+def test_version_and_licence_are_stated_once_and_alike() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert tsmlib.__version__ == PROJECT["version"] == citation["version"]
+    assert PROJECT["license"] == citation["license"] == "MIT"
+    authors = [author["family-names"] for author in citation["preferred-citation"]["authors"]]
+    assert authors == ["Mishra", "Abbeel", "Mordatch"]
+
+
+def test_the_readme_names_commands_and_files_that_exist() -> None:
+    readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
+    for target in re.findall(r"\bmake (\w+)", readme):
+        assert re.search(rf"^(\w+ )*{target}( \w+)*:", makefile, re.MULTILINE), target
+    for name in re.findall(r"\]\(([^)#:]+)\)", readme):
+        assert (ROOT / name).exists(), name
+
+
+def imported(path: Path) -> set[str]:
+    """Every module that a file imports, at its top or within a function."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module == "tsmlib":
+            names |= {f"tsmlib.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module or "")
+    return names
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+def test_nothing_can_execute_what_it_reads(path: Path) -> None:
+    source = path.read_text()
+    assert not {name.split(".")[0] for name in imported(path)} & {"pickle", "cloudpickle", "joblib", "dill", "shelve"}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            assert called not in ("eval", "exec", "torch.load", "torch.save", "np.load", "np.save", "yaml.load"), called
+
+
+def test_imports_point_one_way() -> None:
+    """Nobody imports what is above it, so every module can be read knowing only those below."""
+    uses = {
+        path.stem: {name.split(".")[1] for name in imported(path) if name.startswith("tsmlib.")}
+        for path in (ROOT / "tsmlib").glob("*.py")
+    }
+    for low in ("trajectory", "nets", "rewards", "runs"):
+        assert uses.get(low, set()) <= {"trajectory", "store"}, low
+    assert uses["store"] == {"trajectory"}
+    seen: list[str] = []
+    while uses:  # a round that finds nothing means a circle
+        free = [name for name, needs in uses.items() if not needs & set(uses)]
+        assert free, f"imports go in a circle among {sorted(uses)}"
+        seen += free
+        for name in free:
+            del uses[name]
+
+
+def test_environments_import_nothing_else_of_the_package() -> None:
+    for path in (ROOT / "tsmlib" / "envs").glob("*.py"):
+        for name in imported(path):
+            assert not name.startswith("tsmlib") or name.startswith("tsmlib.envs"), f"{path.name} imports {name}"
+
+
+def test_what_running_leaves_behind_is_ignored() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    made = [".venv/x", "runs/laptop/seed0/x", "tsmlib.egg-info/x", "tsmlib/__pycache__/x", ".ruff_cache/x"]
+    made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12"]
+    done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == made
