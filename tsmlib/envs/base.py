@@ -11,8 +11,9 @@ four methods: ``_start``, ``_simulate``, ``get_state`` and ``set_state``. One ar
 
 from __future__ import annotations
 
+import secrets
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -110,7 +111,7 @@ class ArmVectorEnv(VectorEnv, ABC):
     (N, 2) sets the target. Without them, episode i is drawn from (seed, i) alone, so it does not depend on N.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": ["rgb_array"],
         "render_fps": round(1 / DT),
         "autoreset_mode": AutoresetMode.DISABLED,
@@ -133,7 +134,7 @@ class ArmVectorEnv(VectorEnv, ABC):
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._seed_root: int | None = None
+        self._seed_root: int | None = None  # of the last reset with a seed
         self._resets = 0
         self._elapsed: int | None = None  # steps since reset; None before the first
         self._states = np.zeros((num_envs, dx))
@@ -171,8 +172,9 @@ class ArmVectorEnv(VectorEnv, ABC):
             raise ValueError(f"unknown reset options {sorted(unknown)}; expected 'states' and 'target'")
         super().reset(seed=seed)
         if seed is not None or self._seed_root is None:
-            self._seed_root, self._resets = (seed if seed is not None else np.random.SeedSequence().entropy), 0
-        draws = [self._draw(np.random.default_rng([self._seed_root, self._resets, i])) for i in range(self.num_envs)]
+            self._seed_root, self._resets = (secrets.randbits(64) if seed is None else seed), 0
+        root = (self._seed_root, self._resets)
+        draws = [self._draw(np.random.default_rng((*root, i))) for i in range(self.num_envs)]
         self._resets += 1
         states, target = (np.stack(part) for part in zip(*draws, strict=True))
         if "states" in options:
@@ -264,12 +266,14 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
 class ArmEnv(gymnasium.Env):
     """One arm: the vector environment of the same id with N = 1, so single and bulk simulation agree bit for bit."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
     angles = (0, 1)
     dt = DT
 
     def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
-        self.vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode, **kwargs).unwrapped
+        vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode, **kwargs).unwrapped
+        assert isinstance(vector, ArmVectorEnv)
+        self.vector = vector
         self.env_id, self.render_mode = env_id, render_mode
         self.names, self.units, self.task = self.vector.names, self.vector.units, self.vector.task
         self.observation_space = self.vector.single_observation_space

@@ -125,6 +125,10 @@ def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
         )
 
 
+def _ignore(message: str) -> None:
+    """Takes MuJoCo's warnings."""
+
+
 class MujocoArm(ArmVectorEnv):
     """N arms in MuJoCo. ``threads`` simulate at once (default: the processors there are, at most 8)."""
 
@@ -173,7 +177,12 @@ class MujocoArm(ArmVectorEnv):
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
             position = np.concatenate([obstacle, np.full((len(obstacle), 1), PLANE)], axis=1)
             control = np.concatenate([control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2)
-        physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
+        handler = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(_ignore)  # no MUJOCO_LOG.TXT: `_check` reports what went wrong
+        try:
+            physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
+        finally:
+            mujoco.set_mju_user_warning(handler)
         return physics[:, self.frame_skip - 1 :: self.frame_skip].copy()
 
     def _to_states(self, physics: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
@@ -215,6 +224,7 @@ class MujocoArm(ArmVectorEnv):
         if snapshot.shape != expected:
             raise ValueError(f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}")
         self._physics, self._obstacle = snapshot[:, :-2].copy(), snapshot[:, -2:].copy()
+        self._check(self._physics[:, None], self._physics[:, 0] - DT, 0)
         self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
         self._elapsed = self._elapsed or 0
 
@@ -252,7 +262,7 @@ class MujocoArm(ArmVectorEnv):
                 scene.geoms[scene.ngeom],
                 mujoco.mjtGeom.mjGEOM_SPHERE,
                 np.full(3, 0.009),
-                np.array([*target, PLANE]),
+                np.array([*target, 3 * PLANE]),
                 np.eye(3).ravel(),
                 np.array([0.9, 0.2, 0.2, 1.0], np.float32),
             )
