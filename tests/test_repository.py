@@ -56,6 +56,13 @@ def test_the_readme_names_commands_and_files_that_exist() -> None:
         assert (ROOT / name).exists(), name
 
 
+def test_the_readme_program_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TSM_SCALE", "smoke")
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(compile(program.replace(".take(10)", ".take(2)"), "README.md", "exec"), {})
+
+
 def imported(path: Path) -> set[str]:
     """Every module that a file imports, at its top or within a function."""
     names: set[str] = set()
