@@ -123,7 +123,7 @@ def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
     figure, ax = plt.subplots(figsize=(3.3, 2.8))
     edge = 1.08 * (reach or np.abs(flat).max())
     shades = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.18, 1, 256)))  # one visit is not white
-    bins = ax.hexbin(*flat.T, gridsize=48, mincnt=1, norm=LogNorm(), cmap=shades, linewidths=0.1, edgecolors="face",
+    bins = ax.hexbin(*flat.T, gridsize=60, mincnt=1, norm=LogNorm(), cmap=shades, linewidths=0.1, edgecolors="face",
                      extent=(-edge, edge, -edge, edge))  # fmt: skip
     if reach:
         ax.add_patch(Circle((0, 0), reach, fill=False, ec=COLOURS["data"], lw=0.7, ls="--"))

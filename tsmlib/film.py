@@ -34,7 +34,7 @@ def side_by_side(left: np.ndarray, right: np.ndarray, labels: tuple[str, str]) -
     for film, label in zip((left, right), labels, strict=True):
         held = film[np.minimum(np.arange(length), len(film) - 1)]
         banner = Figure(figsize=(film.shape[2] / 100, height / 100), dpi=100, facecolor="white")
-        banner.text(0.5, 0.45, label, ha="center", va="center", fontsize=0.42 * height, family="DejaVu Sans")
+        banner.text(0.5, 0.45, label, ha="center", va="center", fontsize=0.5 * height, family="DejaVu Sans")
         canvas = FigureCanvasAgg(banner)
         canvas.draw()
         strip = np.asarray(canvas.buffer_rgba())[..., :3]

@@ -108,8 +108,8 @@ def figure6(results: Results) -> Figure:
         for label, y in heights.items():
             true, predicted = rows[label]
             marker, filled = _markers(label)
-            look: dict[str, Any] = {"color": colour(label), "marker": marker, "ms": 4.2,
-                    "mfc": colour(label) if filled else "white", "mew": 0.9, "elinewidth": 1.0, "capsize": 0, "ls": "", "zorder": 3}  # fmt: skip
+            look = {"color": colour(label), "marker": marker, "mfc": colour(label) if filled else "white",
+                    "ms": 4.2, "mew": 0.9, "elinewidth": 1.0, "capsize": 0, "ls": "", "zorder": 3}  # fmt: skip
             shown = [(cost, -true)] + ([(gap, predicted - true)] if predicted is not None else [])
             for ax, values in shown:
                 mean, half = interval(values)
@@ -215,8 +215,8 @@ def plan_actions(data_actions: np.ndarray, prior_plan: np.ndarray, direct_plan: 
     """What the action prior does to a plan (paper, figure 10): torques of the data, of a plan over latent codes and of
     a plan over raw actions, each (T, 2) in [-1, 1]; dt in s. The number is the mean change from step to step."""
     figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 1.6), sharey=True)
-    shown = (("training data", data_actions, COLOURS["data"]), ("planned over latent codes", prior_plan, colour(label)),
-              ("planned over raw actions", direct_plan, colour(label)))  # fmt: skip
+    shown = (("training data", data_actions, COLOURS["data"]), ("plan over codes", prior_plan, colour(label)),
+              ("plan over actions", direct_plan, colour(label)))  # fmt: skip
     for ax, (title, actions, main) in zip(axes, shown, strict=True):
         actions = shaped(title, actions, "T 2")
         torques(ax, actions, dt, main)
@@ -236,7 +236,8 @@ def plan_strip(
 ) -> Figure:  # fmt: skip
     """A filmstrip: what the model dreamt above, what the arm did below, at the steps ``times``.
 
-    draw(ax, state (dx,), target (2,)) paints one scene; predicted_states and true_states: (T, dx); dt in s.
+    draw(ax, state (dx,), target (2,)) paints one scene; predicted_states and true_states: (T, dx), row k the
+    state after k + 1 steps of dt seconds.
     """
     predicted = shaped("predicted_states", predicted_states, "T dx")
     true = shaped("true_states", true_states, f"{len(predicted)} {predicted.shape[1]}")
@@ -254,5 +255,5 @@ def plan_strip(
             ax.spines[:].set(visible=True, color="#CCCCCC")
         row[0].set_ylabel(title, fontsize=7.5)
     for ax, step in zip(axes[0], times, strict=True):
-        ax.set_title(f"{step * dt:.2f} s", fontsize=7)
+        ax.set_title(f"{(step + 1) * dt:.2f} s", fontsize=7)
     return figure

@@ -182,4 +182,5 @@ def torques(ax: Axes, actions: np.ndarray, dt: float, main: str, limit: float = 
         ax.step(seconds, held, where="post", color=shade, zorder=order)
     ax.set(xlim=(0, seconds[-1]), ylim=(-1.08 * limit, 1.08 * limit))
     ax.locator_params(axis="y", nbins=4)
+    ax.locator_params(axis="x", nbins=4)
     ax.axhline(0, color="#DDDDDD", lw=0.5, zorder=0)

@@ -1,0 +1,172 @@
+"""Every figure draws what it is given, in one colour per method, into files whose bytes do not change."""
+
+from __future__ import annotations
+
+import inspect
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from tsmlib import figures, style
+
+NAMES = ("joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y")
+UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m")
+IDS = [f"tsm/{s}{e}-v0" for s in ("", "Pymunk") for e in ("Reacher", "Obstacle", "Push")]
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.clip(np.random.default_rng(0).normal(scale=0.3, size=shape), -1, 1)
+
+
+def returns() -> dict[str, dict[str, dict[str, np.ndarray | None]]]:
+    true = -1 - np.abs(noise(12))
+    rows: dict[str, dict[str, np.ndarray | None]] = {
+        "tsm codes cem": {"true": true - 0.5, "predicted": true - 0.4},
+        "tsm actions adam": {"true": true - 1.5, "predicted": true},
+        "onestep actions adam": {"true": true - 3.0, "predicted": true + 0.5},
+        "oracle codes cem": {"true": true, "predicted": None},
+        "oracle actions cem": {"true": true - 0.2, "predicted": None},
+        "zero": {"true": true - 4.0, "predicted": None},
+    }
+    return {"reach": rows, "push": rows}
+
+
+def curve() -> dict[str, np.ndarray]:
+    steps = np.arange(10.0)
+    return {"seconds": steps, "train": np.exp(-steps), "validation": 1.1 * np.exp(-steps)}
+
+
+def climb() -> dict[str, np.ndarray]:
+    return {"iterations": np.arange(10), "true": noise(10, 7), "predicted": noise(10, 7) + 1}
+
+
+def draw(ax: plt.Axes, state: np.ndarray, target: np.ndarray) -> None:
+    ax.plot([0, state[4]], [0, state[5]])
+    ax.plot(*target, "o")
+
+
+EVERY = {
+    "figure1": lambda: figures.figure1(),
+    "figure2": lambda: figures.figure2(),
+    "figure3": lambda: figures.figure3(),
+    "figure4": lambda: figures.figure4({env: np.full((20, 20, 3), 200, np.uint8) for env in IDS}),
+    "figure6": lambda: figures.figure6(returns()),
+    "predicted_vs_true": lambda: figures.predicted_vs_true(returns()),
+    "loss_curves": lambda: figures.loss_curves({"tsm": curve(), "prior": curve()}),
+    "torque_gallery": lambda: figures.torque_gallery(noise(3, 20, 2), 0.02),
+    "state_histograms": lambda: figures.state_histograms(noise(4, 20, 6), NAMES, UNITS),
+    "workspace_coverage": lambda: figures.workspace_coverage(0.2 * noise(500, 2), 0.21),
+    "rollouts": lambda: figures.rollouts(noise(15, 6), noise(4, 15, 6), NAMES, UNITS),
+    "plan_strip": lambda: figures.plan_strip(draw, noise(10, 6), noise(10, 6), np.zeros(2), [0, 4, 9]),
+    "plan_actions": lambda: figures.plan_actions(noise(20, 2), noise(20, 2), noise(20, 2), 0.02),
+    "gap_against_iterations": lambda: figures.gap_against_iterations({"tsm codes adam": climb()}),
+    "ll_against_horizon": lambda: figures.ll_against_horizon({"tsm": noise(30), "tsm free": noise(30)}),
+}
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_figure_is_returned_and_none_is_left_open(name: str) -> None:
+    assert isinstance(EVERY[name](), Figure)
+    assert plt.get_fignums() == []
+
+
+def test_every_figure_function_is_tested() -> None:
+    public = {name for name, value in vars(figures).items() if getattr(value, "__wrapped__", None)}
+    assert public == set(EVERY)
+
+
+@pytest.mark.parametrize("name", ["figure2", "figure6"])
+def test_the_same_figure_gives_the_same_bytes(name: str, tmp_path) -> None:
+    first = [path.read_bytes() for path in figures.save(EVERY[name](), tmp_path / "a" / "one")]
+    second = [path.read_bytes() for path in figures.save(EVERY[name](), tmp_path / "two")]
+    assert first == second
+    assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["one.pdf", "one.png", "two.pdf", "two.png"]
+
+
+def test_a_method_keeps_its_colour_in_every_figure() -> None:
+    horizon = figures.ll_against_horizon({"lstm": noise(5), "tsm": noise(5)}).axes[0]
+    assert [to_hex(line.get_color()).upper() for line in horizon.lines] == [style.COLOURS["lstm"], style.COLOURS["tsm"]]
+    climbing = figures.gap_against_iterations({"lstm actions adam": climb(), "tsm codes adam": climb()}).axes[1]
+    colours = [to_hex(line.get_color()).upper() for line in climbing.lines[:2]]
+    assert colours == [style.COLOURS["lstm"], style.COLOURS["tsm"]]
+    assert len(set(style.COLOURS.values())) == len(style.COLOURS)
+
+
+def test_figure6_shows_means_of_cost_and_gap_and_the_better_oracle() -> None:
+    rows = returns()["reach"]
+    cost, gap = figures.figure6({"reach": rows}).axes
+    points = {round(float(bar.lines[0].get_xdata()[0]), 6) for bar in cost.containers}
+    assert points == {round(-rows[label]["true"].mean(), 6) for label in rows if label.split()[0] in ("tsm", "onestep")}
+    assert [float(bar.lines[0].get_xdata()[0]) for bar in gap.containers] == pytest.approx([0.1, 1.5, 3.5])
+    assert float(cost.lines[0].get_xdata()[0]) == -rows["oracle codes cem"]["true"].mean()
+
+
+def test_the_interval_of_five_values_is_the_one_in_the_tables() -> None:
+    mean, half = style.interval(np.arange(5.0))
+    assert mean == 2
+    assert half == pytest.approx(2.776 * np.std(np.arange(5), ddof=1) / 5**0.5)
+    wide = style.interval(np.arange(100.0))[1]
+    assert wide == pytest.approx(1.98422 * np.std(np.arange(100), ddof=1) / 10, rel=1e-4)
+
+
+def test_a_rollout_is_drawn_over_the_truth() -> None:
+    true, predicted = noise(15, 6), noise(4, 15, 6)
+    axes = figures.rollouts(true, predicted, NAMES).axes
+    assert len(axes) == 7
+    np.testing.assert_array_equal(axes[4].lines[-1].get_ydata(), true[:, 4])
+    np.testing.assert_array_equal(axes[4].lines[2].get_ydata(), predicted[2, :, 4])
+    assert len(axes[6].lines) == 4 + 2  # the tip's four samples, its true path and its start
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: figures.torque_gallery(noise(3, 20), 0.02), r"actions has shape \(3, 20\), expected \(n, T, 2\)"),
+        (lambda: figures.rollouts(noise(15, 6), noise(4, 14, 6), NAMES), r"expected \(S, 15, 6\)"),
+        (lambda: figures.state_histograms(noise(5, 4), NAMES, UNITS), r"expected \(n, 6\)"),
+        (lambda: figures.ll_against_horizon({"gru": noise(5)}), "starts with 'gru', expected one of tsm"),
+        (lambda: figures.figure4({}), "three MuJoCo and three pymunk"),
+        (lambda: figures.figure6({"reach": {"tsm": {"true": np.array([1, np.nan])}}}), "reach, tsm: 1 of 2 true"),
+        (lambda: figures.figure6({}), "nothing to draw"),
+        (lambda: figures.predicted_vs_true({"reach": {"zero": {"true": noise(3)}}}), "no label has predicted"),
+        (lambda: figures.loss_curves({"tsm": {"train": noise(3)}}), "expected 'seconds' or 'step'"),
+        (lambda: figures.plan_strip(draw, noise(9, 6), noise(9, 6), np.zeros(2), [9]), "between 0 and 8"),
+        (lambda: figures.video(noise(2, 4, 4, 3), "a.mp4"), "expected uint8"),
+        (lambda: figures.video(np.zeros((2, 4, 4, 3), np.uint8), "a.gif"), "must end in .mp4"),
+    ],
+)
+def test_a_wrong_input_is_named(wrong, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        wrong()
+    assert plt.get_fignums() == []
+
+
+def test_a_film_has_even_sides_and_waits_for_the_longer_half(tmp_path) -> None:
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    left, right = np.zeros((3, 65, 63, 3), np.uint8), np.full((5, 65, 64, 3), 200, np.uint8)
+    both = figures.side_by_side(left, right, ("model", "simulator"))
+    assert both.shape[0] == 5
+    assert both.shape[2] == 127
+    np.testing.assert_array_equal(both[4, -65:, :63], left[2])
+    first, second = figures.video(both, tmp_path / "a.mp4"), figures.video(both, tmp_path / "b.mp4")
+    assert first.read_bytes() == second.read_bytes()
+    frames = np.stack(imageio.mimread(first))
+    assert frames.shape == (5, both.shape[1] + both.shape[1] % 2, 128, 3)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "b.mp4"]
+    assert "base64" in figures.embed(first)._repr_html_()
+
+
+def test_a_film_that_is_not_there_says_how_to_make_it(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"figures\.video"):
+        figures.embed(tmp_path / "none.mp4")
+
+
+def test_figures_know_numpy_and_matplotlib_only() -> None:
+    from tsmlib import diagrams, film, plan_figures
+
+    for module in (figures, style, diagrams, film, plan_figures):
+        assert "torch" not in inspect.getsource(module)
