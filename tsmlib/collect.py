@@ -61,8 +61,8 @@ def smooth_torques(
     *,
     generator: torch.Generator,
     action_dim: int = 2,
-    rms: float = 0.1,  # of full torque: few steps at the elbow stop, most objects met (see 01_collect)
-    time_constant: float = 0.08,  # s, of each of the two poles: a cut-off of about 2 Hz
+    rms: float = 0.1,  # of full torque; at most 10 % of steps at the elbow stop, most objects met (01_collect)
+    time_constant: float = 0.03,  # s, of each of the two poles: half the power lies below 3.4 Hz
     dt: float = 0.02,
 ) -> Tensor:
     """Smooth random torques (section 5.1; reading A15): white noise through two poles, (n, horizon, action_dim).

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from tsmlib import store
 from tsmlib.trajectory import Segment, Trajectories, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
@@ -30,13 +33,6 @@ class Curve:
     train: list[float] = field(default_factory=list)
     validation: list[float] = field(default_factory=list)
 
-    def rows(self) -> list[dict[str, float]]:
-        """One dict per validation."""
-        return [
-            dict(step=s, seconds=t, train=a, validation=b)
-            for s, t, a, b in zip(self.step, self.seconds, self.train, self.validation, strict=True)
-        ]
-
 
 def fit(
     model: nn.Module,
@@ -50,33 +46,47 @@ def fit(
     batch_size: int = 256,
     lr: float = 1e-3,  # Adam's default, appendix A
     lr_final: float = 1e-5,  # end of the cosine schedule
-    warmup: int = 100,
+    warmup: int = 100,  # steps
     clip: float = 1.0,  # gradient norm: windows with contact have heavy tails
-    validate_every: int = 250,
+    validate_every: int = 250,  # steps; a checkpoint is written as often
     patience: int = 0,  # validations without improvement before stopping early; 0: never
     seed: int = 0,
-    checkpoint: Checkpoint | None = None,
-    progress: str = "",
+    bf16: bool = False,  # matrix products in bfloat16, weights in float32
+    checkpoint: Path | None = None,
+    progress: str = "",  # title of the progress bar; none without
 ) -> Curve:
     """Minimise ``loss`` over random windows with Adam; leave the weights with the best validation loss in ``model``.
 
-    Windows are drawn as a function of (seed, step), so a resumed run continues as if it had not stopped.
-    Raises TrainingStopped at the first loss that is not finite, with the best weights so far in ``model``.
+    Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint`` continues as if it
+    had not stopped. Raises TrainingStopped at the first loss that is not finite, with the best weights so far in
+    ``model``, and store.StoreError for a checkpoint of another run.
     """
+    if steps < 1 or batch_size < 1 or validate_every < 1:
+        raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
     optimizer = torch.optim.Adam(model.parameters(), lr=lr)
     state = Progress(model, optimizer)
-    if checkpoint is not None:
-        checkpoint.resume(state)
+    identity = dict(
+        past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, seed=seed, bf16=bf16,
+        loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
+    )  # fmt: skip
+    if checkpoint is not None and checkpoint.exists():
+        state.load(checkpoint, identity)
     generator = torch.Generator()
-    data, held_out = train.padded(past_len), fixed_windows(validation, past_len, future_len)
-    draw = batches(data, past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator)
-    start, total, counted = time.perf_counter() - state.seconds, 0.0, 0
+    held_out = fixed_windows(validation, past_len, future_len)
+    draw = batches(
+        train.padded(past_len),
+        past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator,
+    )  # fmt: skip
+    began, total, counted = time.perf_counter() - state.seconds, 0.0, 0
     bar = tqdm(total=steps, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
     for step in range(state.step, steps):
+        if patience and step - state.best_step >= patience * validate_every:
+            break
         generator.manual_seed(seed * 1_000_003 + step)
         for group in optimizer.param_groups:
             group["lr"] = schedule(step, steps, lr, lr_final, warmup)
-        value = loss(next(draw), generator)
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            value = loss(next(draw), generator)
         if not torch.isfinite(value):
             state.restore_best()
             raise TrainingStopped(
@@ -90,14 +100,12 @@ def fit(
         total, counted = total + value.item(), counted + 1
         bar.update()
         if (step + 1) % validate_every == 0 or step + 1 == steps:
-            state.step, state.seconds = step + 1, time.perf_counter() - start
+            state.step, state.seconds = step + 1, time.perf_counter() - began
             state.record(total / counted, validate(loss, held_out, seed))
             bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
             total, counted = 0.0, 0
             if checkpoint is not None:
-                checkpoint.write(state)
-            if patience and state.step - state.best_step >= patience * validate_every:
-                break
+                state.save(checkpoint, identity)
     bar.close()
     state.restore_best()
     return state.curve
@@ -112,6 +120,7 @@ class Progress:
         self.best, self.best_step, self.best_loss = _copy(model.state_dict()), 0, math.inf
 
     def record(self, train: float, validation: float) -> None:
+        """Add a point to the curve; keep the weights if they are the best so far."""
         self.curve.step.append(self.step)
         self.curve.seconds.append(self.seconds)
         self.curve.train.append(train)
@@ -120,7 +129,44 @@ class Progress:
             self.best, self.best_step, self.best_loss = _copy(self.model.state_dict()), self.step, validation
 
     def restore_best(self) -> None:
+        """Put the weights with the best validation loss into the model."""
         self.model.load_state_dict(self.best)
+
+    def save(self, path: Path, identity: dict[str, Any]) -> None:
+        """Write one checkpoint, replacing the one before it in a single step."""
+        adam = self.optimizer.state_dict()["state"]
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
+        tensors |= {f"adam.{i}.{name}": tensor for i, moments in adam.items() for name, tensor in moments.items()}
+        header = dict(
+            identity=identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
+            best_step=self.best_step, best_loss=self.best_loss,
+        )  # fmt: skip
+        store.save(path, tensors, kind="checkpoint", header=header)
+
+    def load(self, path: Path, identity: dict[str, Any]) -> None:
+        """Continue from a checkpoint of the same run; StoreError names what differs otherwise."""
+        tensors, header = store.load(path, kind="checkpoint")
+        differs = [
+            f"{k} is {header['identity'].get(k)!r}, now {v!r}" for k, v in identity.items() if header["identity"].get(k) != v
+        ]
+        if differs:
+            raise store.StoreError(
+                f"{path} is the checkpoint of another run: {'; '.join(differs)}. Delete it to start anew"
+            )
+        groups: dict[str, dict[str, Tensor]] = {"model": {}, "best": {}, "adam": {}}
+        for name, tensor in tensors.items():
+            group, _, rest = name.partition(".")
+            groups[group][rest] = tensor
+        self.model.load_state_dict(groups["model"])
+        self.best = groups["best"]
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in groups["adam"].items():
+            index, _, moment = name.partition(".")
+            moments.setdefault(int(index), {})[moment] = tensor
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+        self.step, self.seconds, self.curve = header["step"], header["seconds"], Curve(**header["curve"])
+        self.best_step, self.best_loss = header["best_step"], header["best_loss"]
 
 
 def schedule(step: int, steps: int, lr: float, lr_final: float, warmup: int) -> float:

@@ -36,7 +36,7 @@ BLOCK_MASS = 1.0  # kg, comparable to the arm's inertia (1 kg m^2), which keeps 
 BLOCK_DECAY = 0.2  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
 FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
-BLOCK_RING = (0.1, 0.2)  # m; distance of the block's centre from the shoulder at reset: within reach all around
+BLOCK_RING = (0.08, 0.17)  # m; distance of the block's centre from the shoulder at reset: within reach all around
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
 
 START_ANGLE = 0.1  # rad, rad/s and m: the reset distribution of Gymnasium's Reacher

@@ -1,0 +1,190 @@
+"""What the notebooks share: data sets, trained models and frozen tasks at a run's scale, made where they are missing.
+
+Anything a notebook asks for is taken from its run's folder, else from what ships under ``data``, else made on the spot
+with a progress bar. This is the only module that knows how much of everything each scale uses.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+import tsmlib.envs
+from tsmlib import store
+from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.control import Task
+from tsmlib.prior import ActionPrior
+from tsmlib.runs import ROOT, Run
+from tsmlib.train import fit
+from tsmlib.trajectory import Trajectories
+from tsmlib.tsm import TSM
+
+SPLITS = ("train", "validation", "test")
+HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
+TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
+FROZEN = ROOT / "data" / "tasks"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of a training schedule: which loss of the model, over how many segments, for how many steps."""
+
+    loss: str
+    segments: int
+    steps: int
+    lr: float = 1e-3
+
+
+def short(env: str) -> str:
+    """Folder name of an environment: ReacherPush for tsm/ReacherPush-v0."""
+    return env.partition("/")[2].partition("-")[0]
+
+
+def has_block(env: str) -> bool:
+    """Whether there is an obstacle or object, and so contacts."""
+    return "Reacher-v0" not in env
+
+
+# Data ----------------------------------------------------------------------------------------------------------------
+
+
+def sizes(run: Run, env: str) -> dict[str, int]:
+    """Episodes per split: the paper's 500 on the basic arm and 5,000 elsewhere, 200 for validation, 1,000 for test."""
+    full = {"train": 5000 if has_block(env) else 500, "validation": 200, "test": 1000}
+    return run.pick(smoke={"train": 20, "validation": 8, "test": 8}, laptop=full, paper=full)
+
+
+def dataset(run: Run, env: str, split: str) -> Trajectories:
+    """One split of an environment's data, collected at the first call. Training data depend on the run's seed."""
+    n = sizes(run, env)[split]
+    path = run.data / short(env) / f"{split}.safetensors"
+    if path.exists():
+        return store.load_trajectories(path, env=env)
+    data = random_data(env, n, seed=HELD_OUT_SEED.get(split, run.seed))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    store.save_trajectories(path, data, {"split": split, "seed": run.seed, "scale": run.scale})
+    return data
+
+
+def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajectories:
+    """``n`` episodes of smooth random torques, a function of (env, n, seed) alone."""
+    copies = gymnasium.make_vec(env, num_envs=n)
+    torques = smooth_torques(n, horizon, generator=torch.Generator().manual_seed(seed))
+    data = collect(copies, once(torques), horizon=horizon, seed=seed)
+    copies.close()
+    return data
+
+
+def fingerprint(data: Trajectories) -> dict[str, Any]:
+    """What a model of these data fits, and refuses to be used without."""
+    return {"env": data.env, "dt": data.dt, "names": list(data.names)}
+
+
+# Models --------------------------------------------------------------------------------------------------------------
+
+
+def schedule(run: Run, model: str) -> list[Stage]:
+    """How a model is trained.
+
+    tsm: teacher forcing, then free-running over two chained segments. tsm+teacher: teacher forcing alone, the
+    ablation. tsm+energy: free-running on the energy score, from new weights. prior: free-running over two segments.
+    """
+    if model == "prior":
+        return [Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4000))]
+    teacher = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=500, paper=1500))
+    free = Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4500))
+    longer = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=3000, paper=10000))  # as many seconds
+    energy = Stage("energy_loss", 2, run.pick(smoke=20, laptop=1500, paper=5000), lr=2e-3)
+    return {"tsm": [teacher, free], "tsm+teacher": [longer], "tsm+energy": [energy]}[model]
+
+
+def load_or_train(run: Run, env: str, model: str) -> tuple[TSM | ActionPrior, dict[str, Any]]:
+    """A trained model and the header of its file (curves, seconds, seed, scale).
+
+    model: tsm, tsm+teacher, tsm+energy (the same class, see ``schedule``) or prior.
+    From the run's folder; else, unless the scale is paper, from the shipped models; else trained now.
+    """
+    if model == "prior":  # equally many episodes hold the same torques, whatever the environment
+        env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
+    cls = ActionPrior if model == "prior" else TSM
+    own = run.models / short(env) / f"{model}.safetensors"
+    shipped = run.shipped / short(env) / f"{model}.safetensors"
+    for path in [own] if run.scale == "paper" or run.seed else [own, shipped]:
+        if path.exists():
+            return store.load_model(path, cls, expect={"env": env}), store.read_header(path)
+    return train(run, env, model, own)
+
+
+def train(run: Run, env: str, model: str, path: Path) -> tuple[TSM | ActionPrior, dict[str, Any]]:
+    """Train ``model`` by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
+    print(f"{env}: no trained {model} at scale {run.scale}; training it now")
+    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    net = fresh(run, model, data)
+    curves = {}
+    for stage in schedule(run, model):
+        checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint.safetensors")
+        curve = fit(
+            net, getattr(net, stage.loss), data, held_out,
+            past_len=net.past_len, future_len=stage.segments * net.segment_len, steps=stage.steps, lr=stage.lr,
+            batch_size=run.pick(smoke=32, laptop=256, paper=256), validate_every=run.pick(smoke=10, laptop=250, paper=250),
+            seed=run.seed, bf16=True, checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
+        )  # fmt: skip
+        curves[stage.loss] = asdict(curve)
+    header = {
+        "fingerprint": fingerprint(data), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
+        "seconds": sum(c["seconds"][-1] for c in curves.values()), "torch": torch.__version__,
+        "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+    }  # fmt: skip
+    store.save_model(path, net, header)
+    for stage in schedule(run, model):
+        path.with_name(f"{model}-{stage.loss}.checkpoint.safetensors").unlink()
+    return net, store.read_header(path)
+
+
+def fresh(run: Run, model: str, data: Trajectories) -> TSM | ActionPrior:
+    """The model as training starts: new weights, and the statistics of the training data."""
+    torch.manual_seed(run.seed)  # initial weights; torch layers draw from the global generator
+    if model == "prior":
+        return ActionPrior(data.actions.shape[2]).fit_scale(torch.from_numpy(data.actions))
+    wide = dict(channels=64, head_channels=128) if has_block(data.env) else {}  # appendix A.1
+    net = TSM(data.states.shape[2], data.actions.shape[2], angles=data.angles, **wide)
+    net.features.fit(torch.from_numpy(data.states))
+    return net
+
+
+# Tasks ---------------------------------------------------------------------------------------------------------------
+
+
+def task(env: str, split: str = "test") -> Task:
+    """100 starts and targets of an environment's task. ``test`` ones are frozen in data/tasks and choose nothing."""
+    path = FROZEN / f"{short(env)}.safetensors"
+    if split == "test" and path.exists():
+        tensors, header = store.load(path, kind="task")
+        return Task(header["task"], header["env"], tensors["start"].numpy(), tensors["target"])
+    return draw_task(env, seed=TASK_SEED[split])
+
+
+def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
+    """Starts from the environment's reset, targets uniform in the disc of radius 0.2 m (reading A21)."""
+    copies = gymnasium.make_vec(env, num_envs=n)
+    start, info = copies.reset(seed=seed)
+    copies.close()
+    name = "push" if "Push" in env else "reach"
+    return Task(name, env, start.astype(np.float32), torch.from_numpy(info["target"]).float())
+
+
+def freeze_tasks() -> None:
+    """Write the test tasks of every environment into data/tasks. Done once; a test compares them with a new draw."""
+    for env in tsmlib.envs.ENV_IDS:
+        drawn = draw_task(env, seed=TASK_SEED["test"])
+        path = FROZEN / f"{short(env)}.safetensors"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        header = {"task": drawn.name, "env": env, "seed": TASK_SEED["test"]}
+        store.save(path, {"start": drawn.start, "target": drawn.target}, kind="task", header=header)
