@@ -37,7 +37,7 @@ $(READY): environment.lock pyproject.toml
 		{ echo "tsmlib needs Python 3.11 or newer, found `$(PYTHON) --version 2>&1`. Name another: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Building $(VENV) from environment.lock: about a minute, once."
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet `grep '^torch==' environment.lock`
-	$(PY) -m pip install --quiet -r environment.lock
-	$(PY) -m pip install --quiet --no-deps --no-build-isolation -e .
+	$(PY) -m pip install -qq `grep '^torch==' environment.lock`
+	$(PY) -m pip install -qq -r environment.lock
+	$(PY) -m pip install -qq --no-deps --no-build-isolation -e .
 	@touch $@
