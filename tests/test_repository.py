@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 import tsmlib
+from tsmlib import store
 from tsmlib.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -108,6 +109,13 @@ def test_environments_import_nothing_else_of_the_package() -> None:
     for path in (ROOT / "tsmlib" / "envs").glob("*.py"):
         for name in imported(path):
             assert not name.startswith("tsmlib") or name.startswith("tsmlib.envs"), f"{path.name} imports {name}"
+
+
+@pytest.mark.skipif(not (ROOT / "data").exists(), reason="nothing ships")
+def test_everything_that_ships_is_intact_and_listed() -> None:
+    shipped = {path for path in (ROOT / "data").rglob("*") if path.is_file() and not path.name.startswith(".")}
+    again = "python -c 'from tsmlib import store; store.write_manifest(\"data\")'"
+    assert not shipped or set(store.verify(ROOT / "data")) == shipped, f"list what is new: {again}"
 
 
 def test_what_running_leaves_behind_is_ignored() -> None:
