@@ -18,11 +18,12 @@ import torch
 import tsmlib.envs
 from tsmlib import store
 from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task
+from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, Run
 from tsmlib.train import fit
 from tsmlib.trajectory import Trajectories
+from tsmlib.trajopt import DirectActions, LatentActions, Plan, adam, cem, sampled_starts, through_model, through_simulator
 from tsmlib.tsm import TSM
 
 SPLITS = ("train", "validation", "test")
@@ -188,3 +189,50 @@ def freeze_tasks() -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         header = {"task": drawn.name, "env": env, "seed": TASK_SEED["test"]}
         store.save(path, {"start": drawn.start, "target": drawn.target}, kind="task", header=header)
+
+
+# Plans ---------------------------------------------------------------------------------------------------------------
+
+
+def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Trial:
+    """Plan with one method and execute open loop in the true simulator.
+
+    model: tsm, tsm+energy, or oracle (the true simulator), or none. planner: adam (from zero, as the paper), started
+    (adam from the best of random candidates), cem; with model none: random or zero torques. prior: codes (Eq. 3) or
+    actions (Eq. 2). iterations: of the planner; 0 means the scale's default.
+    """
+    if model == "none":
+        return execute(task, {"random": random_torques, "zero": zero_torques}[planner](task))
+    return execute(task, plan(run, task, model, planner, prior, iterations=iterations))
+
+
+def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Plan:
+    """The plan alone; see ``trial``."""
+    if prior == "codes":
+        net, _ = load_or_train(run, task.env, "prior")
+        space = LatentActions(net, task.horizon)
+    else:
+        space = DirectActions(task.horizon)
+    if model == "oracle":
+        predict = through_simulator(task.env, task.start)
+    else:
+        net, _ = load_or_train(run, task.env, model)
+        samples = run.pick(smoke=1, laptop=2, paper=4)
+        predict = through_model(net, task.past(net.past_len), samples=samples, seed=run.seed)
+    bar = f"{task.name}: {model}, {planner} over {prior}"
+    candidates = run.pick(smoke=8, laptop=128, paper=256)
+    if planner == "cem":
+        return cem(
+            predict, task.reward, space, len(task),
+            candidates=candidates, elites=max(2, candidates // 10), iterations=iterations or run.pick(smoke=2, laptop=10, paper=12),
+            seed=run.seed, progress=bar,
+        )  # fmt: skip
+    if planner == "started":
+        start = sampled_starts(predict, task.reward, space, len(task), candidates=candidates, keep=run.pick(smoke=1, laptop=2, paper=4), seed=run.seed)
+    elif planner == "adam":
+        start = torch.zeros(1, len(task), *space.shape)
+    else:
+        raise ValueError(f"planner is {planner!r}, expected adam, started or cem")
+    return adam(
+        predict, task.reward, space, start, iterations=iterations or run.pick(smoke=3, laptop=100, paper=100), progress=bar
+    )
