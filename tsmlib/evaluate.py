@@ -19,32 +19,66 @@ from tsmlib.trajectory import Segment, Trajectories
 
 
 @torch.no_grad()
+def sample_states(
+    model: DynamicsModel,
+    data: Trajectories,
+    *,
+    samples: int,
+    horizon: int = 90,  # from the first H observed steps to T = 100 (reading A6)
+    seed: int = 0,
+    progress: str = "",
+) -> Tensor:
+    """Open-loop samples (S, N, T, dx), physical units, with the true actions after ``past_len`` observed steps.
+
+    Column k holds the prediction of x_{past_len + k + 1}.
+    """
+    past_len, whole = model.past_len, data.padded(0)
+    past = Segment(whole.states[:, :past_len], whole.actions[:, :past_len])
+    actions = whole.actions[:, past_len : past_len + horizon]
+    drawn = []
+    for draw in tqdm(range(samples), desc=progress, disable=not progress):
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + draw)
+        drawn.append(rollout(model, past, actions, generator=generator))
+    return torch.stack(drawn)
+
+
 def predict(
     model: DynamicsModel,
     features: Features,
     data: Trajectories,
     *,
     samples: int,
-    horizon: int = 90,  # from the first H observed steps to T = 100 (reading A6)
+    horizon: int = 90,
     seed: int = 0,
-    rows: int = 5000,
     progress: str = "",
 ) -> tuple[Tensor, Tensor]:
-    """Open-loop samples (S, N, T, D) with the true actions after ``past_len`` observed steps, and the truth (N, T, D).
+    """What ``sample_states`` draws, (S, N, T, D), and the truth, (N, T, D), in the space of the scores.
 
     A sample that is not finite is kept at the edge of the representable range, so that it counts as worst.
     """
-    past_len = model.past_len
-    whole = data.padded(0)
-    past = Segment(whole.states[:, :past_len], whole.actions[:, :past_len])
-    steps = slice(past_len, past_len + horizon)
-    truth = features(whole.states[:, steps])[..., features.scored]
-    drawn = []
-    for draw in tqdm(range(samples), desc=progress, disable=not progress):
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + draw)
-        states = rollout(model, past, whole.actions[:, steps], generator=generator)
-        drawn.append(features(states)[..., features.scored].nan_to_num(nan=1e6).clamp(-1e6, 1e6))
+    states = sample_states(model, data, samples=samples, horizon=horizon, seed=seed, progress=progress)
+    steps = slice(model.past_len, model.past_len + horizon)
+    truth = features(data.padded(0).states[:, steps])[..., features.scored]
+    drawn = [features(draw)[..., features.scored].nan_to_num(nan=1e6).clamp(-1e6, 1e6) for draw in states]
     return torch.stack(drawn), truth
+
+
+def scores(
+    samples: Tensor, truth: Tensor, validation: tuple[Tensor, Tensor]
+) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Every score of ``predict``'s samples against the horizon, metric -> (T,), and the two fitted variances.
+
+    validation: samples and truth of the validation set, on which alone the variances are fitted.
+    """
+    floor, variance = fit_floor(*validation), fit_shared(*validation)
+    against_horizon = {
+        "ll_paper": ll_paper(samples, truth, floor).mean(0),
+        "ll_shared": ll_shared(samples, truth, variance).mean(0),
+        "energy_score": energy_score(samples, truth).mean(0),
+        "coverage80": coverage(samples, truth, 0.8).mean(0),
+        "nrmse": nrmse(samples, truth),
+    }
+    return against_horizon, {"floor": floor, "shared": variance}
 
 
 def ll_paper(samples: Tensor, truth: Tensor, floor: float) -> Tensor:
@@ -63,8 +97,9 @@ def ll_shared(samples: Tensor, truth: Tensor, variance: float) -> Tensor:
 
 def fit_floor(samples: Tensor, truth: Tensor) -> float:
     """The scalar floor that maximises ``ll_paper`` on validation data, by a fine grid of powers of ten."""
+    error, variance = truth - samples.mean(0), samples.var(0)
     grid = torch.logspace(-8, 4, 121)
-    values = torch.stack([ll_paper(samples, truth, float(floor)).mean() for floor in grid])
+    values = torch.stack([_gaussian(error, variance + floor).mean() for floor in grid])
     return float(grid[values.argmax()])
 
 
@@ -85,13 +120,20 @@ def energy_score(samples: Tensor, truth: Tensor) -> Tensor:
 
 def coverage(samples: Tensor, truth: Tensor, level: float = 0.8) -> Tensor:
     """Share of dimensions (N, T) in which the truth lies within the samples' central interval of ``level``."""
-    low, high = (torch.quantile(samples, q, dim=0) for q in ((1 - level) / 2, (1 + level) / 2))
+    ordered, n = samples.sort(0).values, len(samples)
+    low, high = (_between(ordered, q * (n - 1)) for q in ((1 - level) / 2, (1 + level) / 2))
     return ((truth >= low) & (truth <= high)).float().mean(-1)
 
 
 def nrmse(samples: Tensor, truth: Tensor) -> Tensor:
     """Root mean squared error of the samples' mean over training standard deviation, at each step (T,)."""
     return (truth - samples.mean(0)).square().mean((0, 2)).sqrt()
+
+
+def _between(ordered: Tensor, position: float) -> Tensor:
+    """Linear interpolation between rows; torch.quantile takes no more than 16 million numbers."""
+    below = min(int(position), len(ordered) - 2)
+    return ordered[below].lerp(ordered[below + 1], position - below)
 
 
 def _gaussian(error: Tensor, variance: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ with a progress bar. This is the only module that knows how much of everything e
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from tsmlib import store
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
 from tsmlib.prior import ActionPrior
-from tsmlib.runs import ROOT, Run
+from tsmlib.runs import ROOT, ParameterError, Run
 from tsmlib.train import fit
 from tsmlib.trajectory import Trajectories
 from tsmlib.trajopt import DirectActions, LatentActions, Plan, adam, cem, sampled_starts, through_model, through_simulator
 from tsmlib.tsm import TSM
 
 SPLITS = ("train", "validation", "test")
+MODELS = ("tsm", "prior", "tsm+teacher", "tsm+energy")
 HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
@@ -50,6 +52,14 @@ def short(env: str) -> str:
 def has_block(env: str) -> bool:
     """Whether there is an obstacle or object, and so contacts."""
     return "Reacher-v0" not in env
+
+
+def chosen(parameter: str, text: str, known: Sequence[str]) -> list[str]:
+    """The value of a notebook parameter that names one of ``known``, several with commas between, or all."""
+    names = list(known) if text == "all" else [word.strip() for word in text.split(",")]
+    if unknown := [word for word in names if word not in known]:
+        raise ParameterError(f"{parameter} names {unknown[0]!r:.80}, expected some of {', '.join(known)}; or all.")
+    return names
 
 
 # Data ----------------------------------------------------------------------------------------------------------------

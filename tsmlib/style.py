@@ -32,6 +32,7 @@ WIDTH = 7.0  # inches: the text width of a two-column journal page
 COLOURS = {
     "tsm": "#0072B2",
     "tsm+energy": "#56B4E9",
+    "tsm+teacher": "#1B2A5C",
     "onestep": "#E69F00",
     "multistep": "#D55E00",
     "lstm": "#009E73",
@@ -45,6 +46,7 @@ COLOURS = {
 NAMES = {
     "tsm": "TSM",
     "tsm+energy": "TSM + energy",
+    "tsm+teacher": "TSM, teacher forcing only",
     "onestep": "one-step",
     "multistep": "multi-step",
     "lstm": "LSTM",
