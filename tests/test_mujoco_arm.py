@@ -2,6 +2,7 @@
 
 import os
 import time
+import warnings
 from pathlib import Path
 
 import gymnasium
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tsmlib.envs import MUJOCO_IDS, SimulationUnstable, closest_gap
+from tsmlib.envs import MUJOCO_IDS, SimulationUnstable, closest_gap, mujoco_arm
 from tsmlib.envs.base import (
     ARM_RADIUS,
     BLOCK_DECAY,
@@ -214,6 +215,22 @@ def test_a_blow_up_is_raised_with_episode_and_step(
         env.rollout(np.zeros((300, 4, 2)))
     assert (caught.value.env, caught.value.episode, caught.value.step) == (env_id, 277, 0)
     assert not os.listdir(tmp_path)  # MuJoCo would leave a log file here
+
+
+def test_a_machine_without_opengl_draws_the_scene_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object) -> None:
+        raise mujoco.FatalError("an OpenGL platform library has not been loaded")
+
+    monkeypatch.setattr(mujoco_arm, "_gl_works", True)
+    monkeypatch.setattr(MujocoArm, "_photograph", fail)
+    env = gymnasium.make(PUSH, render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="drawing with matplotlib"):
+        image = env.render()
+    assert image.shape[2] == 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it says so once
+        np.testing.assert_array_equal(env.render(), image)
 
 
 def test_threads_change_nothing_but_time() -> None:
