@@ -49,7 +49,7 @@ STATE_NAMES = (
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
 
 
-class SimulationUnstable(RuntimeError):  # noqa: N818 - a state of the world, and the name users catch
+class SimulationUnstable(RuntimeError):
     """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` (both from 0) and ``reason``."""
 
     def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
