@@ -30,9 +30,7 @@ class DynamicsModel(Protocol):
         ...
 
 
-def rollout(
-    model: DynamicsModel, past: Segment, actions: Tensor, *, generator: Noise | None = None
-) -> Tensor:
+def rollout(model: DynamicsModel, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
     """Chain segments over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
 
     Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps.

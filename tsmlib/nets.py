@@ -1,4 +1,4 @@
-"""Building blocks of the segment models: gated causal layers (Eq. 1), a convolutional encoder, and features. No physics.
+"""Building blocks of the segment models: gated causal layers (Eq. 1), a convolutional encoder, features. No physics.
 
 Letters in shapes: B batch, P positions in time, C channels, dz latent size.
 """
@@ -153,6 +153,10 @@ class Features(nn.Module):
     The statistics come from training data by ``fit`` and travel with the model. A state dimension that never changes
     within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out.
     """
+
+    mean: Tensor
+    std: Tensor
+    step_std: Tensor
 
     def __init__(self, state_dim: int, angles: tuple[int, ...]) -> None:
         super().__init__()

@@ -24,6 +24,8 @@ class ActionPrior(nn.Module):
     beta: weight of the KL divergence against the summed squared error in units of the training actions' deviation.
     """
 
+    std: Tensor  # (du,) of the training actions
+
     def __init__(
         self,
         action_dim: int,
@@ -32,7 +34,7 @@ class ActionPrior(nn.Module):
         latent_dim: int = 8,  # section 5.1
         channels: int = 32,
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
-        beta: float = 0.01,
+        beta: float = 0.03,
     ) -> None:
         super().__init__()
         self._config = dict(

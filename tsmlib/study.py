@@ -19,12 +19,22 @@ import torch
 import tsmlib.envs
 from tsmlib import store
 from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.control import Task, Trial, execute, label, random_torques, report, zero_torques
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, ParameterError, Run
 from tsmlib.train import fit
 from tsmlib.trajectory import Trajectories
-from tsmlib.trajopt import DirectActions, LatentActions, Plan, adam, cem, sampled_starts, through_model, through_simulator
+from tsmlib.trajopt import (
+    DirectActions,
+    LatentActions,
+    Plan,
+    Space,
+    adam,
+    cem,
+    sampled_starts,
+    through_model,
+    through_simulator,
+)
 from tsmlib.tsm import TSM
 
 SPLITS = ("train", "validation", "test")
@@ -32,6 +42,7 @@ MODELS = ("tsm", "prior", "tsm+teacher", "tsm+energy")
 HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
+RESULTS = ROOT / "data" / "results"
 
 
 @dataclass(frozen=True)
@@ -107,16 +118,16 @@ def schedule(run: Run, model: str) -> list[Stage]:
     ablation. tsm+energy: free-running on the energy score, from new weights. prior: free-running over two segments.
     """
     if model == "prior":
-        return [Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4000))]
-    teacher = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=500, paper=1500))
-    free = Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4500))
+        return [Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=3000))]
+    teacher = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=500, paper=1000))
+    free = Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4000), lr=2e-3)
     longer = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=3000, paper=10000))  # as many seconds
     energy = Stage("energy_loss", 2, run.pick(smoke=20, laptop=1500, paper=5000), lr=2e-3)
     return {"tsm": [teacher, free], "tsm+teacher": [longer], "tsm+energy": [energy]}[model]
 
 
-def load_or_train(run: Run, env: str, model: str) -> tuple[TSM | ActionPrior, dict[str, Any]]:
-    """A trained model and the header of its file (curves, seconds, seed, scale).
+def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
+    """A trained model, TSM or ActionPrior, and the header of its file (curves, seconds, seed, scale).
 
     model: tsm, tsm+teacher, tsm+energy (the same class, see ``schedule``) or prior.
     From the run's folder; else, unless the scale is paper, from the shipped models; else trained now.
@@ -132,7 +143,7 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[TSM | ActionPrior, di
     return train(run, env, model, own)
 
 
-def train(run: Run, env: str, model: str, path: Path) -> tuple[TSM | ActionPrior, dict[str, Any]]:
+def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, Any]]:
     """Train ``model`` by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
     print(f"{env}: no trained {model} at scale {run.scale}; training it now")
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
@@ -144,8 +155,8 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[TSM | ActionPrior
         curve = fit(
             net, getattr(net, stage.loss), data, held_out,
             past_len=net.past_len, future_len=stage.segments * net.segment_len, steps=stage.steps, lr=stage.lr,
-            batch_size=run.pick(smoke=32, laptop=256, paper=256), validate_every=run.pick(smoke=10, laptop=250, paper=250),
-            seed=run.seed, bf16=True, checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
+            batch_size=run.pick(smoke=32, laptop=256, paper=256),
+            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=True, checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
         )  # fmt: skip
         curves[stage.loss] = asdict(curve)
     header = {
@@ -159,12 +170,12 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[TSM | ActionPrior
     return net, store.read_header(path)
 
 
-def fresh(run: Run, model: str, data: Trajectories) -> TSM | ActionPrior:
+def fresh(run: Run, model: str, data: Trajectories) -> Any:
     """The model as training starts: new weights, and the statistics of the training data."""
     torch.manual_seed(run.seed)  # initial weights; torch layers draw from the global generator
     if model == "prior":
         return ActionPrior(data.actions.shape[2]).fit_scale(torch.from_numpy(data.actions))
-    wide = dict(channels=64, head_channels=128) if has_block(data.env) else {}  # appendix A.1
+    wide: dict[str, Any] = dict(channels=64, head_channels=128) if has_block(data.env) else {}  # appendix A.1
     net = TSM(data.states.shape[2], data.actions.shape[2], angles=data.angles, **wide)
     net.features.fit(torch.from_numpy(data.states))
     return net
@@ -207,9 +218,9 @@ def freeze_tasks() -> None:
 def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Trial:
     """Plan with one method and execute open loop in the true simulator.
 
-    model: tsm, tsm+energy, or oracle (the true simulator), or none. planner: adam (from zero, as the paper), started
-    (adam from the best of random candidates), cem; with model none: random or zero torques. prior: codes (Eq. 3) or
-    actions (Eq. 2). iterations: of the planner; 0 means the scale's default.
+    model: tsm, tsm+energy, or oracle (the true simulator), or none. planner: adam (from zero, as the paper),
+    adam+starts (from the best of sampled candidates), cem; with model none: random or zero torques. prior: codes
+    (Eq. 3) or actions (Eq. 2). iterations: of the planner; 0 means the scale's default.
     """
     if model == "none":
         return execute(task, {"random": random_torques, "zero": zero_torques}[planner](task))
@@ -218,11 +229,9 @@ def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterati
 
 def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Plan:
     """The plan alone; see ``trial``."""
+    space: Space = DirectActions(task.horizon)
     if prior == "codes":
-        net, _ = load_or_train(run, task.env, "prior")
-        space = LatentActions(net, task.horizon)
-    else:
-        space = DirectActions(task.horizon)
+        space = LatentActions(load_or_train(run, task.env, "prior")[0], task.horizon)
     if model == "oracle":
         predict = through_simulator(task.env, task.start)
     else:
@@ -230,19 +239,72 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
         samples = run.pick(smoke=1, laptop=2, paper=4)
         predict = through_model(net, task.past(net.past_len), samples=samples, seed=run.seed)
     bar = f"{task.name}: {model}, {planner} over {prior}"
-    candidates = run.pick(smoke=8, laptop=128, paper=256)
+    candidates = run.pick(smoke=8, laptop=96, paper=128)
     if planner == "cem":
         return cem(
             predict, task.reward, space, len(task),
-            candidates=candidates, elites=max(2, candidates // 10), iterations=iterations or run.pick(smoke=2, laptop=10, paper=12),
-            seed=run.seed, progress=bar,
+            candidates=candidates, elites=max(2, candidates // 10),
+            iterations=iterations or run.pick(smoke=2, laptop=8, paper=12), seed=run.seed, progress=bar,
         )  # fmt: skip
-    if planner == "started":
-        start = sampled_starts(predict, task.reward, space, len(task), candidates=candidates, keep=run.pick(smoke=1, laptop=2, paper=4), seed=run.seed)
+    if planner == "adam+starts":
+        start = sampled_starts(
+            predict,
+            task.reward,
+            space,
+            len(task),
+            candidates=candidates,
+            keep=run.pick(smoke=1, laptop=2, paper=4),
+            seed=run.seed,
+        )
     elif planner == "adam":
         start = torch.zeros(1, len(task), *space.shape)
     else:
-        raise ValueError(f"planner is {planner!r}, expected adam, started or cem")
+        raise ValueError(f"planner is {planner!r}, expected adam, adam+starts or cem")
     return adam(
-        predict, task.reward, space, start, iterations=iterations or run.pick(smoke=3, laptop=100, paper=100), progress=bar
+        predict,
+        task.reward,
+        space,
+        start,
+        iterations=iterations or run.pick(smoke=3, laptop=100, paper=100),
+        progress=bar,
     )
+
+
+def oracle(run: Run, task: Task) -> dict[str, Trial]:
+    """CEM through the true simulator, over codes and over raw torques: label -> trial.
+
+    Its plans are kept in the run's folder, since making them takes an hour at scale paper. At scale laptop the plans
+    that ship in data/results are executed again for the task's targets.
+    """
+    trials = {}
+    for prior in ("codes", "actions"):
+        name = f"oracle-{short(task.env)}-{prior}.safetensors"
+        own, shipped = run.folder("plans") / name, RESULTS / name
+        kept = next((p for p in ([own] if run.scale == "paper" or run.seed else [own, shipped]) if p.exists()), None)
+        if kept is None or len(store.load(kept, kind="plan")[0]["actions"]) < len(task):
+            found = plan(run, task, "oracle", "cem", prior)
+            header = {"env": task.env, "seconds": found.seconds, "seed": run.seed, "scale": run.scale}
+            store.save(own, {"actions": found.actions, "predicted": found.predicted}, kind="plan", header=header)
+            kept = own
+        tensors, _ = store.load(kept, kind="plan")
+        trials[label("oracle", "cem", prior)] = execute(task, tensors["actions"][: len(task)])
+    return trials
+
+
+# What ships ----------------------------------------------------------------------------------------------------------
+
+
+def publish(run: Run) -> None:
+    """Copy a run's models, oracle plans and tables into data/, with a manifest of their checksums."""
+    for source, target in ((run.models, run.shipped), (run.folder("plans"), RESULTS), (run.metrics, RESULTS)):
+        for path in sorted(source.rglob("*.*")):
+            if path.suffix in (".safetensors", ".csv") and ".checkpoint" not in path.name:
+                copy = target / path.relative_to(source)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                store.write_bytes(copy, path.read_bytes())
+    store.write_manifest(ROOT / "data")
+
+
+def shipped_report() -> str:
+    """The published results of 05_control as a Markdown table."""
+    return report(store.load_table(RESULTS / "05_control.csv"))

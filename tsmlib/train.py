@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from tsmlib import store
-from tsmlib.trajectory import Segment, Trajectories, Window, batches, windows
+from tsmlib.trajectory import Trajectories, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
 
@@ -148,7 +148,9 @@ class Progress:
         """Continue from a checkpoint of the same run; StoreError names what differs otherwise."""
         tensors, header = store.load(path, kind="checkpoint")
         differs = [
-            f"{k} is {header['identity'].get(k)!r}, now {v!r}" for k, v in identity.items() if header["identity"].get(k) != v
+            f"{k} is {header['identity'].get(k)!r}, now {v!r}"
+            for k, v in identity.items()
+            if header["identity"].get(k) != v
         ]
         if differs:
             raise store.StoreError(

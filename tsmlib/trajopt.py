@@ -52,7 +52,7 @@ class DirectActions:
     """Eq. 2: the torques themselves, squashed to the bounds by tanh. Its noise is as smooth as the training torques."""
 
     def __init__(self, horizon: int, action_dim: int = 2, *, rms: float = 0.1) -> None:
-        self.shape = (horizon, action_dim)
+        self.shape: tuple[int, ...] = (horizon, action_dim)
         self.scale = rms
 
     def decode(self, parameters: Tensor) -> Tensor:
@@ -76,7 +76,7 @@ class LatentActions:
                 f"choose {max(1, horizon // prior.segment_len) * prior.segment_len}"
             )
         self.prior = prior
-        self.shape = (horizon // prior.segment_len, prior.latent_dim)
+        self.shape: tuple[int, ...] = (horizon // prior.segment_len, prior.latent_dim)
 
     def decode(self, parameters: Tensor) -> Tensor:
         codes = parameters.flatten(0, 1)
@@ -191,7 +191,9 @@ def cem(
         returns = evaluate(predict, reward, space, parameters)
         best.update(parameters, returns)
         chosen = returns.topk(elites, dim=0).indices  # (elites, B)
-        elite = parameters.gather(0, chosen.reshape(*chosen.shape, *[1] * len(space.shape)).expand(-1, -1, *space.shape))
+        elite = parameters.gather(
+            0, chosen.reshape(*chosen.shape, *[1] * len(space.shape)).expand(-1, -1, *space.shape)
+        )
         mean = keep * mean + (1 - keep) * elite.mean(0)
         deviation = keep * deviation + (1 - keep) * elite.std(0)
     return best.plan(predict, reward, space, time.perf_counter() - began)

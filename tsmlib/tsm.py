@@ -46,7 +46,7 @@ class TSM(nn.Module):
         channels: int = 32,
         head_channels: int = 0,
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),  # receptive field 20 = 2 H
-        beta: float = 0.1,
+        beta: float = 1.0,
     ) -> None:
         super().__init__()
         self._config = dict(

@@ -174,12 +174,14 @@ class ArmVectorEnv(VectorEnv, ABC):
         if seed is not None or self._seed_root is None:
             self._seed_root, self._resets = (secrets.randbits(64) if seed is None else seed), 0
         root = (self._seed_root, self._resets)
-        draws = [self._draw(np.random.default_rng((*root, i))) for i in range(self.num_envs)]
+        rngs = (np.random.default_rng((*root, i)) for i in range(self.num_envs))
         self._resets += 1
-        states, target = (np.stack(part) for part in zip(*draws, strict=True))
         if "states" in options:
-            states = self._checked(options["states"], states.shape, "states")
+            states = self._checked(options["states"], self.observation_space.shape, "states")
             states[:, 4:6] = fingertip(states[:, :2])
+            target = np.stack([_in_ring(rng, 0.0, TARGET_RADIUS) for rng in rngs])
+        else:
+            states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
         if "target" in options:
             given = np.asarray(options["target"], np.float64)
             target = self._checked(np.broadcast_to(given, target.shape) if given.ndim == 1 else given, target.shape,
@@ -225,9 +227,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         """One uint8 image (height, width, 3) per episode, or None without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
-        return tuple(self._image(state, target) for state, target in zip(self._states, self.target, strict=True))
+        return tuple(self.image(state, target) for state, target in zip(self._states, self.target, strict=True))
 
-    def _image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Draw one state (dx,) and target (2,); a simulator with a renderer of its own replaces this."""
         from tsmlib.envs.render import render_array
 

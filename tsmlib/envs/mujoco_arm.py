@@ -228,7 +228,7 @@ class MujocoArm(ArmVectorEnv):
         self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
         self._elapsed = self._elapsed or 0
 
-    def _image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Seen from above by MuJoCo's renderer, or drawn by matplotlib where there is no OpenGL."""
         global _gl_works
         if _gl_works:
@@ -237,7 +237,7 @@ class MujocoArm(ArmVectorEnv):
             except Exception as error:  # without GL the failure depends on the driver: FatalError, AttributeError, ...
                 _gl_works = False
                 warnings.warn(f"MuJoCo cannot render here ({error}); drawing with matplotlib instead", stacklevel=2)
-        return super()._image(state, target)
+        return super().image(state, target)
 
     def _photograph(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         if self._renderer is None:
