@@ -6,6 +6,7 @@ Random data, a running planner and a policy under test are the same call with an
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -33,21 +34,20 @@ def collect(
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
     start, _ = env.reset(seed=seed, options=None if states is None else {"states": states})
-    action_dim = env.single_action_space.shape[0]
-    past = initial_past(torch.from_numpy(start).float(), past_len, action_dim)
+    arm: Any = env.unwrapped  # an ArmVectorEnv: it has rollout, dt, names, units and angles
+    past = initial_past(torch.from_numpy(start).float(), past_len, arm.single_action_space.shape[0])
     seen, done, taken = [start[:, None]], [], 0
     while taken < horizon:
         actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
-        reached = env.unwrapped.rollout(actions.numpy())
+        reached = arm.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)
         done.append(actions.numpy())
         taken += actions.shape[1]
-    arm = env.unwrapped
     return Trajectories(
         states=np.concatenate(seen, axis=1, dtype=np.float32),
         actions=np.concatenate(done, axis=1, dtype=np.float32),
-        env=env.spec.id,
+        env=arm.spec.id,
         dt=arm.dt,
         names=tuple(arm.names),
         units=tuple(arm.units),
@@ -62,7 +62,7 @@ def smooth_torques(
     generator: torch.Generator,
     action_dim: int = 2,
     rms: float = 0.1,  # of full torque; at most 10 % of steps at the elbow stop, most objects met (01_collect)
-    time_constant: float = 0.03,  # s, of each of the two poles: half the power lies below 3.4 Hz
+    time_constant: float = 0.03,  # s, of each of the two poles: their power density halves at 3.4 Hz
     dt: float = 0.02,
 ) -> Tensor:
     """Smooth random torques (section 5.1; reading A15): white noise through two poles, (n, horizon, action_dim).

@@ -44,9 +44,8 @@ class GatedLayer(nn.Module):
     all positions at once (B, P, C) and a single position (B, C), which is what keeps the two decoding paths equal.
     """
 
-    def __init__(self, channels: int, dilation: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.dilation = dilation
         self.taps = nn.Linear(2 * channels, 2 * channels)  # W_f and W_g
         self.out = nn.Linear(channels, 2 * channels)  # 1x1: residual and skip
 
@@ -79,7 +78,8 @@ class CausalDecoder(nn.Module):
     ) -> None:
         super().__init__()
         self.inlet = nn.Linear(input_dim, channels)
-        self.layers = nn.ModuleList(GatedLayer(channels, d) for d in dilations)
+        self.dilations = dilations
+        self.layers = nn.ModuleList(GatedLayer(channels) for _ in dilations)
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
         head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
         self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
@@ -93,8 +93,8 @@ class CausalDecoder(nn.Module):
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
         _, layer_inputs = self._parallel(inputs, z)
         return [
-            list(F.pad(s, (0, 0, layer.dilation, 0))[:, -layer.dilation :].unbind(1))
-            for layer, s in zip(self.layers, layer_inputs, strict=True)
+            list(F.pad(s, (0, 0, dilation, 0))[:, -dilation:].unbind(1))
+            for dilation, s in zip(self.dilations, layer_inputs, strict=True)
         ]
 
     def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
@@ -110,9 +110,10 @@ class CausalDecoder(nn.Module):
     def _parallel(self, inputs: Tensor, z: Tensor) -> tuple[Tensor, list[Tensor]]:
         s = self.inlet(inputs)  # (B, P, C)
         layer_inputs, total = [], torch.zeros_like(s)
-        for layer, code in zip(self.layers, self.codes(z)[:, None].chunk(len(self.layers), dim=-1), strict=True):
+        codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
+        for layer, dilation, code in zip(self.layers, self.dilations, codes, strict=True):
             layer_inputs.append(s)
-            earlier = F.pad(s, (0, 0, layer.dilation, 0))[:, : s.shape[1]]
+            earlier = F.pad(s, (0, 0, dilation, 0))[:, : s.shape[1]]
             s, skip = layer(earlier, s, code)
             total = total + skip
         return self.head(total), layer_inputs

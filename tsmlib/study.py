@@ -156,7 +156,8 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
             net, getattr(net, stage.loss), data, held_out,
             past_len=net.past_len, future_len=stage.segments * net.segment_len, steps=stage.steps, lr=stage.lr,
             batch_size=run.pick(smoke=32, laptop=256, paper=256),
-            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=True, checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
+            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=True,
+            checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
         )  # fmt: skip
         curves[stage.loss] = asdict(curve)
     header = {

@@ -177,7 +177,7 @@ class ArmVectorEnv(VectorEnv, ABC):
         rngs = (np.random.default_rng((*root, i)) for i in range(self.num_envs))
         self._resets += 1
         if "states" in options:
-            states = self._checked(options["states"], self.observation_space.shape, "states")
+            states = self._checked(options["states"], self._states.shape, "states")
             states[:, 4:6] = fingertip(states[:, :2])
             target = np.stack([_in_ring(rng, 0.0, TARGET_RADIUS) for rng in rngs])
         else:
