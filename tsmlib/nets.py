@@ -35,6 +35,12 @@ def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
     return torch.randn(shape, generator=noise, device=like.device, dtype=like.dtype)
 
 
+def gated(filtered: Tensor, gate: Tensor) -> Tensor:
+    """tanh(filtered) . sigmoid(gate), with tanh(a) = 2 sigmoid(2 a) - 1: torch's tanh is ten times slower on a CPU."""
+    gate = torch.sigmoid(gate)
+    return torch.addcmul(-gate, torch.sigmoid(2 * filtered), gate, value=2)
+
+
 class GatedLayer(nn.Module):
     """One dilated causal layer with the gated activation of Eq. 1, a residual and a skip connection.
 
@@ -52,7 +58,7 @@ class GatedLayer(nn.Module):
     def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
         filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
-        residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
+        residual, skip = self.out(gated(filtered, gate)).chunk(2, dim=-1)
         return now + residual, skip
 
 
