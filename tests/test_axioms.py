@@ -407,7 +407,7 @@ def test_one_window_is_learned_by_heart(case: Case) -> None:
 
 def test_the_prior_learns_one_segment_by_heart() -> None:
     torch.manual_seed(1)
-    torques = smooth_torques(1, 30, generator=generator())
+    torques = smooth_torques(1, 30, generator=generator(1))
     prior = ActionPrior(DU).fit_scale(torques)
     past, future = (Segment(part[..., :0], part) for part in torques[:, 10:].split(10, 1))
     overfit(prior, lambda noise: prior.loss(Window(past, future), noise), lr=1e-2)
