@@ -1,4 +1,5 @@
 """Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify PATH`` hashes again.
+``python -m tsmlib bench [NAME]`` measures speed.
 
 Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
 """
@@ -6,6 +7,7 @@ Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad argume
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,9 +26,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     verify = commands.add_parser("verify", help="hash an artefact, or a folder of them, again")
     verify.add_argument("path", type=Path)
+    bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
+    bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, or all (default)")
     arguments = parser.parse_args(argv)
     try:
-        return _verify(arguments.path) if arguments.command == "verify" else _run(arguments)
+        match arguments.command:
+            case "verify":
+                return _verify(arguments.path)
+            case "bench":
+                return _bench(arguments.name)
+            case _:
+                return _run(arguments)
     except runs.ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -68,6 +78,21 @@ def _verify(path: Path) -> int:
 
     for file in store.verify(path):
         print(f"ok  {file}")
+    return 0
+
+
+def _benchmarks() -> dict[str, Path]:
+    return {path.stem: path for path in sorted((runs.ROOT / "benchmarks").glob("*.py"))}
+
+
+def _bench(name: str) -> int:
+    present = _benchmarks()
+    if name != "all" and name not in present:
+        raise runs.ParameterError(f"no benchmark is called {name!r:.80}; there are {', '.join(present)}, or all.")
+    for word in present if name == "all" else [name]:
+        status = subprocess.run([sys.executable, str(present[word])], check=False).returncode  # its memory is its own
+        if status:
+            raise runs.RunError(f"the benchmark {word} ended with status {status}.")
     return 0
 
 
