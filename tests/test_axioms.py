@@ -55,7 +55,7 @@ def by_code(model: TSM, seen: Window) -> Tensor:
 
 TSM_LOSSES = (("loss", ()), ("teacher_forced_loss", ()), ("energy_loss", ("encoder",)))
 SAME = dict(losses=TSM_LOSSES, recall=by_code)
-SMALL = dict(channels=8, segment_len=10)
+SMALL = dict(channels=8, segment_len=10, beta=0.1)
 
 MODELS = {
     "tsm": Case(lambda dx: TSM(dx, DU, **SMALL), **SAME),
@@ -408,7 +408,7 @@ def test_one_window_is_learned_by_heart(case: Case) -> None:
 def test_the_prior_learns_one_segment_by_heart() -> None:
     torch.manual_seed(1)
     torques = smooth_torques(1, 30, generator=generator(1))
-    prior = ActionPrior(DU).fit_scale(torques)
+    prior = ActionPrior(DU, beta=0.01).fit_scale(torques)
     past, future = (Segment(part[..., :0], part) for part in torques[:, 10:].split(10, 1))
     overfit(prior, lambda noise: prior.loss(Window(past, future), noise), lr=1e-2)
     error = prior.decode(past.actions, prior.encode(future.actions)[0]) - future.actions

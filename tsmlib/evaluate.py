@@ -33,6 +33,11 @@ def sample_states(
     Column k holds the prediction of x_{past_len + k + 1}.
     """
     past_len, whole = model.past_len, data.padded(0)
+    if not 1 <= horizon <= data.horizon - past_len:
+        raise ValueError(
+            f"horizon is {horizon}; episodes of {data.horizon} steps with {past_len} observed first leave 1 to "
+            f"{data.horizon - past_len} to predict"
+        )
     past = Segment(whole.states[:, :past_len], whole.actions[:, :past_len])
     actions = whole.actions[:, past_len : past_len + horizon]
     drawn = []

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from tsmlib import store
-from tsmlib.trajectory import Trajectories, Window, batches, windows
+from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
 
@@ -88,11 +88,7 @@ def fit(
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             value = loss(next(draw), generator)
         if not torch.isfinite(value):
-            state.restore_best()
-            raise TrainingStopped(
-                f"the training loss became {value.item()} at step {step} of {steps}; the weights of step "
-                f"{state.best_step} are kept. Check the data, or train with a smaller lr than {lr:g}"
-            )
+            raise state.stopped("training", value.item(), f"{step} of {steps}", lr)
         optimizer.zero_grad(set_to_none=True)
         value.backward()
         nn.utils.clip_grad_norm_(model.parameters(), clip)
@@ -101,7 +97,10 @@ def fit(
         bar.update()
         if (step + 1) % validate_every == 0 or step + 1 == steps:
             state.step, state.seconds = step + 1, time.perf_counter() - began
-            state.record(total / counted, validate(loss, held_out, seed))
+            held_out_loss = validate(loss, held_out, seed)
+            if not math.isfinite(held_out_loss):
+                raise state.stopped("validation", held_out_loss, f"{step + 1} of {steps}", lr)
+            state.record(total / counted, held_out_loss)
             bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
             total, counted = 0.0, 0
             if checkpoint is not None:
@@ -132,6 +131,14 @@ class Progress:
         """Put the weights with the best validation loss into the model."""
         self.model.load_state_dict(self.best)
 
+    def stopped(self, which: str, loss: float, at: str, lr: float) -> TrainingStopped:
+        """Go back to the best weights; the error to raise."""
+        self.restore_best()
+        return TrainingStopped(
+            f"the {which} loss became {loss} at step {at}; the weights of step {self.best_step} are kept. "
+            f"Check the data, or train with a smaller lr than {lr:g}"
+        )
+
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write one checkpoint, replacing the one before it in a single step."""
         adam = self.optimizer.state_dict()["state"]
@@ -160,7 +167,13 @@ class Progress:
         for name, tensor in tensors.items():
             group, _, rest = name.partition(".")
             groups[group][rest] = tensor
-        self.model.load_state_dict(groups["model"])
+        try:
+            self.model.load_state_dict(groups["model"])
+        except RuntimeError as error:
+            first = str(error).partition("\n\t")[2].partition("\n")[0]
+            raise store.StoreError(
+                f"{path} holds the weights of another model: {first} Delete it to start anew"
+            ) from error
         self.best = groups["best"]
         moments: dict[int, dict[str, Tensor]] = {}
         for name, tensor in groups["adam"].items():
@@ -182,6 +195,11 @@ def fixed_windows(data: Trajectories, past_len: int, future_len: int, n_windows:
     """The same windows at every validation: evenly spread over episodes and starts."""
     segment = data.padded(past_len)
     n_starts = data.horizon - future_len + 1
+    if n_starts < 1 or not len(data):
+        raise TrajectoryError(
+            f"{len(data)} held-out episodes of {data.horizon} steps hold no window of {future_len} future steps; "
+            f"collect some of at least {future_len} steps"
+        )
     chosen = np.linspace(0, len(data) * n_starts - 1, min(n_windows, len(data) * n_starts)).round().astype(np.int64)
     index = torch.from_numpy(chosen)
     return windows(segment, index // n_starts, index % n_starts, past_len, future_len)

@@ -1,0 +1,273 @@
+"""fit(): what training guarantees, whatever is trained. Small models on a made-up world that takes milliseconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tsmlib import store
+from tsmlib.prior import ActionPrior
+from tsmlib.train import Curve, TrainingStopped, fit, fixed_windows, schedule
+from tsmlib.trajectory import Trajectories, TrajectoryError, Window
+from tsmlib.tsm import TSM
+
+H = 4
+SIZES = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
+
+
+def episodes(n: int, seed: int) -> Trajectories:
+    """States that drift with the actions and with some noise."""
+    rng = np.random.default_rng(seed)
+    actions = np.repeat(rng.uniform(-1, 1, (n, 6, 2)), 5, axis=1)
+    steps = 0.2 * actions @ np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.4]]) + 0.05 * rng.normal(size=(n, 30, 3))
+    states = np.concatenate([np.zeros((n, 1, 3)), steps.cumsum(1)], 1)
+    return Trajectories(
+        states.astype(np.float32), actions.astype(np.float32), "tsm/Made-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (0,)
+    )
+
+
+TRAIN, HELD_OUT = episodes(30, 0), episodes(5, 1)
+
+
+def new_tsm(seed: int = 0) -> TSM:
+    torch.manual_seed(seed)
+    model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
+    model.features.fit(torch.from_numpy(TRAIN.states))
+    return model
+
+
+def new_prior(seed: int = 0) -> ActionPrior:
+    torch.manual_seed(seed)
+    return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(torch.from_numpy(TRAIN.actions))
+
+
+def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> Curve:
+    return fit(model, loss or model.loss, TRAIN, HELD_OUT, **{**SIZES, **settings})
+
+
+def weights(model: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in model.state_dict().items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+class Faulty:
+    """The model's loss, except that call number ``at`` does something else."""
+
+    def __init__(self, model: Any, at: int, instead: Callable[[Tensor], Tensor]) -> None:
+        self.model, self.at, self.instead, self.calls = model, at, instead, 0
+        self.__name__ = "loss"
+
+    def __call__(self, window: Window, generator: torch.Generator) -> Tensor:
+        value = self.model.loss(window, generator)
+        if torch.is_grad_enabled():  # not a validation
+            self.calls += 1
+            if self.calls == self.at:
+                return self.instead(value)
+        return value
+
+
+# What comes out ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("new", [new_tsm, new_prior])
+def test_the_loss_goes_down(new: Callable[[], Any]) -> None:
+    curve = train(new(), steps=60, lr=1e-2, validate_every=20)
+    assert curve.step == [20, 40, 60]
+    assert curve.train[-1] < 0.7 * curve.train[0]
+    assert curve.validation[-1] < 0.7 * curve.validation[0]
+    assert np.all(np.diff(curve.seconds) > 0)
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not() -> None:
+    models = [new_tsm() for _ in range(3)]
+    curves = [train(model, seed=seed) for model, seed in zip(models, (0, 0, 1), strict=True)]
+    assert same(weights(models[0]), weights(models[1]))
+    assert curves[0].validation == curves[1].validation
+    assert not same(weights(models[0]), weights(models[2]))
+
+
+def test_training_neither_uses_nor_changes_the_global_generator() -> None:
+    model = new_tsm()
+    before = torch.get_rng_state()
+    train(model)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_the_weights_with_the_best_validation_loss_are_kept() -> None:
+    model, best = new_tsm(), {}
+
+    def worse_in_the_end(window: Window, generator: torch.Generator) -> Tensor:
+        """A loss whose validation is best at the second of four."""
+        value = model.loss(window, generator)
+        if torch.is_grad_enabled():
+            return value
+        validations.append(weights(model))
+        return torch.tensor([3.0, 1.0, 2.0, 1.0][len(validations) - 1])
+
+    validations: list[dict[str, Tensor]] = []
+    curve = train(model, worse_in_the_end)
+    assert curve.validation == [3.0, 1.0, 2.0, 1.0]
+    best = validations[1]
+    assert same(weights(model), best)
+    assert not same(best, validations[3])
+
+
+def test_patience_stops_early() -> None:
+    model = new_tsm()
+
+    def never_better(window: Window, generator: torch.Generator) -> Tensor:
+        value = model.loss(window, generator)
+        return value if torch.is_grad_enabled() else torch.tensor(1.0)
+
+    assert train(model, never_better, steps=400, patience=3).step == [5, 10, 15, 20]
+
+
+def test_validation_uses_the_same_windows_every_time_from_all_over_the_data() -> None:
+    first, second = (fixed_windows(HELD_OUT, H, H, n_windows=40) for _ in range(2))
+    assert torch.equal(first.future.states, second.future.states)
+    assert first.future.states.shape == (40, H, 3)
+    assert fixed_windows(HELD_OUT, H, H).future.states.shape == (5 * 27, H, 3)  # every window there is
+    assert torch.equal(first.past.states[0, 0], torch.from_numpy(HELD_OUT.states[0, 0]))
+    assert torch.equal(first.future.states[-1, -1], torch.from_numpy(HELD_OUT.states[-1, -1]))
+
+
+def test_the_learning_rate_warms_up_and_ends_at_its_final_value() -> None:
+    rates = [schedule(step, 1000, 1e-3, 1e-5, 100) for step in range(1001)]
+    assert rates[0] == pytest.approx(1e-5)
+    assert max(rates) == rates[99] == rates[100] == pytest.approx(1e-3)
+    assert np.all(np.diff(rates[:100]) > 0)
+    assert np.all(np.diff(rates[100:]) < 0)
+    assert rates[550] == pytest.approx((1e-3 + 1e-5) / 2)
+    assert rates[1000] == pytest.approx(1e-5)
+
+
+# Stopped and resumed -------------------------------------------------------------------------------------------------
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupt(_: Tensor) -> Tensor:
+    raise Interrupted
+
+
+@pytest.mark.parametrize("new", [new_tsm, new_prior])
+@pytest.mark.parametrize("at", [3, 6, 13])
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
+    tmp_path: Path, new: Callable[..., Any], at: int
+) -> None:
+    whole, stopped, resumed = new(), new(), new(seed=0 if at <= 5 else 7)  # other weights: a checkpoint brings them
+    expected = train(whole)
+    checkpoint = tmp_path / "run.safetensors"
+    with pytest.raises(Interrupted):
+        train(stopped, Faulty(stopped, at, interrupt), checkpoint=checkpoint)
+    assert checkpoint.exists() is (at > 5)
+    curve = train(resumed, checkpoint=checkpoint)
+    assert same(weights(resumed), weights(whole))
+    assert (curve.step, curve.train, curve.validation) == (expected.step, expected.train, expected.validation)
+    again = new(seed=8)
+    assert asdict(train(again, checkpoint=checkpoint)) == asdict(curve)  # finished: nothing is left to do
+    assert same(weights(again), weights(whole))
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"seed": 3}, "seed is 0, now 3"),
+        ({"lr": 5e-4}, "lr is 0.001, now 0.0005"),
+        ({"steps": 50}, "steps is 20, now 50"),
+        ({"batch_size": 4}, "batch_size is 8, now 4"),
+        ({"future_len": 2 * H}, "future_len is 4, now 8"),
+        ({"bf16": True}, "bf16 is False, now True"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused_naming_what_differs(
+    tmp_path: Path, other: dict[str, Any], message: str
+) -> None:
+    checkpoint = tmp_path / "run.safetensors"
+    train(new_tsm(), checkpoint=checkpoint)
+    content, model = checkpoint.read_bytes(), new_tsm()
+    before = weights(model)
+    with pytest.raises(store.StoreError, match=f"run.safetensors is the checkpoint of another run: {message}. Delete"):
+        train(model, checkpoint=checkpoint, **other)
+    assert checkpoint.read_bytes() == content
+    assert same(weights(model), before)
+
+
+def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -> None:
+    checkpoint, model = tmp_path / "run.safetensors", new_tsm()
+    train(model, checkpoint=checkpoint)
+    with pytest.raises(store.StoreError, match="loss is 'loss', now 'teacher_forced_loss'"):
+        train(model, model.teacher_forced_loss, checkpoint=checkpoint)
+    elsewhere = replace(TRAIN, env="tsm/Other-v0").take(slice(0, 20))
+    with pytest.raises(store.StoreError, match="env is 'tsm/Made-v0', now 'tsm/Other-v0'; episodes is 30, now 20"):
+        fit(model, model.loss, elsewhere, HELD_OUT, **SIZES, checkpoint=checkpoint)
+
+
+def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
+    checkpoint, wider = (
+        tmp_path / "run.safetensors",
+        TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2)),
+    )
+    train(new_tsm(), checkpoint=checkpoint)
+    with pytest.raises(store.StoreError, match=r"run.safetensors holds the weights of another model.*Delete it"):
+        train(wider, checkpoint=checkpoint)
+
+
+# What goes wrong -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_the_first_loss_that_is_not_finite_stops_training_and_keeps_the_best_weights(
+    tmp_path: Path, value: float
+) -> None:
+    kept, model = new_tsm(), new_tsm()
+    with pytest.raises(Interrupted):
+        train(kept, Faulty(kept, 12, interrupt), checkpoint=tmp_path / "kept.safetensors")
+    tensors, header = store.load(tmp_path / "kept.safetensors", kind="checkpoint")
+    best = {name.removeprefix("best."): t for name, t in tensors.items() if name.startswith("best.")}
+    faulty, kept_step = Faulty(model, 14, lambda loss: loss * value), header["best_step"]
+    message = rf"training loss became {value} at step 13 of 20; the weights of step {kept_step} are kept.*smaller lr"
+    with pytest.raises(TrainingStopped, match=message):
+        train(model, faulty)
+    assert faulty.calls == 14
+    assert same(weights(model), best)
+
+
+@pytest.mark.parametrize(("at", "which"), [(12, "training"), (10, "validation")])
+def test_a_gradient_that_is_not_finite_stops_training_at_the_next_loss(tmp_path: Path, at: int, which: str) -> None:
+    model, checkpoint = new_tsm(), tmp_path / "run.safetensors"
+    first = next(model.parameters())
+    with pytest.raises(TrainingStopped, match=f"the {which} loss became nan at step {at} of 20; the weights of step"):
+        train(model, Faulty(model, at, lambda loss: loss + _cliff(first)), checkpoint=checkpoint)
+    assert all(torch.isfinite(p).all() for p in model.parameters())
+    store.load(checkpoint, kind="checkpoint")  # the last good one is still there
+
+
+def _cliff(parameter: Tensor) -> Tensor:
+    """Zero, with an infinite slope."""
+    return (parameter - parameter.detach()).abs().sum().sqrt()
+
+
+def test_numbers_that_are_not_positive_are_refused() -> None:
+    for name in ("steps", "batch_size", "validate_every"):
+        for value in (0, -5):
+            with pytest.raises(ValueError, match=f"{name} {value}.*expected positive"):
+                train(new_tsm(), **{name: value})
+
+
+def test_episodes_shorter_than_the_windows_are_refused() -> None:
+    with pytest.raises(TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"):
+        train(new_tsm(), future_len=36)
