@@ -105,7 +105,7 @@ def test_training_neither_uses_nor_changes_the_global_generator() -> None:
 
 
 def test_the_weights_with_the_best_validation_loss_are_kept() -> None:
-    model, best = new_tsm(), {}
+    model = new_tsm()
 
     def worse_in_the_end(window: Window, generator: torch.Generator) -> Tensor:
         """A loss whose validation is best at the second of four."""

@@ -39,6 +39,8 @@ def collect(
     seen, done, taken = [start[:, None]], [], 0
     while taken < horizon:
         actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
+        if actions.shape[1] < 1:
+            raise ValueError(f"the controller gave no actions when asked at step {taken} of {horizon}")
         reached = arm.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)

@@ -37,6 +37,10 @@ class Task:
     def __post_init__(self) -> None:
         if self.name not in ("reach", "push"):
             raise ValueError(f"task is {self.name!r}, expected 'reach' or 'push'")
+        if self.name == "push" and self.start.shape[1] < 10:
+            raise ValueError(f"there is nothing to push in {self.env}; its task is 'reach'")
+        if self.horizon < 1:
+            raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
 
     def __len__(self) -> int:
         return len(self.start)

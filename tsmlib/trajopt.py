@@ -52,6 +52,8 @@ class DirectActions:
     """Eq. 2: the torques themselves, squashed to the bounds by tanh. Its noise is as smooth as the training torques."""
 
     def __init__(self, horizon: int, action_dim: int = 2, *, rms: float = 0.1) -> None:
+        if horizon < 1:
+            raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
         self.shape: tuple[int, ...] = (horizon, action_dim)
         self.scale = rms
 

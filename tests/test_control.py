@@ -1,0 +1,242 @@
+"""Collecting, executing, posing tasks: what is recorded is what happened; a gap is what was promised too much."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tsmlib import control, rewards, runs, study
+from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.control import Task, execute, random_torques, zero_torques
+from tsmlib.envs import ENV_IDS
+from tsmlib.trajectory import Segment
+from tsmlib.trajopt import Plan
+
+REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+
+
+def arms(env_id: str, n: int) -> Any:
+    return gymnasium.make_vec(env_id, num_envs=n)
+
+
+def torques(n: int, steps: int, seed: int = 0) -> Tensor:
+    return smooth_torques(n, steps, generator=torch.Generator().manual_seed(seed), rms=0.2)
+
+
+# Collecting ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", [REACHER, PUSH, "tsm/PymunkPush-v0"])
+def test_collected_episodes_are_the_simulators_rollouts(env_id: str) -> None:
+    env, actions = arms(env_id, 3), torques(3, 12)
+    data = collect(env, once(actions), horizon=12, seed=5)
+    start, _ = env.reset(seed=5)
+    np.testing.assert_array_equal(data.states[:, 0], start.astype(np.float32))
+    np.testing.assert_array_equal(data.states[:, 1:], env.unwrapped.rollout(actions.numpy()).astype(np.float32))
+    np.testing.assert_array_equal(data.actions, actions)
+    arm = env.unwrapped
+    assert (data.env, data.dt, data.names, data.angles) == (env_id, 0.02, tuple(arm.names), (0, 1))
+    assert data.states.dtype == data.actions.dtype == np.float32
+
+
+def test_episodes_start_from_given_states() -> None:
+    env = arms(PUSH, 4)
+    start, _ = env.reset(seed=1)
+    data = collect(env, once(torques(4, 6)), horizon=6, states=start[::-1])
+    np.testing.assert_array_equal(data.states[:, 0], start[::-1].astype(np.float32))
+
+
+def test_a_controller_that_is_asked_again_gets_the_past() -> None:
+    asked: list[Segment] = []
+    plan = torques(2, 20)
+
+    def three_at_a_time(past: Segment) -> Tensor:
+        done = 3 * len(asked)
+        asked.append(past)
+        return plan[:, done : done + 3]
+
+    data = collect(arms(REACHER, 2), three_at_a_time, horizon=10, past_len=5, seed=0)
+    assert len(asked) == 4
+    assert data.horizon == 10  # the last answer is cut short
+    whole = data.padded(5)
+    for k, past in enumerate(asked):
+        assert torch.equal(past.states, whole.states[:, 3 * k : 3 * k + 5])
+        assert torch.equal(past.actions, whole.actions[:, 3 * k : 3 * k + 5])
+    at_once = collect(arms(REACHER, 2), once(plan), horizon=10, seed=0)
+    np.testing.assert_array_equal(data.states, at_once.states)
+
+
+def test_what_is_recorded_is_what_the_arm_received() -> None:
+    strong = torch.full((1, 4, 2), 3.0, requires_grad=True)
+    data = collect(arms(REACHER, 1), once(strong), horizon=4, seed=0)
+    assert (data.actions == 1).all()
+
+
+@pytest.mark.parametrize("horizon", [0, -5])
+def test_a_horizon_without_steps_is_refused(horizon: int) -> None:
+    with pytest.raises(ValueError, match=f"horizon is {horizon}, expected a positive number of steps"):
+        collect(arms(REACHER, 1), once(torques(1, 5)), horizon=horizon)
+
+
+def test_a_controller_without_an_answer_is_refused() -> None:
+    def three_steps(past: Segment) -> Tensor:
+        return torques(2, 0 if past.actions.any() else 3)
+
+    with pytest.raises(ValueError, match="the controller gave no actions when asked at step 3 of 10"):
+        collect(arms(REACHER, 2), three_steps, horizon=10, seed=0)
+
+
+# Smooth torques ------------------------------------------------------------------------------------------------------
+
+
+def test_torques_start_near_zero_and_settle_to_their_strength() -> None:
+    drawn = smooth_torques(4000, 60, generator=torch.Generator().manual_seed(0), rms=0.1)
+    strength = drawn.square().mean((0, 2)).sqrt()  # (60,)
+    assert strength[0] < 0.07
+    assert (strength[:5].diff() > 0).all()
+    assert strength[20:].min() > 0.097
+    assert strength[20:].max() < 0.103
+    assert drawn.mean().abs() < 1e-3
+
+
+def test_torques_are_smooth_bounded_and_a_function_of_their_generator() -> None:
+    drawn = torques(2000, 60)
+    assert drawn.diff(dim=1)[:, 20:].std() < 0.8 * drawn[:, 20:].std()
+    now, later = drawn[:, 20:-1].flatten(), drawn[:, 21:].flatten()
+    assert torch.corrcoef(torch.stack([now, later]))[0, 1] > 0.7
+    assert smooth_torques(500, 50, generator=torch.Generator().manual_seed(0), rms=2.0).abs().max() == 1
+    assert torch.equal(torques(5, 9), torques(5, 9))
+    assert not torch.equal(torques(5, 9), torques(5, 9, seed=1))
+
+
+# Executing -----------------------------------------------------------------------------------------------------------
+
+
+def some_task(env: str = REACHER, n: int = 4, horizon: int = 20) -> Task:
+    return dataclasses.replace(study.draw_task(env, seed=3, n=n), horizon=horizon)
+
+
+@pytest.mark.parametrize("env", ENV_IDS)
+def test_without_torque_the_return_is_that_of_staying_put(env: str) -> None:
+    task = some_task(env)
+    trial = execute(task, zero_torques(task))
+    distance = np.linalg.norm(task.start[:, task.position] - task.target.numpy(), axis=1)
+    assert trial.states.shape == (4, 21, task.start.shape[1])
+    np.testing.assert_allclose(trial.true, -20 * distance, atol=20 * 1e-3)  # it drifts by less than a millimetre
+    np.testing.assert_allclose(trial.final_distance, distance, atol=2e-3)
+    np.testing.assert_allclose(trial.states[:, 0], task.start)
+
+
+@pytest.mark.parametrize("env", [REACHER, PUSH])
+def test_the_environments_reward_is_the_tasks(env: str) -> None:
+    task, actions = some_task(env), torques(4, 20)
+    trial = execute(task, actions)
+    arm = arms(env, 4)
+    arm.reset(options={"states": task.start, "target": task.target.numpy()})
+    total, last = np.zeros(4), None
+    for u in actions.unbind(1):
+        last, reward, _, _, _ = arm.step(u.numpy())
+        total += reward
+    np.testing.assert_allclose(trial.true, total, rtol=1e-5)
+    np.testing.assert_allclose(trial.states[:, -1], last, rtol=1e-5, atol=1e-6)
+
+
+def test_a_reward_is_distance_and_torque_of_its_own_target() -> None:
+    draw = torch.Generator().manual_seed(0)
+    states, actions = torch.randn(5, 3, 7, 10, generator=draw), torch.randn(5, 3, 7, 2, generator=draw)
+    target = torch.randn(3, 2, generator=draw)
+    for reward, at in ((rewards.reach(target, torque_weight=0.3), 4), (rewards.push(target, torque_weight=0.3), 6)):
+        found = reward(states, actions)
+        assert found.shape == (5, 3, 7)
+        for c, b, t in ((0, 0, 0), (4, 2, 6), (1, 2, 3)):
+            apart = math.dist(states[c, b, t, at : at + 2].tolist(), target[b].tolist())
+            effort = actions[c, b, t].square().sum().item()
+            assert found[c, b, t].item() == pytest.approx(-apart - 0.3 * effort, rel=1e-5)
+
+
+def test_a_reward_has_a_finite_slope_at_its_target() -> None:
+    states = torch.zeros(1, 2, 6, requires_grad=True)
+    rewards.reach(torch.zeros(1, 2))(states, torch.zeros(1, 2, 2)).sum().backward()
+    assert torch.isfinite(states.grad).all()
+
+
+def test_the_gap_is_predicted_minus_true() -> None:
+    task = some_task()
+    actions = random_torques(task)
+    promised = torch.tensor([-1.0, -2.0, 0.0, 5.0])
+    plan = Plan(
+        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted=promised,
+        curve=promised[None], seconds=1.0,
+    )  # fmt: skip
+    trial, plain = execute(task, plan), execute(task, actions)
+    torch.testing.assert_close(trial.true, plain.true)
+    torch.testing.assert_close(trial.gap, promised - plain.true)
+    with pytest.raises(ValueError, match="not planned"):
+        _ = plain.gap
+
+
+def test_a_table_holds_what_the_trials_measured() -> None:
+    task = some_task()
+    trial = execute(task, zero_torques(task))
+    run = runs.resolve("05_control", scale="smoke", seed=2, run_dir="/nowhere")
+    summary, per_target = control.tables([task], {REACHER: {"zero": trial}}, run)
+    found = {row["metric"]: row for row in summary}
+    assert found["return_true"]["value"] == pytest.approx(float(trial.true.mean()))
+    near = trial.final_distance <= control.TOLERANCE
+    assert found["success"]["value"] == pytest.approx(float(near.float().mean()))
+    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
+    returns = [row["value"] for row in per_target if row["metric"] == "return_true"]
+    np.testing.assert_allclose(returns, trial.true, rtol=1e-6)
+
+
+# Tasks ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not study.FROZEN.exists(), reason="data/tasks is not there")
+@pytest.mark.parametrize("env", ENV_IDS)
+def test_frozen_tasks_are_those_their_seed_draws(env: str) -> None:
+    frozen, drawn = study.task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
+    assert (frozen.name, frozen.env, len(frozen)) == (drawn.name, env, 100)
+    np.testing.assert_allclose(frozen.start, drawn.start, rtol=0, atol=1e-6)
+    torch.testing.assert_close(frozen.target, drawn.target, rtol=0, atol=1e-6)
+    assert not np.allclose(frozen.start, study.task(env, "validation").start)
+
+
+@pytest.mark.parametrize("env", ENV_IDS)
+def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number(env: str) -> None:
+    many, few = study.draw_task(env, seed=9), study.draw_task(env, seed=9, n=5)
+    assert many.target.norm(dim=1).max() <= 0.2
+    first = many.take(5)
+    assert len(first) == 5
+    np.testing.assert_array_equal(first.start, few.start)
+    assert torch.equal(first.target, few.target)
+
+
+def test_a_task_of_another_name_is_refused() -> None:
+    with pytest.raises(ValueError, match="task is 'dance', expected 'reach' or 'push'"):
+        dataclasses.replace(some_task(), name="dance")
+
+
+def test_pushing_without_an_object_is_refused() -> None:
+    with pytest.raises(ValueError, match=f"there is nothing to push in {REACHER}"):
+        dataclasses.replace(some_task(), name="push")
+
+
+def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
+    task = some_task()
+    with pytest.raises(ValueError, match="not planned"):
+        control.strip(task, execute(task, zero_torques(task)), 0)
+
+
+def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    execute(some_task(), zero_torques(some_task()))
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,316 @@
+"""Planning on systems whose best plan is known, and through the true simulator."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium
+import pytest
+import torch
+from torch import Tensor
+
+import tsmlib.envs  # noqa: F401 - registers the environments
+from tsmlib import rewards
+from tsmlib.nets import Noise, standard_normal
+from tsmlib.prior import ActionPrior
+from tsmlib.rewards import Reward
+from tsmlib.trajectory import Segment, Window, initial_past
+from tsmlib.trajopt import (
+    DirectActions,
+    LatentActions,
+    Plan,
+    Predict,
+    adam,
+    cem,
+    evaluate,
+    expected_return,
+    sampled_starts,
+    through_model,
+    through_simulator,
+)
+from tsmlib.tsm import TSM
+
+T, B, DT = 10, 3, 0.5
+
+
+@dataclass
+class Cart:
+    """A double integrator, state (position, velocity), force in [-1, 1], with noise in its velocity at every step."""
+
+    noise: float = 0.0
+    segment_len: int = 4
+    past_len: int = 1
+
+    def loss(self, window: Window, generator: Noise) -> Tensor:
+        raise NotImplementedError
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        position, velocity = past.states[:, -1].unbind(-1)
+        states = []
+        for u in actions.unbind(1):
+            velocity = velocity + DT * u[:, 0]
+            if generator is not None:
+                velocity = velocity + self.noise * standard_normal(velocity.shape, generator, velocity)
+            position = position + DT * velocity
+            states.append(torch.stack([position, velocity], -1))
+        return torch.stack(states, 1)
+
+
+START = torch.tensor([[0.0, 0.0], [1.0, -0.5], [-0.3, 0.2]])
+TARGET = torch.tensor([0.8, 0.5, -0.4])
+
+
+def reward(states: Tensor, actions: Tensor) -> Tensor:
+    """Minus the squared distance from TARGET and a little of the force."""
+    return -(states[..., 0] - TARGET[:, None]).square() - 0.3 * actions.square().sum(-1)
+
+
+def predictor(noise: float = 0.0, samples: int = 1) -> Predict:
+    return through_model(Cart(noise), initial_past(START, 1, 1), samples=samples)
+
+
+def optimum() -> tuple[Tensor, Tensor]:
+    """The best forces (B, T) and their return (B,), by least squares: positions are linear in forces."""
+    predict = predictor()
+    free = predict(torch.zeros(1, B, T, 1))[0, 0, ..., 0]  # (B, T)
+    unit = torch.eye(T)[:, None, :, None].expand(-1, B, -1, -1)
+    effect = predict(unit)[0, ..., 0] - free  # (T, B, T): of force j on position k
+    best = []
+    for b in range(B):
+        m = effect[:, b]
+        best.append(torch.linalg.solve(m @ m.T + 0.3 * torch.eye(T), m @ (TARGET[b] - free[b])))
+    forces = torch.stack(best)
+    assert forces.abs().max() < 0.95  # within the bounds, so that it is the optimum of the bounded problem too
+    actions = forces[None, ..., None]
+    return forces, expected_return(predict(actions), actions, reward)[0]
+
+
+class Rough(DirectActions):
+    """Torques whose noise at one step has nothing to do with that at the next."""
+
+    def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
+        return torch.randn(n, n_targets, *self.shape, generator=generator)
+
+
+def plan_by(planner: str, predict: Predict, reward: Reward, iterations: int, **settings: Any) -> Plan:
+    space = settings.pop("space", DirectActions(T, 1, rms=0.5))
+    if planner == "cem":
+        settings = {"candidates": 64, "elites": 8, **settings}
+        return cem(predict, reward, space, B, iterations=iterations, **settings)
+    return adam(predict, reward, space, torch.zeros(1, B, T, 1), iterations=iterations, **{"lr": 0.05, **settings})
+
+
+# Optima --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("planner", "settings", "missed"),
+    [
+        ("adam", {"iterations": 100, "lr": 0.1}, 0.01),
+        ("cem", {"iterations": 20, "space": Rough(T, 1, rms=0.5)}, 0.01),
+        ("cem", {"iterations": 10, "candidates": 256, "elites": 24}, 0.1),  # smooth noise finds no abrupt start
+    ],
+    ids=["adam", "cem", "cem, smooth"],
+)
+def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, Any], missed: float) -> None:
+    forces, value = optimum()
+    plan = plan_by(planner, predictor(), reward, **settings)
+    nothing = expected_return(predictor()(torch.zeros(1, B, T, 1)), torch.zeros(1, B, T, 1), reward)[0]
+    assert (plan.predicted <= value + 1e-5).all()
+    assert (value - plan.predicted < missed * (value - nothing)).all()
+    if missed < 0.05:
+        assert (plan.actions[..., 0] - forces).abs().max() < 0.3
+
+
+@pytest.mark.parametrize("planner", ["adam", "cem"])
+def test_more_iterations_never_make_the_predicted_return_worse(planner: str) -> None:
+    plans = [plan_by(planner, predictor(0.1, 3), reward, n) for n in (1, 4, 12)]
+    for fewer, more in itertools.pairwise(plans):
+        assert (more.predicted >= fewer.predicted - 1e-5).all()
+    assert (plans[-1].curve.diff(dim=0) >= 0).all()
+    assert (plans[-1].predicted > plans[0].predicted).all()
+
+
+@pytest.mark.parametrize("planner", ["adam", "cem"])
+def test_a_plan_keeps_its_promises(planner: str) -> None:
+    predict, space = predictor(0.1, 5), DirectActions(T, 1, rms=0.5)
+    plan = plan_by(planner, predict, reward, 5)
+    assert plan.actions.shape == (B, T, 1)
+    assert plan.states.shape == (5, B, T, 2)
+    assert plan.parameters.shape == (B, T, 1)
+    assert plan.seconds > 0
+    torch.testing.assert_close(space.decode(plan.parameters[None])[0], plan.actions)
+    torch.testing.assert_close(evaluate(predict, reward, space, plan.parameters[None])[0], plan.predicted)
+    torch.testing.assert_close(plan.curve[-1], plan.predicted)
+    torch.testing.assert_close(reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted)
+
+
+@pytest.mark.parametrize("planner", ["adam", "cem"])
+def test_targets_are_planned_for_independently(planner: str) -> None:
+    def greedy(states: Tensor, actions: Tensor) -> Tensor:
+        """The first target's reward is as before; the others' is huge and means nothing."""
+        return torch.cat([reward(states, actions)[..., :1, :], 1e3 * reward(states, actions)[..., 1:, :]], -2)
+
+    usual, odd = (plan_by(planner, predictor(), r, 8) for r in (reward, greedy))
+    torch.testing.assert_close(usual.actions[0], odd.actions[0])
+
+
+def test_the_bounds_hold_however_much_is_to_gain() -> None:
+    def forwards(states: Tensor, actions: Tensor) -> Tensor:
+        return 100 * states[..., 0]
+
+    for planner, settings in (("adam", {"lr": 1.0}), ("cem", {})):
+        plan = plan_by(planner, predictor(), forwards, 30, **settings)
+        assert plan.actions.abs().max() <= 1
+        assert plan.actions.max() > 0.9
+
+
+def test_each_target_keeps_its_best_restart() -> None:
+    starts = torch.zeros(3, B, T, 1)
+    starts[0], starts[2] = -3.0, 3.0  # poor places to begin
+    many = adam(predictor(), reward, DirectActions(T, 1), starts, iterations=5)
+    for start in starts:
+        alone = adam(predictor(), reward, DirectActions(T, 1), start[None], iterations=5)
+        assert (many.predicted >= alone.predicted - 1e-5).all()
+
+
+def test_sampled_starts_are_the_best_of_the_candidates() -> None:
+    space = DirectActions(T, 1, rms=0.5)
+    starts = sampled_starts(predictor(), reward, space, B, candidates=100, keep=4)
+    returns = evaluate(predictor(), reward, space, starts)
+    assert starts.shape == (4, B, T, 1)
+    assert (returns.diff(dim=0) <= 0).all()
+    drawn = space.scale * space.noise(100, B, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(evaluate(predictor(), reward, space, drawn).topk(4, dim=0).values, returns)
+
+
+def test_a_large_evaluation_is_that_of_its_parts() -> None:
+    space, predict = DirectActions(T, 1), predictor(0.1, 2)
+    parameters = torch.randn(11, B, T, 1, generator=torch.Generator().manual_seed(0))
+    whole, parts = (evaluate(predict, reward, space, parameters, rows=rows) for rows in (6400, 2 * B))
+    torch.testing.assert_close(whole, parts)
+
+
+def test_a_return_that_is_not_finite_stops_the_planner() -> None:
+    def broken(states: Tensor, actions: Tensor) -> Tensor:
+        return reward(states, actions) / 0.0 * 0.0
+
+    for planner in ("adam", "cem"):
+        with pytest.raises(FloatingPointError, match="candidates have a predicted return that is not finite"):
+            plan_by(planner, predictor(), broken, 2)
+
+
+# Common random numbers -----------------------------------------------------------------------------------------------
+
+
+def test_candidates_and_calls_meet_the_same_futures() -> None:
+    actions = torch.zeros(1, B, T, 1)
+    predict = predictor(0.3, samples=4)
+    states = predict(actions.expand(5, -1, -1, -1))
+    assert states.shape == (4, 5, B, T, 2)
+    torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 4, -1, -1, -1))
+    torch.testing.assert_close(predict(actions)[:, 0], states[:, 0])
+    assert (states[0] - states[1]).abs().min(dim=-1).values.max() > 0.01  # the samples themselves differ
+    other = through_model(Cart(0.3), initial_past(START, 1, 1), samples=4, seed=1)
+    assert not torch.equal(other(actions), predict(actions))
+
+
+def test_no_samples_means_the_mode() -> None:
+    actions = torch.full((2, B, T, 1), 0.3)
+    states = through_model(Cart(0.3), initial_past(START, 1, 1), samples=0)(actions)
+    torch.testing.assert_close(states, predictor(0.0)(actions))
+
+
+def test_a_batch_of_candidates_and_samples_is_laid_out_as_stated() -> None:
+    torch.manual_seed(0)
+    model = TSM(6, 2, channels=8)
+    start = torch.randn(B, 6)
+    actions = torch.randn(4, B, 15, 2).clamp(-1, 1)
+    states = through_model(model, initial_past(start, 10, 2), samples=0)(actions)
+    for c, b in itertools.product(range(4), range(B)):
+        past = initial_past(start[b : b + 1], 10, 2)
+        alone = through_model(model, past, samples=0)(actions[c : c + 1, b : b + 1])
+        torch.testing.assert_close(states[0, c, b], alone[0, 0, 0], rtol=1e-4, atol=1e-5)
+
+
+# Latent actions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def prior() -> ActionPrior:
+    torch.manual_seed(0)
+    return ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2)).requires_grad_(False)
+
+
+def test_codes_decode_segment_by_segment_from_no_torque(prior: ActionPrior) -> None:
+    space = LatentActions(prior, 30)
+    codes = torch.randn(2, B, *space.shape)
+    actions = space.decode(codes)
+    assert space.shape == (3, 8)
+    assert actions.shape == (2, B, 30, 2)
+    for c, b in itertools.product(range(2), range(B)):
+        past = torch.zeros(1, 10, 2)
+        for k in range(3):
+            past = prior.decode(past, codes[c, b, k][None])
+            torch.testing.assert_close(actions[c, b, 10 * k : 10 * k + 10], past[0], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("horizon", [0, -10, 5, 25])
+def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(prior: ActionPrior, horizon: int) -> None:
+    with pytest.raises(
+        ValueError, match=rf"horizon of {horizon} steps is not a whole number of segments of 10; choose"
+    ):
+        LatentActions(prior, horizon)
+
+
+@pytest.mark.parametrize("planner", ["adam", "cem"])
+def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, planner: str) -> None:
+    torch.manual_seed(0)
+    model, space = TSM(6, 2, channels=8).requires_grad_(False), LatentActions(prior, 20)
+    predict = through_model(model, initial_past(torch.zeros(B, 6), 10, 2), samples=2)
+    task = rewards.reach(torch.tensor([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0]]))
+    start = torch.zeros(1, B, *space.shape)
+    if planner == "adam":
+        plan = adam(predict, task, space, start, iterations=5, lr=0.1)
+    else:
+        plan = cem(predict, task, space, B, candidates=16, elites=4, iterations=4)
+    assert (plan.predicted > evaluate(predict, task, space, start)[0]).all()
+    assert plan.actions.abs().max() <= 1
+    torch.testing.assert_close(plan.actions, prior.plan(torch.zeros(B, 10, 2), plan.parameters))
+
+
+# Through the true simulator ------------------------------------------------------------------------------------------
+
+
+def test_cem_through_the_simulator_beats_doing_nothing() -> None:
+    env_id = "tsm/Reacher-v0"
+    env = gymnasium.make_vec(env_id, num_envs=2)
+    start, _ = env.reset(seed=0)
+    predict = through_simulator(env_id, start)
+    task = rewards.reach(torch.tensor([[0.1, 0.12], [0.15, -0.1]]))
+    plan = cem(predict, task, DirectActions(20), 2, candidates=24, elites=4, iterations=4)
+    nothing = torch.zeros(1, 2, 20, 2)
+    assert (plan.predicted > expected_return(predict(nothing), nothing, task)[0] + 0.1).all()
+    env.reset(options={"states": start})
+    by_hand = torch.from_numpy(env.unwrapped.rollout(plan.actions.numpy())).float()
+    torch.testing.assert_close(plan.states[0], by_hand, rtol=0, atol=0)  # what it predicted is what happens
+    env.close()
+
+
+def test_candidates_in_the_simulator_do_not_mix() -> None:
+    start = gymnasium.make_vec("tsm/ReacherPush-v0", num_envs=2).reset(seed=0)[0]
+    predict = through_simulator("tsm/ReacherPush-v0", start)
+    actions = 0.2 * torch.randn(3, 2, 12, 2, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
+    states = predict(actions)
+    assert states.shape == (1, 3, 2, 12, 10)
+    for c in range(3):
+        assert torch.equal(predict(actions[c : c + 1])[0, 0], states[0, c])
+
+
+@pytest.mark.parametrize("make", [partial(DirectActions, 0), partial(DirectActions, -3)])
+def test_a_horizon_without_steps_is_refused(make: Any) -> None:
+    with pytest.raises(ValueError, match="horizon is (0|-3), expected a positive number of steps"):
+        make()
