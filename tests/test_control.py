@@ -88,7 +88,7 @@ def test_a_horizon_without_steps_is_refused(horizon: int) -> None:
 
 def test_a_controller_without_an_answer_is_refused() -> None:
     def three_steps(past: Segment) -> Tensor:
-        return torques(2, 0 if past.actions.any() else 3)
+        return torques(2, 3)[:, : 0 if past.actions.any() else 3]
 
     with pytest.raises(ValueError, match="the controller gave no actions when asked at step 3 of 10"):
         collect(arms(REACHER, 2), three_steps, horizon=10, seed=0)

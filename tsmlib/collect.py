@@ -71,6 +71,8 @@ def smooth_torques(
 
     They start from zero, as the paper's U_0 does, and settle to a root mean square of ``rms``, clipped to [-1, 1].
     """
+    if n < 1 or horizon < 1:
+        raise ValueError(f"n is {n}, horizon is {horizon}, expected a positive number of episodes and of steps")
     keep = np.exp(-dt / time_constant)
     noise = torch.randn(n, horizon, action_dim, generator=generator).numpy()
     once, twice, torques = np.zeros((n, action_dim)), np.zeros((n, action_dim)), np.empty_like(noise)

@@ -85,11 +85,10 @@ def sizes(run: Run, env: str) -> dict[str, int]:
 def dataset(run: Run, env: str, split: str) -> Trajectories:
     """One split of an environment's data, collected at the first call. Training data depend on the run's seed."""
     n = sizes(run, env)[split]
-    path = run.data / short(env) / f"{split}.safetensors"
+    path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
     if path.exists():
         return store.load_trajectories(path, env=env)
     data = random_data(env, n, seed=HELD_OUT_SEED.get(split, run.seed))
-    path.parent.mkdir(parents=True, exist_ok=True)
     store.save_trajectories(path, data, {"split": split, "seed": run.seed, "scale": run.scale})
     return data
 
@@ -136,7 +135,7 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     if model == "prior":  # equally many episodes hold the same torques, whatever the environment
         env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
     cls = ActionPrior if model == "prior" else TSM
-    own = run.models / short(env) / f"{model}.safetensors"
+    own = run.folder(f"models/{short(env)}") / f"{model}.safetensors"
     shipped = run.shipped / short(env) / f"{model}.safetensors"
     for path in [own] if run.scale == "paper" or run.seed else [own, shipped]:
         if path.exists():
@@ -148,7 +147,6 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
     """Train ``model`` by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
     print(f"{env}: no trained {model} at scale {run.scale}; training it now")
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
-    path.parent.mkdir(parents=True, exist_ok=True)
     net = fresh(run, model, data)
     curves = {}
     for stage in schedule(run, env, model):
@@ -231,6 +229,11 @@ def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterati
 
 def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Plan:
     """The plan alone; see ``trial``."""
+    if planner not in ("adam", "adam+starts", "cem") or prior not in ("codes", "actions") or iterations < 0:
+        raise ValueError(
+            f"planner is {planner!r}, prior {prior!r}, iterations {iterations}; expected adam, adam+starts or cem, "
+            "codes or actions, and 0 (the scale's default) or more"
+        )
     space: Space = DirectActions(task.horizon)
     if prior == "codes":
         space = LatentActions(load_or_train(run, task.env, "prior")[0], task.horizon)
@@ -258,10 +261,8 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
             keep=run.pick(smoke=1, laptop=2, paper=4),
             seed=run.seed,
         )
-    elif planner == "adam":
-        start = torch.zeros(1, len(task), *space.shape)
     else:
-        raise ValueError(f"planner is {planner!r}, expected adam, adam+starts or cem")
+        start = torch.zeros(1, len(task), *space.shape)
     return adam(
         predict,
         task.reward,

@@ -150,6 +150,8 @@ def adam(
 
     C restarts run side by side; each target keeps the parameters with the best predicted return it ever had.
     """
+    if iterations < 0:
+        raise ValueError(f"iterations is {iterations}, expected 0 or more")
     began = time.perf_counter()
     parameters = start.clone().requires_grad_()
     optimizer = torch.optim.Adam([parameters], lr=lr)
@@ -181,6 +183,11 @@ def cem(
     progress: str = "",
 ) -> Plan:
     """Cross-entropy method: sample around a mean, refit mean and deviation to the elites, keep the best ever seen."""
+    if not 2 <= elites <= candidates or iterations < 1:
+        raise ValueError(
+            f"candidates is {candidates}, elites {elites}, iterations {iterations}; expected 2 <= elites <= candidates "
+            "and at least one iteration"
+        )
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
     mean = torch.zeros(n_targets, *space.shape)
@@ -216,6 +223,8 @@ def sampled_starts(
 
     Where nothing is pushed before contact there is no gradient either, so a start must already touch the object.
     """
+    if not 1 <= keep <= candidates:
+        raise ValueError(f"keep is {keep} of {candidates} candidates, expected 1 to {candidates}")
     parameters = space.scale * space.noise(candidates, n_targets, torch.Generator().manual_seed(seed))
     chosen = evaluate(predict, reward, space, parameters).topk(keep, dim=0).indices
     return parameters.gather(0, chosen.reshape(*chosen.shape, *[1] * len(space.shape)).expand(-1, -1, *space.shape))

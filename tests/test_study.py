@@ -1,0 +1,279 @@
+"""What the notebooks share is made once, found again, and never replaced when it is not what it should be."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tsmlib import runs, store, study
+from tsmlib.prior import ActionPrior
+from tsmlib.runs import ParameterError, Run
+from tsmlib.store import StoreError
+from tsmlib.trajopt import DirectActions, adam, cem, sampled_starts
+from tsmlib.tsm import TSM
+
+REACHER = "tsm/Reacher-v0"
+
+
+def new_run(folder: Path, *, seed: int = 1) -> Run:
+    """A run cut down; only seed 0 uses what ships with the repository."""
+    return runs.resolve("05_control", scale="smoke", seed=seed, run_dir=str(folder))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run in which data, a model and a prior of the basic arm were made. Read only."""
+    run = new_run(tmp_path_factory.mktemp("runs"))
+    for model in ("tsm", "prior"):
+        study.load_or_train(run, REACHER, model)
+    return run
+
+
+@pytest.fixture
+def run(made: Run, tmp_path: Path) -> Run:
+    """A copy of it to spoil."""
+    shutil.copytree(made.dir, tmp_path / "smoke" / "seed1")
+    return new_run(tmp_path)
+
+
+def no_training(*_: Any, **__: Any) -> Any:
+    raise AssertionError("this should not have been made again")
+
+
+# Data ----------------------------------------------------------------------------------------------------------------
+
+
+def test_data_are_collected_once(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "random_data", no_training)
+    data = study.dataset(made, REACHER, "train")
+    assert (len(data), data.horizon, data.env) == (20, 100, REACHER)
+
+
+def test_data_are_a_function_of_the_seed_and_held_out_data_of_none(made: Run, tmp_path: Path) -> None:
+    again, other = (new_run(tmp_path, seed=seed) for seed in (1, 2))
+    for split in study.SPLITS:
+        first, second, third = (study.dataset(run, REACHER, split) for run in (made, again, other))
+        np.testing.assert_array_equal(first.states, second.states)
+        np.testing.assert_array_equal(first.actions, second.actions)
+        assert np.array_equal(first.actions, third.actions) is (split != "train")
+    splits = [study.dataset(made, REACHER, split).actions[:8] for split in study.SPLITS]
+    assert not np.array_equal(splits[0], splits[1])
+    assert not np.array_equal(splits[1], splits[2])
+
+
+def test_the_papers_sizes() -> None:
+    paper = runs.resolve("01_collect", scale="paper")
+    assert study.sizes(paper, REACHER) == {"train": 500, "validation": 200, "test": 1000}
+    assert study.sizes(paper, "tsm/ReacherPush-v0")["train"] == 5000
+    assert study.sizes(paper, "tsm/PymunkObstacle-v0")["train"] == 5000
+
+
+# Models --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_trained_model_is_found_again_with_the_same_weights(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "fit", no_training)
+    (model, header), (again, _) = (study.load_or_train(made, REACHER, "tsm") for _ in range(2))
+    assert isinstance(model, TSM)
+    assert all(torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True))
+    assert header["fingerprint"]["env"] == REACHER
+    assert list(header["curves"]) == ["teacher_forced_loss", "loss"]
+    assert header["seconds"] > 0
+    assert (header["seed"], header["scale"]) == (1, "smoke")
+    assert isinstance(study.load_or_train(made, REACHER, "prior")[0], ActionPrior)
+
+
+def test_nothing_but_models_is_left_behind(made: Run) -> None:
+    assert sorted(p.name for p in (made.models / "Reacher").iterdir()) == ["prior.safetensors", "tsm.safetensors"]
+
+
+def test_a_model_knows_the_scale_of_its_data(made: Run) -> None:
+    data, (model, _) = study.dataset(made, REACHER, "train"), study.load_or_train(made, REACHER, "tsm")
+    seen = model.features(torch.from_numpy(data.states)).flatten(0, 1)
+    torch.testing.assert_close(seen.std(0), torch.ones(8), rtol=0.01, atol=0.01)
+    torch.testing.assert_close(seen.mean(0), torch.zeros(8), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("env", ["tsm/ReacherPush-v0", "tsm/PymunkReacher-v0"])
+def test_models_with_contacts_are_wider(env: str) -> None:
+    run = runs.resolve("02_train", scale="smoke")
+    config = study.fresh(run, "tsm", study.random_data(env, 2, seed=0, horizon=10)).config()
+    wide = "Push" in env
+    assert (config["channels"], config["head_channels"]) == ((64, 128) if wide else (32, 0))  # appendix A.1
+    assert (config["segment_len"], config["latent_dim"]) == (10, 8)  # section 5.1
+
+
+def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = run.models / "Reacher" / "prior.safetensors"
+    path.unlink()
+    fit = study.fit
+
+    def stopped(*args: Any, **settings: Any) -> Any:
+        fit(*args, **settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        study.load_or_train(run, REACHER, "prior")
+    assert [p.name for p in path.parent.glob("prior*")] == ["prior-loss.checkpoint.safetensors"]
+    monkeypatch.setattr(study, "fit", fit)
+    again, _ = study.load_or_train(run, REACHER, "prior")
+    whole, _ = study.load_or_train(made, REACHER, "prior")
+    assert all(torch.equal(a, b) for a, b in zip(again.parameters(), whole.parameters(), strict=True))
+    assert [p.name for p in path.parent.glob("prior*")] == ["prior.safetensors"]
+
+
+# Plans ---------------------------------------------------------------------------------------------------------------
+
+
+def some_task(n: int = 2) -> study.Task:
+    return study.task(REACHER, "validation").take(n)
+
+
+@pytest.mark.parametrize("planner", ["adam", "adam+starts", "cem"])
+@pytest.mark.parametrize("prior", ["codes", "actions"])
+def test_every_method_plans_and_executes(made: Run, planner: str, prior: str) -> None:
+    trial = study.trial(made, some_task(), "tsm", planner, prior)
+    assert trial.plan is not None
+    assert trial.actions.shape == (2, 50, 2)
+    torch.testing.assert_close(trial.gap, trial.plan.predicted - trial.true)
+
+
+def test_the_oracle_earns_what_it_promises_and_is_kept(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    trials = study.oracle(run, some_task())
+    assert list(trials) == ["oracle codes cem", "oracle actions cem"]
+    kept = sorted((run.dir / "plans").iterdir())
+    tensors, header = store.load(kept[0], kind="plan")
+    assert header["env"] == REACHER
+    torch.testing.assert_close(tensors["predicted"], trials["oracle actions cem"].true, rtol=1e-4, atol=1e-4)
+    monkeypatch.setattr(study, "plan", no_training)
+    again = study.oracle(run, some_task())
+    for name, trial in trials.items():
+        torch.testing.assert_close(again[name].true, trial.true)
+
+
+@pytest.mark.parametrize(
+    "bad", [("tsm", "adma", "codes", 0), ("tsm", "adam", "code", 0), ("oracle", "cem", "actions", -1)]
+)
+def test_an_unknown_method_is_refused_before_anything_is_trained(
+    tmp_path: Path, bad: tuple[str, str, str, int]
+) -> None:
+    *method, iterations = bad
+    with pytest.raises(ValueError, match="expected adam, adam\\+starts or cem, codes or actions, and 0"):
+        study.plan(new_run(tmp_path), some_task(), *method, iterations=iterations)
+    assert not any(tmp_path.iterdir())
+
+
+# Bad input: one clear message that names the thing, and nothing is overwritten ---------------------------------------
+
+
+def cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def flipped(data: bytes) -> bytes:
+    return data[:-9] + bytes([data[-9] ^ 1]) + data[-8:]
+
+
+@pytest.mark.parametrize("damage", [cut, flipped, lambda data: b""], ids=["cut", "flipped bit", "empty"])
+@pytest.mark.parametrize("what", ["models/Reacher/tsm", "models/Reacher/prior", "data/Reacher/train"])
+def test_a_damaged_file_is_named_and_left_alone(run: Run, what: str, damage: Callable[[bytes], bytes]) -> None:
+    path = run.dir / f"{what}.safetensors"
+    path.write_bytes(damaged := damage(path.read_bytes()))
+    with pytest.raises(StoreError, match=rf"{path.name} is damaged.*(Delete it and make|Restore)"):
+        if what.startswith("data"):
+            study.dataset(run, REACHER, "train")
+        else:
+            study.load_or_train(run, REACHER, path.stem)
+    assert path.read_bytes() == damaged
+
+
+def test_a_model_of_another_environment_is_refused_naming_both(run: Run) -> None:
+    there = run.folder("models/PymunkReacher") / "tsm.safetensors"
+    shutil.copy(run.models / "Reacher" / "tsm.safetensors", there)
+    before = there.read_bytes()
+    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"):
+        study.load_or_train(run, "tsm/PymunkReacher-v0", "tsm")
+    assert there.read_bytes() == before
+
+
+def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
+    folder = run.models / "Reacher"
+    shutil.copy(folder / "tsm.safetensors", folder / "prior.safetensors")
+    with pytest.raises(StoreError, match="holds a TSM, expected a ActionPrior"):
+        study.load_or_train(run, REACHER, "prior")
+
+
+def test_data_of_another_environment_are_refused(run: Run) -> None:
+    there = run.folder("data/PymunkReacher") / "train.safetensors"
+    shutil.copy(run.data / "Reacher" / "train.safetensors", there)
+    with pytest.raises(StoreError, match="trajectories of tsm/Reacher-v0, expected tsm/PymunkReacher-v0"):
+        study.dataset(run, "tsm/PymunkReacher-v0", "train")
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = new_run(tmp_path)
+    (run.folder() / "data").write_text("in the way")
+    (run.folder() / "models").write_text("in the way")
+    monkeypatch.setattr(study, "random_data", no_training)
+    monkeypatch.setattr(study, "fit", no_training)
+    with pytest.raises(ParameterError, match=r"cannot make the folder .*data/Reacher.*TSM_RUN_DIR"):
+        study.dataset(run, REACHER, "train")
+    with pytest.raises(ParameterError, match=r"cannot make the folder .*models/Reacher.*TSM_RUN_DIR"):
+        study.load_or_train(run, REACHER, "tsm")
+
+
+@pytest.mark.parametrize("n", [0, -3])
+def test_a_number_of_episodes_that_is_not_positive_is_refused(n: int) -> None:
+    with pytest.raises(ValueError, match=rf"num_envs is {n}; expected at least 1"):
+        study.random_data(REACHER, n, seed=0)
+    with pytest.raises(ValueError, match=rf"num_envs is {n}; expected at least 1"):
+        study.draw_task(REACHER, seed=0, n=n)
+
+
+@pytest.mark.parametrize("horizon", [0, -3])
+def test_episodes_without_steps_are_refused(horizon: int) -> None:
+    with pytest.raises(ValueError, match=rf"horizon is {horizon}, expected a positive number of episodes and of steps"):
+        study.random_data(REACHER, 2, seed=0, horizon=horizon)
+
+
+def test_planners_refuse_sizes_that_make_no_sense() -> None:
+    def predict(actions: torch.Tensor) -> torch.Tensor:
+        return actions[None]
+
+    def reward(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return -actions.square().sum(-1)
+
+    space = DirectActions(5)
+    for bad in (
+        {"candidates": 0},
+        {"elites": 0},
+        {"elites": 1},
+        {"elites": 300},
+        {"iterations": 0},
+        {"candidates": -1},
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            cem(predict, reward, space, 2, **bad)
+    with pytest.raises(ValueError, match="keep is 5 of 4 candidates, expected 1 to 4"):
+        sampled_starts(predict, reward, space, 2, candidates=4, keep=5)
+    with pytest.raises(ValueError, match="iterations is -1, expected"):
+        adam(predict, reward, space, torch.zeros(1, 2, 5, 2), iterations=-1)
+
+
+@pytest.mark.parametrize("text", ["tsm/Nothing-v0", "", "tsm/Reacher-v0,,", "ALL"])
+def test_a_parameter_that_names_something_unknown_lists_what_there_is(text: str) -> None:
+    with pytest.raises(
+        ParameterError, match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v0; or all"
+    ):
+        study.chosen("envs", text, [REACHER, "tsm/ReacherPush-v0"])
+    assert study.chosen("envs", f" {REACHER} ", [REACHER]) == [REACHER]
+    assert study.chosen("envs", "all", ["a", "b"]) == ["a", "b"]
