@@ -1,5 +1,5 @@
 """Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify PATH`` hashes again.
-``python -m tsmlib bench [NAME]`` measures speed.
+``python -m tsmlib bench [NAME]`` measures speed. ``python -m tsmlib publish`` copies a paper-scale run to what ships.
 
 Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
 """
@@ -28,6 +28,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     verify.add_argument("path", type=Path)
     bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
     bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, or all (default)")
+    publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
+    publish.add_argument("--seed", default="0")
     arguments = parser.parse_args(argv)
     try:
         match arguments.command:
@@ -35,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _verify(arguments.path)
             case "bench":
                 return _bench(arguments.name)
+            case "publish":
+                return _publish(runs.convert("seed", arguments.seed, int))
             case _:
                 return _run(arguments)
     except runs.ParameterError as error:
@@ -78,6 +82,13 @@ def _verify(path: Path) -> int:
 
     for file in store.verify(path):
         print(f"ok  {file}")
+    return 0
+
+
+def _publish(seed: int) -> int:
+    from tsmlib import study
+
+    study.publish(runs.resolve("publish", scale="paper", seed=seed))
     return 0
 
 

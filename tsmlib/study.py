@@ -43,6 +43,7 @@ HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for eve
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
 RESULTS = ROOT / "data" / "results"
+README_MARKS = ("<!-- results -->", "<!-- end of results -->")
 
 
 @dataclass(frozen=True)
@@ -298,16 +299,51 @@ def oracle(run: Run, task: Task) -> dict[str, Trial]:
 
 
 def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans and tables into data/, with a manifest of their checksums."""
-    for source, target in ((run.models, run.shipped), (run.folder("plans"), RESULTS), (run.metrics, RESULTS)):
+    """Copy a run's models, oracle plans, tables and figures into data/ and figures/, with a manifest of checksums."""
+    places = {run.models: run.shipped, run.folder("plans"): RESULTS, run.metrics: RESULTS, run.figures: ROOT / "figures"}
+    for source, target in places.items():
         for path in sorted(source.rglob("*.*")):
-            if path.suffix in (".safetensors", ".csv") and ".checkpoint" not in path.name:
+            if path.suffix in (".safetensors", ".csv", ".png", ".pdf", ".mp4") and ".checkpoint" not in path.name:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 store.write_bytes(copy, path.read_bytes())
     store.write_manifest(ROOT / "data")
+    readme = ROOT / "README.md"
+    before, _, rest = readme.read_text().partition(README_MARKS[0])
+    after = rest.partition(README_MARKS[1])[2]
+    text = "\n".join([before + README_MARKS[0], "", readme_results(), "", README_MARKS[1] + after])
+    store.write_bytes(readme, text.encode())
 
 
 def shipped_report() -> str:
     """The published results of 05_control as a Markdown table."""
     return report(store.load_table(RESULTS / "05_control.csv"))
+
+
+def readme_results() -> str:
+    """What README says about results, from the shipped tables alone."""
+    control = store.load_table(RESULTS / "05_control.csv")
+    train = [row for row in store.load_table(RESULTS / "02_train.csv") if row["env"] == "tsm/ReacherPush-v0"]
+    arms = report([row for row in control if row["sim"] == "mujoco"])
+    others = report([row for row in control if row["sim"] == "pymunk"])
+    scores = {(row["model"], row["metric"], row["horizon"]): row for row in train}
+    metrics = ("ll_paper", "ll_shared", "energy_score", "nrmse")
+    lines = ["| model | " + " | ".join(f"{m} at {h}" for m in metrics for h in (10, 80)) + " |", "|---" * 9 + "|"]
+    for model in ("tsm+teacher", "tsm", "tsm+energy"):
+        cells = [f"{scores[model, m, h]['value']:.3f}" for m in metrics for h in (10, 80)]
+        lines.append(f"| {model} | " + " | ".join(cells) + " |")
+    n = scores["tsm", "ll_paper", 10]["n"]
+    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed (0), means over targets.
+
+**Planning, MuJoCo.** Frozen targets, T = 50 steps, executed open loop. Returns in metres summed over steps.
+
+{arms}
+
+**Planning, pymunk.**
+
+{others}
+
+**Prediction, pushing in MuJoCo.** {n} test episodes, open loop after ten observed steps; log-likelihoods (higher is
+better) and energy score and error (lower is better) at 10 and at 80 steps, standardised units.
+
+{chr(10).join(lines)}"""
