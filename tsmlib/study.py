@@ -242,7 +242,7 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
         predict = through_simulator(task.env, task.start)
     else:
         net, _ = load_or_train(run, task.env, model)
-        samples = run.pick(smoke=1, laptop=2, paper=4)
+        samples = 2  # model samples per candidate
         predict = through_model(net, task.past(net.past_len), samples=samples, seed=run.seed)
     bar = f"{task.name}: {model}, {planner} over {prior}"
     candidates = run.pick(smoke=8, laptop=96, paper=128)
@@ -269,7 +269,7 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
         task.reward,
         space,
         start,
-        iterations=iterations or run.pick(smoke=3, laptop=100, paper=100),
+        iterations=iterations or run.pick(smoke=3, laptop=60, paper=100),
         progress=bar,
     )
 
@@ -299,8 +299,9 @@ def oracle(run: Run, task: Task) -> dict[str, Trial]:
 
 
 def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans, tables and figures into data/ and figures/, with a manifest of checksums."""
-    places = {run.models: run.shipped, run.folder("plans"): RESULTS, run.metrics: RESULTS, run.figures: ROOT / "figures"}
+    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results."""
+    figures = ROOT / "figures"
+    places = {run.models: run.shipped, run.folder("plans"): RESULTS, run.metrics: RESULTS, run.figures: figures}
     for source, target in places.items():
         for path in sorted(source.rglob("*.*")):
             if path.suffix in (".safetensors", ".csv", ".png", ".pdf", ".mp4") and ".checkpoint" not in path.name:
@@ -333,9 +334,10 @@ def readme_results() -> str:
         cells = [f"{scores[model, m, h]['value']:.3f}" for m in metrics for h in (10, 80)]
         lines.append(f"| {model} | " + " | ".join(cells) + " |")
     n = scores["tsm", "ll_paper", 10]["n"]
-    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed (0), means over targets.
+    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed (0).
 
-**Planning, MuJoCo.** Frozen targets, T = 50 steps, executed open loop. Returns in metres summed over steps.
+**Planning, MuJoCo.** Frozen targets, T = 50 steps, executed open loop; means over targets, returns in metres summed
+over steps.
 
 {arms}
 
