@@ -34,7 +34,7 @@ from tsmlib.style import (
 
 Results = Mapping[str, Mapping[str, Mapping[str, np.ndarray | None]]]  # task -> label -> {"true", "predicted"}
 REFERENCES = {"oracle": "-", "zero": "--", "random": ":"}  # drawn as lines: nothing a model could gain or lose
-PLANNER_MARKERS = {"adam": "o", "cem": "s", "mppi": "^", "policy": "D"}
+PLANNER_MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "D"}
 
 
 def _returns(results: Results) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray | None]]]:

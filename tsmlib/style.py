@@ -124,7 +124,15 @@ def name(label: str) -> str:
 
 def pretty(rest: str) -> list[str]:
     """The words after the model as they are printed: each known word alone, the others together."""
-    known = {"codes": "codes", "actions": "actions", "adam": "Adam", "cem": "CEM", "mppi": "MPPI", "policy": "policy"}
+    known = {
+        "codes": "codes",
+        "actions": "actions",
+        "adam": "Adam",
+        "adam+starts": "Adam from samples",
+        "cem": "CEM",
+        "mppi": "MPPI",
+        "policy": "policy",
+    }
     parts = [known.get(word, word) for word in rest.split() if word in known]
     other = " ".join(word for word in rest.split() if word not in known)
     return [*parts, other] if other else parts
