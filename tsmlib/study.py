@@ -318,7 +318,10 @@ def publish(run: Run) -> None:
 
 def shipped_report() -> str:
     """The published results of 05_control as a Markdown table."""
-    return report(store.load_table(RESULTS / "05_control.csv"))
+    table = RESULTS / "05_control.csv"
+    if not table.exists():  # while they are being made
+        return "No results are published yet: `python -m tsmlib run all --scale paper`, then `python -m tsmlib publish`."
+    return report(store.load_table(table))
 
 
 def readme_results() -> str:
