@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import tsmlib
-from tsmlib import store
+from tsmlib import publish, store
 from tsmlib.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -125,3 +125,7 @@ def test_what_running_leaves_behind_is_ignored() -> None:
     made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12"]
     done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == made
+
+
+def test_the_results_in_the_readme_are_those_of_the_shipped_tables() -> None:
+    assert publish.readme_results() in (ROOT / "README.md").read_text()

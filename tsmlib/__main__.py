@@ -86,9 +86,9 @@ def _verify(path: Path) -> int:
 
 
 def _publish(seed: int) -> int:
-    from tsmlib import study
+    from tsmlib import publish
 
-    study.publish(runs.resolve("publish", scale="paper", seed=seed))
+    publish.publish(runs.resolve("publish", scale="paper", seed=seed))
     return 0
 
 

@@ -69,7 +69,7 @@ def smooth_torques(
 ) -> Tensor:
     """Smooth random torques (section 5.1; reading A15): white noise through two poles, (n, horizon, action_dim).
 
-    They start from zero, as the paper's U_0 does, and settle to a root mean square of ``rms``, clipped to [-1, 1].
+    The filter starts at rest, so the first torques are small; they settle to a root mean square of ``rms``, clipped.
     """
     if n < 1 or horizon < 1:
         raise ValueError(f"n is {n}, horizon is {horizon}, expected a positive number of episodes and of steps")

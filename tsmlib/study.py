@@ -19,7 +19,7 @@ import torch
 import tsmlib.envs
 from tsmlib import store
 from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task, Trial, execute, label, random_torques, report, zero_torques
+from tsmlib.control import Task, Trial, execute, label, random_torques, zero_torques
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, ParameterError, Run
 from tsmlib.train import fit
@@ -43,7 +43,6 @@ HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for eve
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
 RESULTS = ROOT / "data" / "results"
-README_MARKS = ("<!-- results -->", "<!-- end of results -->")
 
 
 @dataclass(frozen=True)
@@ -293,62 +292,3 @@ def oracle(run: Run, task: Task) -> dict[str, Trial]:
         tensors, _ = store.load(kept, kind="plan")
         trials[label("oracle", "cem", prior)] = execute(task, tensors["actions"][: len(task)])
     return trials
-
-
-# What ships ----------------------------------------------------------------------------------------------------------
-
-
-def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results."""
-    figures = ROOT / "figures"
-    places = {run.models: run.shipped, run.folder("plans"): RESULTS, run.metrics: RESULTS, run.figures: figures}
-    for source, target in places.items():
-        for path in sorted(source.rglob("*.*")):
-            if path.suffix in (".safetensors", ".csv", ".png", ".pdf", ".mp4") and ".checkpoint" not in path.name:
-                copy = target / path.relative_to(source)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                store.write_bytes(copy, path.read_bytes())
-    store.write_manifest(ROOT / "data")
-    readme = ROOT / "README.md"
-    before, _, rest = readme.read_text().partition(README_MARKS[0])
-    after = rest.partition(README_MARKS[1])[2]
-    text = "\n".join([before + README_MARKS[0], "", readme_results(), "", README_MARKS[1] + after])
-    store.write_bytes(readme, text.encode())
-
-
-def shipped_report() -> str:
-    """The published results of 05_control as a Markdown table."""
-    table = RESULTS / "05_control.csv"
-    if not table.exists():  # while they are being made
-        return "No results are published yet: `python -m tsmlib run all --scale paper`, then `python -m tsmlib publish`."
-    return report(store.load_table(table))
-
-
-def readme_results() -> str:
-    """What README says about results, from the shipped tables alone."""
-    control = store.load_table(RESULTS / "05_control.csv")
-    train = [row for row in store.load_table(RESULTS / "02_train.csv") if row["env"] == "tsm/ReacherPush-v0"]
-    arms = report([row for row in control if row["sim"] == "mujoco"])
-    others = report([row for row in control if row["sim"] == "pymunk"])
-    scores = {(row["model"], row["metric"], row["horizon"]): row for row in train}
-    metrics = ("ll_paper", "ll_shared", "energy_score", "nrmse")
-    lines = ["| model | " + " | ".join(f"{m} at {h}" for m in metrics for h in (10, 80)) + " |", "|---" * 9 + "|"]
-    for model in ("tsm+teacher", "tsm", "tsm+energy"):
-        cells = [f"{scores[model, m, h]['value']:.3f}" for m in metrics for h in (10, 80)]
-        lines.append(f"| {model} | " + " | ".join(cells) + " |")
-    n = scores["tsm", "ll_paper", 10]["n"]
-    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed (0).
-
-**Planning, MuJoCo.** Frozen targets, T = 50 steps, executed open loop; means over targets, returns in metres summed
-over steps.
-
-{arms}
-
-**Planning, pymunk.**
-
-{others}
-
-**Prediction, pushing in MuJoCo.** {n} test episodes, open loop after ten observed steps; log-likelihoods (higher is
-better) and energy score and error (lower is better) at 10 and at 80 steps, standardised units.
-
-{chr(10).join(lines)}"""
