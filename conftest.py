@@ -8,6 +8,8 @@ import tempfile
 
 import pytest
 
+MADE = pytest.StashKey[str]()  # the folder that this session made for its runs
+
 
 def notebooks_run(config: pytest.Config) -> bool:
     """Whether nbval collects notebooks in this session."""
@@ -20,11 +22,11 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["TQDM_DISABLE"] = "1"
     if notebooks_run(config):  # the kernels inherit this process's environment
         os.environ["TSM_SCALE"] = "smoke"
-        os.environ["TSM_RUN_DIR"] = tempfile.mkdtemp(prefix="tsmlib-runs-")
+        os.environ["TSM_RUN_DIR"] = config.stash[MADE] = tempfile.mkdtemp(prefix="tsmlib-runs-")
 
 
-def pytest_unconfigure() -> None:
-    if folder := os.environ.pop("TSM_RUN_DIR", None):
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if folder := config.stash.get(MADE, None):
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -67,7 +67,7 @@ def smooth_torques(
     time_constant: float = 0.03,  # s, of each of the two poles: their power density halves at 3.4 Hz
     dt: float = 0.02,
 ) -> Tensor:
-    """Smooth random torques (section 5.1; reading A15): white noise through two poles, (n, horizon, action_dim).
+    """Smooth random torques (section 5.1): white noise through two poles, (n, horizon, action_dim).
 
     The filter starts at rest, so the first torques are small; they settle to a root mean square of ``rms``, clipped.
     """

@@ -1,8 +1,8 @@
 """How good predictions are: likelihoods, proper scores and errors against the horizon (sections 5.2 and 5.3.1).
 
-All scores live in the standardised feature space of the training data (reading A13): angles as cosine and sine, unit
-variance, dimensions that never change within an episode left out (A4). Likelihoods are sums over dimensions and means
-over time steps and trajectories (A5). Letters in shapes: S samples, N trajectories, T steps, D scored features.
+All scores live in the standardised feature space of the training data: angles as cosine and sine, unit variance,
+dimensions that never change within an episode left out. Likelihoods are sums over dimensions and means over time steps
+and trajectories. Letters in shapes: S samples, N trajectories, T steps, D scored features.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def sample_states(
     data: Trajectories,
     *,
     samples: int,
-    horizon: int = 90,  # from the first H observed steps to T = 100 (reading A6)
+    horizon: int = 90,  # from the first H observed steps to T = 100
     seed: int = 0,
     progress: str = "",
 ) -> Tensor:
@@ -89,14 +89,14 @@ def scores(
 def ll_paper(samples: Tensor, truth: Tensor, floor: float) -> Tensor:
     """The paper's protocol: log-likelihood (N, T) under a diagonal Gaussian fitted to the samples at each step.
 
-    floor: a variance added everywhere, one scalar per model fitted on validation (reading A2; ``fit_floor``).
+    floor: a variance added everywhere, one scalar per model fitted on validation (``fit_floor``).
     """
     variance = samples.var(0) + floor  # (N, T, D)
     return _gaussian(truth - samples.mean(0), variance)
 
 
 def ll_shared(samples: Tensor, truth: Tensor, variance: float) -> Tensor:
-    """Log-likelihood (N, T) under one scalar variance around the samples' mean, the same form for every model (A1b)."""
+    """Log-likelihood (N, T) under one scalar variance around the samples' mean, the same form for every model."""
     return _gaussian(truth - samples.mean(0), truth.new_tensor(variance))
 
 

@@ -88,7 +88,10 @@ class ActionPrior(nn.Module):
         return torch.cat(segments, dim=1)
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error plus beta KL per segment, free-running within each segment of the window's future."""
+        """Squared error plus beta KL per segment, free-running over the window's future.
+
+        The past of the first segment is the window's; that of each later one is the decoded segment before it.
+        """
         past, loss = window.past.actions, window.past.actions.new_zeros(())
         for future in window.future.actions.split(self.segment_len, dim=1):
             mean, log_variance = self.encode(future)

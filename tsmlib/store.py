@@ -311,6 +311,14 @@ def sha256(path: PathLike) -> str:
     return hashlib.sha256(_read(Path(path))).hexdigest()
 
 
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of named arrays, by name and content."""
+    found = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        found.update(name.encode() + tensor.detach().contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
 def write_manifest(folder: PathLike) -> None:
     """Write ``MANIFEST.json``: size and SHA-256 of every file under ``folder`` (for folders that are shipped)."""
     folder = Path(folder)
@@ -413,11 +421,12 @@ def write_bytes(path: PathLike, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        if os.name != "nt":  # Windows opens no folders
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     except OSError as error:
         raise StoreError(
             f"cannot write {path} ({len(data)} bytes): {error.strerror or error}. Make room or permission there, or "

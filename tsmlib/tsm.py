@@ -113,7 +113,7 @@ class TSM(nn.Module):
         return loss
 
     def teacher_forced_loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error of one-step increments plus beta KL, with true states as inputs (reading A9)."""
+        """Squared error of one-step increments plus beta KL, with true states as inputs."""
         loss, past = window.past.states.new_zeros(()), window.past
         for future in self._segments(window.future):
             mean, log_variance = self.encode(future.states)

@@ -10,12 +10,14 @@ Contacts have no friction: torques of 200 N m are so strong that friction would 
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported; draws without a screen
+if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
 
 import gymnasium.envs.mujoco
 import mujoco
