@@ -39,10 +39,6 @@ def curve() -> dict[str, np.ndarray]:
     return {"seconds": steps, "train": np.exp(-steps), "validation": 1.1 * np.exp(-steps)}
 
 
-def climb() -> dict[str, np.ndarray]:
-    return {"iterations": np.arange(10), "true": noise(10, 7), "predicted": noise(10, 7) + 1}
-
-
 def draw(ax: plt.Axes, state: np.ndarray, target: np.ndarray) -> None:
     ax.plot([0, state[4]], [0, state[5]])
     ax.plot(*target, "o")
@@ -62,7 +58,6 @@ EVERY = {
     "rollouts": lambda: figures.rollouts(noise(15, 6), noise(4, 15, 6), NAMES, UNITS),
     "plan_strip": lambda: figures.plan_strip(draw, noise(10, 6), noise(10, 6), np.zeros(2), [0, 4, 9]),
     "plan_actions": lambda: figures.plan_actions(noise(20, 2), noise(20, 2), noise(20, 2), 0.02),
-    "gap_against_iterations": lambda: figures.gap_against_iterations({"tsm codes adam": climb()}),
     "ll_against_horizon": lambda: figures.ll_against_horizon({"tsm": noise(30), "tsm free": noise(30)}),
 }
 
@@ -89,8 +84,8 @@ def test_the_same_figure_gives_the_same_bytes(name: str, tmp_path) -> None:
 def test_a_method_keeps_its_colour_in_every_figure() -> None:
     horizon = figures.ll_against_horizon({"lstm": noise(5), "tsm": noise(5)}).axes[0]
     assert [to_hex(line.get_color()).upper() for line in horizon.lines] == [style.COLOURS["lstm"], style.COLOURS["tsm"]]
-    climbing = figures.gap_against_iterations({"lstm actions adam": climb(), "tsm codes adam": climb()}).axes[1]
-    colours = [to_hex(line.get_color()).upper() for line in climbing.lines[:2]]
+    panels = figures.loss_curves({"lstm": curve(), "tsm": curve()}).axes
+    colours = [to_hex(ax.lines[1].get_color()).upper() for ax in panels]
     assert colours == [style.COLOURS["lstm"], style.COLOURS["tsm"]]
     assert len(set(style.COLOURS.values())) == len(style.COLOURS)
 

@@ -1,7 +1,6 @@
 """What must hold in the MuJoCo world, whatever the torques."""
 
 import os
-import time
 import warnings
 from pathlib import Path
 
@@ -242,17 +241,3 @@ def test_threads_change_nothing_but_time() -> None:
         results.append(env.unwrapped.rollout(actions))
         env.close()
     np.testing.assert_array_equal(*results)
-
-
-def test_bulk_simulation_is_faster_than_stepping() -> None:
-    env, _ = arms(PUSH, 300)
-    actions = smooth_torques(300, DATA_RMS)
-    begin = time.perf_counter()
-    env.rollout(actions)
-    bulk = actions[..., 0].size / (time.perf_counter() - begin)
-    one = gymnasium.make(PUSH).unwrapped
-    one.reset(seed=0)
-    begin = time.perf_counter()
-    for action in actions[0]:
-        one.step(action)
-    assert bulk > 1.5 * len(actions[0]) / (time.perf_counter() - begin)  # about 6 on two idle processors

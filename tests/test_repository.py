@@ -87,28 +87,50 @@ def test_nothing_can_execute_what_it_reads(path: Path) -> None:
             assert called not in ("eval", "exec", "torch.load", "torch.save", "np.load", "np.save", "yaml.load"), called
 
 
+def uses() -> dict[str, set[str]]:
+    """Module -> the other modules of the package that it imports; ``envs`` is one module."""
+    found: dict[str, set[str]] = {}
+    for path in MODULES:
+        name = path.relative_to(ROOT / "tsmlib").with_suffix("").parts[0]
+        found.setdefault(name, set()).update(n.split(".")[1] for n in imported(path) if n.startswith("tsmlib."))
+    return {name: needs - {name} for name, needs in found.items()}
+
+
+PICTURES = {"style", "diagrams", "film", "plan_figures", "figures"}
+ALONE = {"envs", "rewards", "nets", "trajectory", "style"}
+
+
+def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
+    assert {name: needs for name, needs in uses().items() if name in ALONE} == {name: set() for name in ALONE}
+
+
+def test_figures_know_nothing_but_figures() -> None:
+    needs = uses()
+    for name in ("diagrams", "film", "plan_figures"):
+        assert needs[name] == {"style"}, name
+    assert needs["figures"] <= PICTURES
+
+
+def test_what_computes_draws_nothing() -> None:
+    for name, needs in uses().items():
+        if name not in PICTURES | {"report"}:
+            assert not needs & PICTURES, name
+
+
+def test_what_notebooks_share_is_used_by_nothing_below_them() -> None:
+    assert {name for name, needs in uses().items() if "study" in needs} <= {"publish", "__main__"}
+
+
 def test_imports_point_one_way() -> None:
     """Nobody imports what is above it, so every module can be read knowing only those below."""
-    uses = {
-        path.stem: {name.split(".")[1] for name in imported(path) if name.startswith("tsmlib.")}
-        for path in (ROOT / "tsmlib").glob("*.py")
-    }
-    for low in ("trajectory", "nets", "rewards", "runs"):
-        assert uses.get(low, set()) <= {"trajectory", "store"}, low
-    assert uses["store"] == {"trajectory"}
-    seen: list[str] = []
-    while uses:  # a round that finds nothing means a circle
-        free = [name for name, needs in uses.items() if not needs & set(uses)]
-        assert free, f"imports go in a circle among {sorted(uses)}"
-        seen += free
+    left = uses()
+    assert left["store"] == {"trajectory"}
+    assert left["runs"] <= {"store"}
+    while left:  # a round that finds nothing means a circle
+        free = [name for name, needs in left.items() if not needs & set(left)]
+        assert free, f"imports go in a circle among {sorted(left)}"
         for name in free:
-            del uses[name]
-
-
-def test_environments_import_nothing_else_of_the_package() -> None:
-    for path in (ROOT / "tsmlib" / "envs").glob("*.py"):
-        for name in imported(path):
-            assert not name.startswith("tsmlib") or name.startswith("tsmlib.envs"), f"{path.name} imports {name}"
+            del left[name]
 
 
 @pytest.mark.skipif(not (ROOT / "data").exists(), reason="nothing ships")

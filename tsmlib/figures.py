@@ -26,7 +26,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tsmlib.diagrams import figure1, figure2, figure3  # noqa: F401
 from tsmlib.film import embed, side_by_side, video  # noqa: F401
-from tsmlib.plan_figures import figure6, gap_against_iterations, plan_actions, plan_strip, predicted_vs_true  # noqa: F401
+from tsmlib.plan_figures import figure6, plan_actions, plan_strip, predicted_vs_true  # noqa: F401
 from tsmlib.style import (  # noqa: F401
     COLOURS,
     WIDTH,

@@ -1,13 +1,12 @@
 """Figures of plans: what they earned, what the model promised, the torques, and the film of one.
 
 The paper's figures 6 and 10 and what surrounds them. Reached through ``tsmlib.figures``, where labels are explained.
-Letters in shapes: n targets, T steps, I iterations, dx state size.
+Letters in shapes: n targets, T steps, dx state size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -175,37 +174,6 @@ def predicted_vs_true(results: Results) -> Figure:
             ax.set_xlabel("true return" if i + columns >= len(rows) else "")
             ax.set_ylabel("" if i % columns else f"{task.capitalize()}: predicted return")
         first += heights[task]
-    return figure
-
-
-@styled
-def gap_against_iterations(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Does more optimisation help the arm or only the model? Returns, and the gap between them, along the iterations.
-
-    curves: label -> {"iterations": (I,), "true": (I, n), "predicted": (I, n)}, returns of the plans so far per target.
-    """
-    figure, (returns, gap) = plt.subplots(1, 2, figsize=(WIDTH, 2.2), width_ratios=(1.15, 1))
-    handles = []
-    drawn: dict[str, int] = {}
-    for label, curve in curves.items():
-        steps, main, model = shaped(f"{label}: iterations", curve["iterations"], "I"), colour(label), words(label)[0]
-        true = shaped(f"{label}: true", curve["true"], f"{len(steps)} n")
-        predicted = shaped(f"{label}: predicted", curve["predicted"], f"{len(steps)} {true.shape[1]}")
-        marker = "os^D"[drawn.get(model, 0) % 4]
-        drawn[model] = drawn.get(model, 0) + 1
-        look: dict[str, Any] = {"color": main, "marker": marker, "markevery": max(1, len(steps) // 6), "ms": 3.2}
-        returns.plot(steps, true.mean(1), **look)
-        returns.plot(steps, predicted.mean(1), ls="--", **look | {"mfc": "white"})
-        middle, half = np.array([interval(row) for row in predicted - true]).T
-        gap.plot(steps, middle, **look)
-        gap.fill_between(steps, middle - half, middle + half, color=main, alpha=0.18, lw=0)
-        handles.append(Line2D([], [], color=main, marker=marker, ms=3.2, label=name(label)))
-    gap.axhline(0, color="#999999", lw=0.6)
-    returns.set(xlabel="iterations of the planner", ylabel="mean return", title="return")
-    gap.set(xlabel="iterations of the planner", ylabel="predicted − true return", title="exploitation gap")
-    dark = COLOURS["data"]
-    handles += [Line2D([], [], color=dark, label="executed"), Line2D([], [], color=dark, ls="--", label="predicted")]
-    legend(figure, handles, columns=5)
     return figure
 
 
