@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import control, rewards, runs, study
+from tsmlib import control, report, rewards, runs, study
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, execute, random_torques, zero_torques
 from tsmlib.envs import ENV_IDS
@@ -187,7 +187,7 @@ def test_a_table_holds_what_the_trials_measured() -> None:
     task = some_task()
     trial = execute(task, zero_torques(task))
     run = runs.resolve("05_control", scale="smoke", seed=2, run_dir="/nowhere")
-    summary, per_target = control.tables([task], {REACHER: {"zero": trial}}, run)
+    summary, per_target = report.tables([task], {REACHER: {"zero": trial}}, run)
     found = {row["metric"]: row for row in summary}
     assert found["return_true"]["value"] == pytest.approx(float(trial.true.mean()))
     near = trial.final_distance <= control.TOLERANCE
@@ -220,6 +220,23 @@ def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number
     assert torch.equal(first.target, few.target)
 
 
+@pytest.mark.parametrize("n", [-5, 0, 101])
+def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
+    with pytest.raises(ValueError, match="choose a number from 1 to 100"):
+        study.task(REACHER, "validation").take(n)
+
+
+def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> None:
+    task = some_task()
+    nothing, random = (execute(task, torques(task)) for torques in (zero_torques, random_torques))
+    oracle = dataclasses.replace(nothing, true=nothing.true / 2)
+    among = {"zero": nothing, "oracle codes cem": oracle, "random": random}
+    assert report.means(oracle, among)["cost_over_oracle"][0] == pytest.approx(1)
+    assert report.means(oracle, among)["gain_share"][0] == pytest.approx(1)
+    assert report.means(nothing, among)["cost_over_oracle"][0] == pytest.approx(2)
+    assert report.means(nothing, among)["gain_share"][0] == pytest.approx(0)
+
+
 def test_a_task_of_another_name_is_refused() -> None:
     with pytest.raises(ValueError, match="task is 'dance', expected 'reach' or 'push'"):
         dataclasses.replace(some_task(), name="dance")
@@ -233,7 +250,7 @@ def test_pushing_without_an_object_is_refused() -> None:
 def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
     task = some_task()
     with pytest.raises(ValueError, match="not planned"):
-        control.strip(task, execute(task, zero_torques(task)), 0)
+        report.strip(task, execute(task, zero_torques(task)), 0)
 
 
 def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import runs, store, study
+from tsmlib import runs, study
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ParameterError, Run
 from tsmlib.store import StoreError
@@ -145,17 +145,26 @@ def test_every_method_plans_and_executes(made: Run, planner: str, prior: str) ->
     torch.testing.assert_close(trial.gap, trial.plan.predicted - trial.true)
 
 
-def test_the_oracle_earns_what_it_promises_and_is_kept(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    trials = study.oracle(run, some_task())
-    assert list(trials) == ["oracle codes cem", "oracle actions cem"]
-    kept = sorted((run.dir / "plans").iterdir())
-    tensors, header = store.load(kept[0], kind="plan")
-    assert header["env"] == REACHER
-    torch.testing.assert_close(tensors["predicted"], trials["oracle actions cem"].true, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(study, "plan", no_training)
-    again = study.oracle(run, some_task())
-    for name, trial in trials.items():
-        torch.testing.assert_close(again[name].true, trial.true)
+def test_the_oracle_earns_what_it_promises(run: Run) -> None:
+    trial = study.trial(run, some_task(), "oracle", "cem", "actions")
+    assert trial.plan is not None
+    torch.testing.assert_close(trial.plan.predicted, trial.true, rtol=1e-4, atol=1e-4)
+
+
+def test_a_plan_is_kept_for_its_task_and_models_alone(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = study.plan(made, some_task(), "tsm", "cem", "codes")
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "_search", no_training)
+        assert torch.equal(study.plan(made, some_task(), "tsm", "cem", "codes").actions, first.actions)
+        with pytest.raises(AssertionError):
+            study.plan(made, some_task(3), "tsm", "cem", "codes")  # other targets
+        with pytest.raises(AssertionError):
+            study.plan(made, some_task(), "tsm", "cem", "codes", iterations=1)  # another budget
+
+
+def test_what_is_promised_is_not_what_the_planner_searched_with(made: Run) -> None:
+    plan = study.plan(made, some_task(), "tsm", "cem", "codes")
+    assert not torch.equal(plan.predicted, plan.curve[-1])
 
 
 @pytest.mark.parametrize(

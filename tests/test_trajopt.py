@@ -314,3 +314,8 @@ def test_candidates_in_the_simulator_do_not_mix() -> None:
 def test_a_horizon_without_steps_is_refused(make: Any) -> None:
     with pytest.raises(ValueError, match="horizon is (0|-3), expected a positive number of steps"):
         make()
+
+
+def test_smooth_noise_has_the_same_strength_at_every_step() -> None:
+    noise = DirectActions(50).noise(2000, 2, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(noise.std((0, 1)), torch.ones(50, 2), rtol=0, atol=0.06)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from tsmlib import store
-from tsmlib.control import report
-from tsmlib.runs import ROOT, Run
+from tsmlib.report import report
+from tsmlib.runs import ROOT, Run, RunError
 from tsmlib.study import RESULTS
 
 README = ROOT / "README.md"
@@ -12,12 +12,23 @@ MARKS = ("<!-- results -->", "<!-- end of results -->")
 
 
 def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results."""
-    figures = ROOT / "figures"
-    places = {run.models: run.shipped, run.folder("plans"): RESULTS, run.metrics: RESULTS, run.figures: figures}
-    for source, target in places.items():
-        for path in sorted(source.rglob("*.*")):
-            if path.suffix in (".safetensors", ".csv", ".png", ".pdf", ".mp4") and ".checkpoint" not in path.name:
+    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results.
+
+    Raises RunError, before anything is written, unless all three notebooks ran to their end.
+    """
+    status = store.read_json(run.dir / "status.json")
+    for notebook in ("01_collect", "02_train", "05_control"):
+        state = status.get(notebook, {}).get("state", "missing")
+        if state != "complete":
+            raise RunError(f"{notebook} in {run.dir} is {state}; python -m tsmlib run all --scale paper completes it")
+    for source, pattern, target in (
+        (run.models, "*/*.safetensors", run.shipped),
+        (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
+        (run.metrics, "*.csv", RESULTS),
+        (run.figures, "*.*", ROOT / "figures"),
+    ):
+        for path in sorted(source.glob(pattern)):
+            if ".checkpoint" not in path.name:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 store.write_bytes(copy, path.read_bytes())
@@ -40,16 +51,18 @@ def readme_results() -> str:
     """What README says about results, from the shipped tables alone."""
     control = store.load_table(RESULTS / "05_control.csv")
     train = [row for row in store.load_table(RESULTS / "02_train.csv") if row["env"] == "tsm/ReacherPush-v0"]
-    arms = report([row for row in control if row["sim"] == "mujoco"])
-    others = report([row for row in control if row["sim"] == "pymunk"])
+    arms, others = (
+        report([row for row in control if row["sim"] == sim and row["metric"] not in ("success", "plan_seconds")])
+        for sim in ("mujoco", "pymunk")
+    )
     scores = {(row["model"], row["metric"], row["horizon"]): row for row in train}
     metrics = ("ll_paper", "ll_shared", "energy_score", "nrmse")
     lines = ["| model | " + " | ".join(f"{m} at {h}" for m in metrics for h in (10, 80)) + " |", "|---" * 9 + "|"]
     for model in ("tsm+teacher", "tsm", "tsm+energy"):
         cells = [f"{scores[model, m, h]['value']:.3f}" for m in metrics for h in (10, 80)]
         lines.append(f"| {model} | " + " | ".join(cells) + " |")
-    n = scores["tsm", "ll_paper", 10]["n"]
-    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed (0).
+    n, seed = scores["tsm", "ll_paper", 10]["n"], control[0]["seed"]
+    return f"""Written by `python -m tsmlib publish` from `data/results`: scale paper, one training seed ({seed}).
 
 **Planning, MuJoCo.** Frozen targets, T = 50 steps, executed open loop; means over targets, returns in metres summed
 over steps.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ import torch
 import tsmlib.envs
 from tsmlib import store
 from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task, Trial, execute, label, random_torques, zero_torques
+from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.envs.base import DT, STATE_NAMES
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, ParameterError, Run
 from tsmlib.train import fit
@@ -31,6 +32,7 @@ from tsmlib.trajopt import (
     Space,
     adam,
     cem,
+    reassess,
     sampled_starts,
     through_model,
     through_simulator,
@@ -88,8 +90,11 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
     if path.exists():
         return store.load_trajectories(path, env=env)
-    data = random_data(env, n, seed=HELD_OUT_SEED.get(split, run.seed))
-    store.save_trajectories(path, data, {"split": split, "seed": run.seed, "scale": run.scale})
+    if run.seed in HELD_OUT_SEED.values():
+        raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
+    seed = HELD_OUT_SEED.get(split, run.seed)
+    data = random_data(env, n, seed=seed)
+    store.save_trajectories(path, data, {"split": split, "seed": seed, "scale": run.scale})
     return data
 
 
@@ -102,9 +107,10 @@ def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajector
     return data
 
 
-def fingerprint(data: Trajectories) -> dict[str, Any]:
-    """What a model of these data fits, and refuses to be used without."""
-    return {"env": data.env, "dt": data.dt, "names": list(data.names)}
+def fingerprint(env: str) -> dict[str, Any]:
+    """What a model of this environment was made for; a file that says otherwise is refused."""
+    names = STATE_NAMES if has_block(env) else STATE_NAMES[:6]
+    return {"env": env, "dt": DT, "names": list(names)}
 
 
 # Models --------------------------------------------------------------------------------------------------------------
@@ -121,7 +127,8 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     pushes = env == "tsm/ReacherPush-v0"  # the hardest to learn, and the headline
     teacher = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=500, paper=1000))
     free = Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4000 if pushes else 2000), lr=2e-3)
-    longer = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=2000, paper=5000))  # as many steps as tsm
+    steps = teacher.steps + free.steps
+    longer = Stage("teacher_forced_loss", 2, steps, lr=2e-3)  # as many steps, windows and the same rate as tsm
     energy = Stage("energy_loss", 2, run.pick(smoke=20, laptop=1500, paper=5000 if pushes else 3000), lr=2e-3)
     return {"tsm": [teacher, free], "tsm+teacher": [longer], "tsm+energy": [energy]}[model]
 
@@ -130,16 +137,21 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     """A trained model, TSM or ActionPrior, and the header of its file (curves, seconds, seed, scale).
 
     model: tsm, tsm+teacher, tsm+energy (the same class, see ``schedule``) or prior.
-    From the run's folder; else, unless the scale is paper, from the shipped models; else trained now.
+    From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now.
     """
     if model == "prior":  # equally many episodes hold the same torques, whatever the environment
         env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
     cls = ActionPrior if model == "prior" else TSM
     own = run.folder(f"models/{short(env)}") / f"{model}.safetensors"
     shipped = run.shipped / short(env) / f"{model}.safetensors"
-    for path in [own] if run.scale == "paper" or run.seed else [own, shipped]:
+    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            return store.load_model(path, cls, expect={"env": env}), store.read_header(path)
+            header = store.read_header(path)
+            if header.get("model") != model:
+                raise store.StoreError(
+                    f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it"
+                )
+            return store.load_model(path, cls, expect=fingerprint(env)), header
     return train(run, env, model, own)
 
 
@@ -160,7 +172,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
         )  # fmt: skip
         curves[stage.loss] = asdict(curve)
     header = {
-        "fingerprint": fingerprint(data), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
+        "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
         "seconds": sum(c["seconds"][-1] for c in curves.values()), "torch": torch.__version__,
         "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
     }  # fmt: skip
@@ -172,7 +184,12 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
 
 def fresh(run: Run, model: str, data: Trajectories) -> Any:
     """The model as training starts: new weights, and the statistics of the training data."""
-    torch.manual_seed(run.seed)  # initial weights; torch layers draw from the global generator
+    with torch.random.fork_rng(devices=[]):  # torch layers draw their weights from the global generator
+        torch.manual_seed(run.seed)
+        return _new(model, data)
+
+
+def _new(model: str, data: Trajectories) -> Any:
     if model == "prior":
         return ActionPrior(data.actions.shape[2]).fit_scale(torch.from_numpy(data.actions))
     wide: dict[str, Any] = dict(channels=64, head_channels=128) if has_block(data.env) else {}  # appendix A.1
@@ -228,67 +245,81 @@ def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterati
 
 
 def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Plan:
-    """The plan alone; see ``trial``."""
+    """The plan alone; see ``trial``. ``predicted`` comes from 32 model samples that the planner did not see.
+
+    Plans are kept in the run's folder and found again as long as task, models and budget are the same. At scale
+    laptop the oracle's plans are those that ship in data/results, since it simulates every candidate.
+    """
     if planner not in ("adam", "adam+starts", "cem") or prior not in ("codes", "actions") or iterations < 0:
         raise ValueError(
             f"planner is {planner!r}, prior {prior!r}, iterations {iterations}; expected adam, adam+starts or cem, "
             "codes or actions, and 0 (the scale's default) or more"
         )
-    space: Space = DirectActions(task.horizon)
+    nets = {}
     if prior == "codes":
-        space = LatentActions(load_or_train(run, task.env, "prior")[0], task.horizon)
-    if model == "oracle":
-        predict = through_simulator(task.env, task.start)
+        nets["prior"], _ = load_or_train(run, task.env, "prior")
+    if model != "oracle":
+        nets["model"], _ = load_or_train(run, task.env, model)
+    budget = (
+        run.pick(smoke=8, laptop=96, paper=128),
+        iterations
+        or (run.pick(smoke=2, laptop=8, paper=12) if planner == "cem" else run.pick(smoke=3, laptop=100, paper=100)),
+    )
+    name = f"{short(task.env)}-{model}-{prior}-{planner}.safetensors"
+    made_from = {
+        "env": task.env, "horizon": task.horizon, "seed": run.seed, "candidates": budget[0], "iterations": budget[1],
+        "weights": {word: store.digest(net.state_dict()) for word, net in nets.items()},
+    }  # fmt: skip
+    own, shipped = run.folder("plans") / name, RESULTS / name
+    if own.exists() and store.read_header(own)["made_from"] == made_from and (kept := _kept(own, task)):
+        return kept
+    if model == "oracle" and run.scale == "laptop" and shipped.exists() and (kept := _kept(shipped, task, prefix=True)):
+        return kept
+    found = _search(run, task, planner, nets, *budget, bar=f"{task.name}: {model}, {planner} over {prior}")
+    if model != "oracle":
+        net = nets["model"]
+        fresh_samples = through_model(net, task.past(net.past_len), samples=32, seed=run.seed + 1)
+        found = reassess(found, fresh_samples, task.reward)
+    arrays: dict[str, Any] = {
+        "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
+        "states": found.states[:1], "predicted": found.predicted, "curve": found.curve,
+    }  # fmt: skip
+    store.save(own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds})
+    return found
+
+
+def _search(
+    run: Run, task: Task, planner: str, nets: dict[str, Any], candidates: int, iterations: int, *, bar: str
+) -> Plan:
+    began = time.perf_counter()
+    space: Space = LatentActions(nets["prior"], task.horizon) if "prior" in nets else DirectActions(task.horizon)
+    if "model" in nets:
+        predict = through_model(nets["model"], task.past(nets["model"].past_len), samples=2, seed=run.seed)
     else:
-        net, _ = load_or_train(run, task.env, model)
-        samples = 2  # model samples per candidate
-        predict = through_model(net, task.past(net.past_len), samples=samples, seed=run.seed)
-    bar = f"{task.name}: {model}, {planner} over {prior}"
-    candidates = run.pick(smoke=8, laptop=96, paper=128)
+        predict = through_simulator(task.env, task.start)
     if planner == "cem":
-        return cem(
+        found = cem(
             predict, task.reward, space, len(task),
-            candidates=candidates, elites=max(2, candidates // 10),
-            iterations=iterations or run.pick(smoke=2, laptop=8, paper=12), seed=run.seed, progress=bar,
+            candidates=candidates, elites=max(2, candidates // 10), iterations=iterations, seed=run.seed, progress=bar,
         )  # fmt: skip
-    if planner == "adam+starts":
-        start = sampled_starts(
-            predict,
-            task.reward,
-            space,
-            len(task),
-            candidates=candidates,
-            keep=run.pick(smoke=1, laptop=2, paper=4),
-            seed=run.seed,
-        )
     else:
         start = torch.zeros(1, len(task), *space.shape)
-    return adam(
-        predict,
-        task.reward,
-        space,
-        start,
-        iterations=iterations or run.pick(smoke=3, laptop=60, paper=100),
-        progress=bar,
-    )
+        if planner == "adam+starts":
+            start = sampled_starts(
+                predict, task.reward, space, len(task), candidates=candidates, keep=2, seed=run.seed
+            )  # fmt: skip
+        found = adam(predict, task.reward, space, start, iterations=iterations, progress=bar)
+    return replace(found, seconds=time.perf_counter() - began)
 
 
-def oracle(run: Run, task: Task) -> dict[str, Trial]:
-    """CEM through the true simulator, over codes and over raw torques: label -> trial.
-
-    Its plans are kept in the run's folder, since making them takes an hour at scale paper. At scale laptop the plans
-    that ship in data/results are executed again for the task's targets.
-    """
-    trials = {}
-    for prior in ("codes", "actions"):
-        name = f"oracle-{short(task.env)}-{prior}.safetensors"
-        own, shipped = run.folder("plans") / name, RESULTS / name
-        kept = next((p for p in ([own] if run.scale == "paper" or run.seed else [own, shipped]) if p.exists()), None)
-        if kept is None or len(store.load(kept, kind="plan")[0]["actions"]) < len(task):
-            found = plan(run, task, "oracle", "cem", prior)
-            header = {"env": task.env, "seconds": found.seconds, "seed": run.seed, "scale": run.scale}
-            store.save(own, {"actions": found.actions, "predicted": found.predicted}, kind="plan", header=header)
-            kept = own
-        tensors, _ = store.load(kept, kind="plan")
-        trials[label("oracle", "cem", prior)] = execute(task, tensors["actions"][: len(task)])
-    return trials
+def _kept(path: Path, task: Task, *, prefix: bool = False) -> Plan | None:
+    """The plan in ``path`` if it was made for this task, or, with ``prefix``, for more targets that begin with its."""
+    tensors, header = store.load(path, kind="plan")
+    n = len(task)
+    same = np.array_equal(tensors["start"][:n].numpy(), task.start) and torch.equal(tensors["target"][:n], task.target)
+    if not same or (len(tensors["start"]) != n and not prefix):
+        return None
+    return Plan(
+        actions=tensors["actions"][:n], parameters=tensors["parameters"][:n], states=tensors["states"][:, :n],
+        predicted=tensors["predicted"][:n], curve=tensors["curve"][:, :n], seconds=header["seconds"],
+    )  # fmt: skip

@@ -66,8 +66,8 @@ def fit(
     optimizer = torch.optim.Adam(model.parameters(), lr=lr)
     state = Progress(model, optimizer)
     identity = dict(
-        past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final, warmup=warmup,
-        clip=clip, validate_every=validate_every, patience=patience, seed=seed, bf16=bf16,
+        past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final,
+        warmup=warmup, clip=clip, validate_every=validate_every, patience=patience, seed=seed, bf16=bf16,
         loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
     )  # fmt: skip
     if checkpoint is not None and checkpoint.exists():

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Protocol
 
@@ -61,9 +61,9 @@ class DirectActions:
         return parameters.tanh()
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
-        horizon, action_dim = self.shape
-        torques = smooth_torques(n * n_targets, horizon, generator=generator, action_dim=action_dim, rms=self.scale)
-        return torques.unflatten(0, (n, n_targets)) / self.scale
+        (horizon, action_dim), settle = self.shape, 20  # steps until the smooth noise has its full variance
+        torques = smooth_torques(n * n_targets, settle + horizon, generator=generator, action_dim=action_dim, rms=0.1)
+        return torques[:, settle:].unflatten(0, (n, n_targets)) / 0.1
 
 
 class LatentActions:
@@ -206,6 +206,17 @@ def cem(
         mean = keep * mean + (1 - keep) * elite.mean(0)
         deviation = keep * deviation + (1 - keep) * elite.std(0)
     return best.plan(predict, reward, space, time.perf_counter() - began)
+
+
+@torch.no_grad()
+def reassess(plan: Plan, predict: Predict, reward: Reward) -> Plan:
+    """The same plan with ``predicted`` and ``states`` from fresh samples.
+
+    A planner picks what does best under the few samples that it plans with; what the model promises is the
+    expectation, and needs samples that had no part in the choice.
+    """
+    states = predict(plan.actions[None])
+    return replace(plan, states=states[:, 0], predicted=expected_return(states, plan.actions[None], reward)[0])
 
 
 @torch.no_grad()
