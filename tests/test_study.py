@@ -215,7 +215,7 @@ def test_a_model_of_another_environment_is_refused_naming_both(run: Run) -> None
 def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
     folder = run.models / "Reacher"
     shutil.copy(folder / "tsm.safetensors", folder / "prior.safetensors")
-    with pytest.raises(StoreError, match="holds a model called 'tsm', expected 'prior'"):
+    with pytest.raises(StoreError, match="holds 'tsm', expected 'prior'"):
         study.load_or_train(run, REACHER, "prior")
 
 

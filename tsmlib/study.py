@@ -211,7 +211,7 @@ def task(env: str, split: str = "test") -> Task:
 
 
 def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
-    """Starts from the environment's reset, targets uniform in the disc of radius 0.2 m (reading A21)."""
+    """Starts from the environment's reset, targets uniform in the disc of radius 0.2 m."""
     copies = gymnasium.make_vec(env, num_envs=n)
     start, info = copies.reset(seed=seed)
     copies.close()
