@@ -206,6 +206,8 @@ def start(place: Path) -> subprocess.Popen[bytes]:
         f"open({str(place / 'inside')!r}, 'w').write(str(__import__('os').getpid()))\nimport time; time.sleep(60)",
     )
     code = (
+        # SIGINT would be ignored where the tests themselves run in the background.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "import sys; from pathlib import Path; from tsmlib import runs; from tsmlib.__main__ import main;"
         f"runs.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
     )
