@@ -18,6 +18,7 @@ import torch
 
 import tsmlib.envs
 from tsmlib import store
+from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
 from tsmlib.envs.base import DT, STATE_NAMES
@@ -40,7 +41,15 @@ from tsmlib.trajopt import (
 from tsmlib.tsm import TSM
 
 SPLITS = ("train", "validation", "test")
-MODELS = ("tsm", "prior", "tsm+teacher", "tsm+energy")
+CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows a + is an option of the class
+    "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
+}  # fmt: skip
+DYNAMICS = ("tsm", "tsm+energy", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")  # what 03 compares
+MODELS = (*DYNAMICS, "tsm+teacher", "prior")
+BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
+    "Reacher": 120, "ReacherObstacle": 180, "ReacherPush": 420,
+    "PymunkReacher": 60, "PymunkObstacle": 90, "PymunkPush": 120,
+}  # fmt: skip
 HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
@@ -49,12 +58,12 @@ RESULTS = ROOT / "data" / "results"
 
 @dataclass(frozen=True)
 class Stage:
-    """One part of a training schedule: which loss of the model, over how many segments, for how many steps."""
+    """One part of a training schedule: which loss of the model, for how many updates, over how long a future."""
 
     loss: str
-    segments: int
     steps: int
-    lr: float = 1e-3
+    future_len: int = 20  # 2 H
+    lr: float = 2e-3
 
 
 def short(env: str) -> str:
@@ -117,31 +126,41 @@ def fingerprint(env: str) -> dict[str, Any]:
 
 
 def schedule(run: Run, env: str, model: str) -> list[Stage]:
-    """How a model is trained.
+    """How a model is trained: every dynamics model of an environment for about the same time on one core.
 
     tsm: teacher forcing, then free-running over two chained segments. tsm+teacher: teacher forcing alone, the
-    ablation. tsm+energy: free-running on the energy score, from new weights. prior: free-running over two segments.
+    ablation. tsm+energy: free-running on the energy score, from new weights. onestep, ensemble: one step ahead.
+    multistep, lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":
-        return [Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=3000))]
-    pushes = env == "tsm/ReacherPush-v0"  # the hardest to learn, and the headline
-    teacher = Stage("teacher_forced_loss", 1, run.pick(smoke=30, laptop=500, paper=1000))
-    free = Stage("loss", 2, run.pick(smoke=30, laptop=1500, paper=4000 if pushes else 2000), lr=2e-3)
-    steps = teacher.steps + free.steps
-    longer = Stage("teacher_forced_loss", 2, steps, lr=2e-3)  # as many steps, windows and the same rate as tsm
-    energy = Stage("energy_loss", 2, run.pick(smoke=20, laptop=1500, paper=5000 if pushes else 3000), lr=2e-3)
-    return {"tsm": [teacher, free], "tsm+teacher": [longer], "tsm+energy": [energy]}[model]
+        return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000))]
+    seconds = BUDGET[short(env)] * run.pick(smoke=0.0, laptop=0.4, paper=1.0)
+    wide = has_block(env)
+
+    def stage(loss: str, rate: float, share: float = 1.0, **options: Any) -> Stage:
+        return Stage(loss, max(30, 10 * round(seconds * share * rate / 10)), **options)
+
+    if model == "tsm":
+        teacher = stage("teacher_forced_loss", 16 if wide else 30, 0.1, future_len=10, lr=1e-3)
+        return [teacher, stage("loss", 5 if wide else 8, 0.9)]
+    return {
+        "tsm+teacher": [stage("teacher_forced_loss", 9)],
+        "tsm+energy": [stage("energy_loss", 3.2 if wide else 5.5)],
+        "onestep": [stage("loss", 26)],
+        "multistep": [stage("multi_step_loss", 16)],
+        "lstm": [stage("loss", 10)],
+        "ensemble": [stage("loss", 23)],
+        "ensemble+mse": [stage("loss", 23)],
+    }[model]
 
 
 def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
-    """A trained model, TSM or ActionPrior, and the header of its file (curves, seconds, seed, scale).
+    """A trained model, any of MODELS, and the header of its file (curves, seconds, seed, scale).
 
-    model: tsm, tsm+teacher, tsm+energy (the same class, see ``schedule``) or prior.
     From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now.
     """
     if model == "prior":  # equally many episodes hold the same torques, whatever the environment
         env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
-    cls = ActionPrior if model == "prior" else TSM
     own = run.folder(f"models/{short(env)}") / f"{model}.safetensors"
     shipped = run.shipped / short(env) / f"{model}.safetensors"
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
@@ -151,7 +170,7 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
                 raise store.StoreError(
                     f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it"
                 )
-            return store.load_model(path, cls, expect=fingerprint(env)), header
+            return store.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
     return train(run, env, model, own)
 
 
@@ -165,7 +184,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
         checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint.safetensors")
         curve = fit(
             net, getattr(net, stage.loss), data, held_out,
-            past_len=net.past_len, future_len=stage.segments * net.segment_len, steps=stage.steps, lr=stage.lr,
+            past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr,
             batch_size=run.pick(smoke=32, laptop=256, paper=256),
             validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=True,
             checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
@@ -190,11 +209,15 @@ def fresh(run: Run, model: str, data: Trajectories) -> Any:
 
 
 def _new(model: str, data: Trajectories) -> Any:
+    states, actions = data.states, data.actions
     if model == "prior":
-        return ActionPrior(data.actions.shape[2]).fit_scale(torch.from_numpy(data.actions))
-    wide: dict[str, Any] = dict(channels=64, head_channels=128) if has_block(data.env) else {}  # appendix A.1
-    net = TSM(data.states.shape[2], data.actions.shape[2], angles=data.angles, **wide)
-    net.features.fit(torch.from_numpy(data.states))
+        return ActionPrior(actions.shape[2]).fit_scale(torch.from_numpy(actions))
+    kind, _, option = model.partition("+")
+    options: dict[str, Any] = {"gaussian": option != "mse"} if kind == "ensemble" else {}
+    if kind == "tsm" and has_block(data.env):
+        options = dict(channels=64, head_channels=128)  # appendix A.1
+    net = CLASSES[kind](states.shape[2], actions.shape[2], angles=data.angles, **options)
+    net.features.fit(torch.from_numpy(states))
     return net
 
 

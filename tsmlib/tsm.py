@@ -118,9 +118,7 @@ class TSM(nn.Module):
         for future in self._segments(window.future):
             mean, log_variance = self.encode(future.states)
             z = sample_posterior(mean, log_variance, generator)
-            error = self.decode_teacher_forced(Window(past, future), z) - future.states
-            moving = self.features.step_std > 1e-9
-            error = error[..., moving] / self.features.step_std[moving]
+            error = self.features.increments(self.decode_teacher_forced(Window(past, future), z), future.states)
             kl = kl_from_standard_normal(mean, log_variance)
             loss = loss + (error.square().sum((1, 2)) + self.beta * kl).mean()
             past = past.then(future).last(self.past_len)
@@ -155,7 +153,7 @@ class TSM(nn.Module):
         return [Segment(*part) for part in parts]
 
     def _elbo(self, predicted: Tensor, states: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-        error = (self.features(predicted) - self.features(states))[..., self.features.scored]
+        error = self.features.difference(predicted, states)
         return (error.square().sum((1, 2)) + self.beta * kl_from_standard_normal(mean, log_variance)).mean()
 
 

@@ -1,0 +1,243 @@
+"""What TSM is held against (section 5.2), behind the same interface, with the same features and targets.
+
+    OneStep    x_{t+1} = f(x_t, u_t)                       (i) one-step loss, (ii) the same with a multi-step loss
+    LSTM       x_{t+1}, h_{t+1} = f(x_t, u_t, h_t)         (iii) multi-step loss, h warmed up on the past
+    Ensemble   x_{t+1} ~ N(mean_m, variance_m)(x_t, u_t)   PETS: member m is drawn once per rollout (Chua et al., 2018)
+
+All of them read cosine and sine of the angles and standardised velocities and positions, and predict the increment of
+the physical state in units of its standard deviation, as TSM does. The ensemble is not in the paper.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tsmlib.nets import Features, Noise, sigmoid_tanh, standard_normal
+from tsmlib.trajectory import Segment, Window
+
+
+class OneStep(nn.Module):
+    """A fully connected network f(x_t, u_t): a segment model with H = 1 that reads the last state alone.
+
+    state_dim, action_dim: dx, du. angles: state dimensions in radians.
+    """
+
+    segment_len, past_len, stochastic = 1, 1, False
+
+    def __init__(
+        self, state_dim: int, action_dim: int, *, angles: tuple[int, ...] = (0, 1), hidden: int = 200, layers: int = 3
+    ) -> None:
+        super().__init__()
+        self._config = dict(
+            state_dim=state_dim, action_dim=action_dim, angles=list(angles), hidden=hidden, layers=layers
+        )
+        self.features = Features(state_dim, tuple(angles))
+        widths = [self.features.dim + action_dim, *[hidden] * layers]
+        inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
+        self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
+
+    def config(self) -> dict[str, Any]:
+        """The constructor's arguments, as they travel with the weights."""
+        return dict(self._config)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        """f: (..., dx), (..., du) -> (..., dx)."""
+        return x + self.features.step_std * self.net(torch.cat([self.features(x), u], dim=-1))
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """(B, L, .), (B, K, du) -> states (B, K, dx), for any K. There is nothing to draw."""
+        x, states = past.states[:, -1], []
+        for u in actions.unbind(1):
+            x = self.step(x, u)
+            states.append(x)
+        return torch.stack(states, dim=1)
+
+    def loss(self, window: Window, generator: Noise) -> Tensor:
+        """(i) Squared error of one-step increments on every tuple (x_t, u_t, x_{t+1}) of the window's future."""
+        before = states_before(window)
+        predicted = self.step(before, window.future.actions)
+        return self.features.increments(predicted, window.future.states).square().sum((1, 2)).mean()
+
+    def multi_step_loss(self, window: Window, generator: Noise) -> Tensor:
+        """(ii) Squared error of the states that the network reaches on its own predictions, over the whole future."""
+        predicted = self.predict_segment(window.past, window.future.actions)
+        return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
+
+
+class LSTM(nn.Module):
+    """(iii) A recurrent model: its hidden state reads the true past, then runs on with the model's own predictions.
+
+    hidden: size of h. past_len: steps of past that warm it up. segment_len: it keeps its hidden state for as many
+    steps as one call asks for, so a whole horizon is one segment.
+    """
+
+    stochastic = False
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        angles: tuple[int, ...] = (0, 1),
+        hidden: int = 160,
+        past_len: int = 10,  # H
+        segment_len: int = 100,  # the length of an episode
+    ) -> None:
+        super().__init__()
+        self._config = dict(
+            state_dim=state_dim, action_dim=action_dim, angles=list(angles), hidden=hidden, past_len=past_len,
+            segment_len=segment_len,
+        )  # fmt: skip
+        self.past_len, self.segment_len, self.hidden = past_len, segment_len, hidden
+        self.features = Features(state_dim, tuple(angles))
+        self.cell = nn.Linear(self.features.dim + action_dim + hidden, 4 * hidden)
+        self.out = nn.Linear(hidden, state_dim)
+        with torch.no_grad():
+            self.cell.bias[:hidden] = 1.0  # forget gates start open
+
+    def config(self) -> dict[str, Any]:
+        """The constructor's arguments, as they travel with the weights."""
+        return dict(self._config)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx). There is nothing to draw."""
+        h = c = actions.new_zeros(len(actions), self.hidden)
+        for x, u in zip(past.states[:, :-1].unbind(1), past.actions[:, 1:].unbind(1), strict=True):
+            h, c = self.recur(x, u, h, c)
+        x, states = past.states[:, -1], []
+        for u in actions.unbind(1):
+            h, c = self.recur(x, u, h, c)
+            x = x + self.features.step_std * self.out(h)
+            states.append(x)
+        return torch.stack(states, dim=1)
+
+    def recur(self, x: Tensor, u: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """The next hidden state h and cell c, (B, hidden) each."""
+        gates = self.cell(torch.cat([self.features(x), u, h], dim=-1))
+        forget, write, read, candidate = gates.chunk(4, dim=-1)
+        c = forget.sigmoid() * c + write.sigmoid() * sigmoid_tanh(candidate)
+        return read.sigmoid() * sigmoid_tanh(c), c
+
+    def loss(self, window: Window, generator: Noise) -> Tensor:
+        """Squared error of the states over the whole future, on the model's own predictions."""
+        predicted = self.predict_segment(window.past, window.future.actions)
+        return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
+
+
+class Ensemble(nn.Module):
+    """PETS: networks that differ in their weights and in the data they see, each of which states a Gaussian.
+
+    gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the
+    choice of the member is random). members, hidden, layers: the defaults of PETS. segment_len: a member is drawn for
+    the whole of a segment, so that a segment as long as an episode is trajectory sampling with a fixed member.
+    """
+
+    past_len, stochastic = 1, True
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        angles: tuple[int, ...] = (0, 1),
+        gaussian: bool = True,
+        members: int = 5,
+        hidden: int = 200,
+        layers: int = 3,
+        segment_len: int = 100,  # the length of an episode
+    ) -> None:
+        super().__init__()
+        self._config = dict(
+            state_dim=state_dim, action_dim=action_dim, angles=list(angles), gaussian=gaussian, members=members,
+            hidden=hidden, layers=layers, segment_len=segment_len,
+        )  # fmt: skip
+        self.gaussian, self.members, self.segment_len = gaussian, members, segment_len
+        self.features = Features(state_dim, tuple(angles))
+        widths = [self.features.dim + action_dim, *[hidden] * layers, state_dim * (2 if gaussian else 1)]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for i, o in pairwise(widths):
+            drawn = [nn.Linear(i, o) for _ in range(members)]
+            self.weights.append(nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn])))  # (M, i, o)
+            self.biases.append(nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn])))  # (M, 1, o)
+        if gaussian:  # limits of the stated log variance, learned as in PETS
+            self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
+            self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
+
+    def config(self) -> dict[str, Any]:
+        """The constructor's arguments, as they travel with the weights."""
+        return dict(self._config)
+
+    def increments(self, x: Tensor, u: Tensor, members: slice = slice(None)) -> tuple[Tensor, Tensor | None]:
+        """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``."""
+        s = torch.cat([self.features(x), u], dim=-1)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            s = torch.baddbmm(bias[members], F.silu(s) if i else s, weight[members])
+        if not self.gaussian:
+            return s, None
+        mean, log_variance = s.chunk(2, dim=-1)
+        log_variance = self.log_variance_max - F.softplus(self.log_variance_max - log_variance)
+        return mean, self.log_variance_min + F.softplus(log_variance - self.log_variance_min)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx).
+
+        No generator: every step takes the mean of all members. With one: each row keeps a member of its own, and in
+        the Gaussian form adds the noise which that member states.
+        """
+        if generator is None:
+            x, states = past.states[:, -1], []
+            for u in actions.unbind(1):
+                mean, _ = self.increments(*(part.expand(self.members, -1, -1) for part in (x, u)))
+                x = x + self.features.step_std * mean.mean(0)
+                states.append(x)
+            return torch.stack(states, dim=1)
+        (rows, steps, _), dx = actions.shape, past.states.shape[2]
+        uniform = torch.special.ndtr(standard_normal((rows,), generator, actions))
+        member = (self.members * uniform).long().clamp(max=self.members - 1)
+        noise = standard_normal((rows, steps if self.gaussian else 0, dx), generator, actions)
+        predicted = actions.new_empty(rows, steps, dx)
+        for m in range(self.members):
+            mine = (member == m).nonzero()[:, 0]
+            states = self._by_member(m, past.states[mine, -1], actions[mine], noise[mine])
+            predicted = predicted.index_put((mine,), states)
+        return predicted
+
+    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+        """Mean over members of the negative log-likelihood, or squared error, of one-step increments.
+
+        The tuples of the batch are dealt out at random, so that a step costs as much as it would for one network.
+        """
+        future, scale = window.future, self.features.step_std
+        tuples = [part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)]
+        share = -(-len(tuples[0]) // self.members)
+        index = torch.randint(len(tuples[0]), (self.members, share), generator=generator, device=scale.device)
+        x, u, after = (part[index] for part in tuples)
+        mean, log_variance = self.increments(x, u)
+        moving = self.features.moving
+        error = ((after - x)[..., moving] / scale[moving] - mean[..., moving]).square()
+        if log_variance is None:
+            return error.sum(-1).mean()
+        log_variance = log_variance[..., moving]
+        likelihood = 0.5 * (error * (-log_variance).exp() + log_variance).sum(-1).mean()
+        return likelihood + 0.01 * (self.log_variance_max - self.log_variance_min)[moving].sum()
+
+    def _by_member(self, m: int, x: Tensor, actions: Tensor, noise: Tensor) -> Tensor:
+        states = []
+        for k, u in enumerate(actions.unbind(1)):
+            mean, log_variance = self.increments(x[None], u[None], slice(m, m + 1))
+            change = mean[0]
+            if log_variance is not None:
+                change = change + (0.5 * log_variance[0]).exp() * noise[:, k]
+            x = x + self.features.step_std * change
+            states.append(x)
+        return torch.stack(states, dim=1)
+
+
+def states_before(window: Window) -> Tensor:
+    """x_t .. x_{t+K-1}, the states in which the future's actions are taken: (B, K, dx)."""
+    return torch.cat([window.past.states[:, -1:], window.future.states[:, :-1]], dim=1)
