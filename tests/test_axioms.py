@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import smooth_torques
 from tsmlib.dynamics import rollout
 from tsmlib.nets import CausalDecoder, SharedNoise
@@ -63,7 +64,17 @@ MODELS = {
     "tsm, obstacle": Case(
         lambda dx: TSM(dx, DU, head_channels=16, **SMALL), state_dim=10, constant=(6, 7, 8, 9), **SAME
     ),
-}
+    "onestep": Case(
+        lambda dx: OneStep(dx, DU, hidden=16, layers=2), stochastic=False,
+        losses=(("loss", ()), ("multi_step_loss", ())),
+    ),
+    "lstm": Case(lambda dx: LSTM(dx, DU, hidden=16, segment_len=10), stochastic=False),
+    "ensemble": Case(lambda dx: Ensemble(dx, DU, hidden=16, layers=2, segment_len=10)),
+    "ensemble+mse, obstacle": Case(
+        lambda dx: Ensemble(dx, DU, gaussian=False, hidden=16, layers=2, segment_len=10), state_dim=10,
+        constant=(6, 7, 8, 9),
+    ),
+}  # fmt: skip
 
 
 @pytest.fixture(params=MODELS.values(), ids=MODELS.keys())
