@@ -1,0 +1,249 @@
+"""Figures of predictions show every model in its own colour, and say in words what does not fit the axis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from tsmlib import figures, predict_figures, style
+
+MODELS = ("tsm", "tsm+energy", "tsm+teacher", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
+ENVS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
+NAMES = ("joint0", "joint1", "tip_x", "tip_y", "block_x", "block_y")
+LEVELS = np.linspace(0.1, 0.9, 9)
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).normal(scale=0.3, size=shape)
+
+
+def scores(*models: str, **more: list[float]) -> dict[str, np.ndarray]:
+    return {m: i + noise(3) for i, m in enumerate(models)} | {m: np.array(v) for m, v in more.items()}
+
+
+def curves(*models: str, seeds: int = 3) -> dict[str, np.ndarray]:
+    return {m: 1 + i + 0.1 * noise(seeds, 30) for i, m in enumerate(models)}
+
+
+def episodes(*models: str) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+    """Blocks that move 5 cm to the right; episode 0 is the worst, 4 the best, 2 the median."""
+    true = np.zeros((5, 20, 6))
+    true[..., 4] = 0.1 + np.linspace(0, 0.05, 20)
+    predicted = {m: true + 0.01 * noise(4, 5, 20, 6) for m in models}
+    return true, predicted, {m: np.array([5.0, 4, 3, 2, 1]) for m in models}, NAMES
+
+
+def texts(figure: Figure) -> str:
+    return "\n".join(text.get_text() for ax in figure.axes for text in ax.texts)
+
+
+def lines(ax: Axes, model: str) -> list[plt.Line2D]:
+    return [line for line in ax.lines if to_hex(line.get_color()).upper() == style.COLOURS[model]]
+
+
+EVERY: dict[str, Callable[[], Figure]] = {
+    "figure5": lambda: figures.figure5({env: scores(*MODELS) for env in ENVS}),
+    "figure5, two panels": lambda: figures.figure5({t: {e: scores(*MODELS) for e in ENVS} for t in ("paper", "fair")}),
+    "figure5, one seed": lambda: figures.figure5({ENVS[0]: {"tsm": np.array([1.0])}}),
+    "against_horizon": lambda: figures.against_horizon(
+        {"reach": curves(*MODELS), "push": curves("tsm", "lstm", seeds=1)}, "NRMSE", log=["push"],
+        reference={"reach": 0.8},
+    ),
+    "calibration": lambda: figures.calibration(LEVELS, {"push": dict.fromkeys(MODELS, LEVELS)}),
+    "differences": lambda: figures.differences(
+        {"reach": scores(*MODELS[1:]), "push": {"lstm": np.array([1.0])}}, "nats", lower_is_better=["push"]
+    ),
+    "gallery": lambda: figures.gallery(*episodes("tsm", "lstm"), contact=np.array([3, -1, 3, 3, 19]), by="tsm"),
+    "gallery, tip": lambda: figures.gallery(*episodes(*MODELS), path="tip"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", EVERY)
+def test_every_figure_is_laid_out_without_warnings_and_none_is_left_open(name: str) -> None:
+    figure = EVERY[name]()
+    figure.draw_without_rendering()
+    assert plt.get_fignums() == []
+    assert min(text.get_fontsize() for text in figure.findobj(plt.Text) if text.get_text()) >= 6.5
+
+
+def test_every_figure_of_predictions_is_tested_and_reached_from_figures() -> None:
+    public = {name for name, value in vars(predict_figures).items() if getattr(value, "__wrapped__", None)}
+    assert public == {name.partition(",")[0] for name in EVERY}
+    assert all(getattr(figures, name) is getattr(predict_figures, name) for name in public)
+
+
+def test_every_model_has_its_colour_and_marker_in_every_figure() -> None:
+    assert len({style.COLOURS[m] for m in MODELS}) == len({predict_figures.MARKERS[m] for m in MODELS}) == len(MODELS)
+    for name in ("figure5", "against_horizon", "calibration", "gallery, tip"):
+        figure = EVERY[name]()
+        assert all(any(lines(ax, m) for ax in figure.axes) for m in MODELS), name
+
+
+def test_both_ensembles_are_named_by_their_loss() -> None:
+    legend = EVERY["figure5"]().legends[0]
+    named = [text.get_text() for text in legend.get_texts()]
+    assert {"ensemble (Gaussian)", "ensemble (squared error)"} <= set(named)
+
+
+def test_figure5_marks_the_mean_over_seeds_and_its_interval() -> None:
+    seeds = np.array([1.0, 2.0, 4.0])
+    (ax,) = figures.figure5({ENVS[0]: {"tsm": seeds, "lstm": seeds + 1}}).axes
+    bar, mark = (line.get_ydata() for line in lines(ax, "tsm"))
+    mean, half = style.interval(seeds)
+    np.testing.assert_allclose(mark, [mean])
+    np.testing.assert_allclose(bar, [mean - half, mean + half])
+
+
+def test_figure5_keeps_the_place_of_a_model_that_one_environment_lacks() -> None:
+    (ax,) = figures.figure5({ENVS[0]: scores("tsm", "onestep", "lstm"), ENVS[1]: scores("tsm", "lstm")}).axes
+    first, second = ([float(lines(ax, m)[i].get_xdata()[0]) for m in ("tsm", "lstm")] for i in (1, 3))
+    assert first[1] - first[0] == second[1] - second[0] == 2
+
+
+def test_a_diverged_model_leaves_the_others_readable_and_its_value_in_words() -> None:
+    good = scores("tsm", "tsm+energy", "lstm")
+    figure = figures.figure5({"push": good | {"onestep": np.array([-1e5, -2e5, -3e5]), "ensemble": [5.0, 5, 300]}})
+    assert "mean −2.0×10⁵" in texts(figure)
+    assert "mean 103" in texts(figure)
+    ends = figure.axes[0].get_ylim()
+    seen = np.concatenate(list(good.values()))
+    assert ends[0] < seen.min() < seen.max() < ends[1]
+    assert np.ptp(ends) < 20
+    assert all(tick >= -20 for tick in figure.axes[0].get_yticks())
+
+
+def test_a_value_beyond_the_scale_is_noted_and_one_within_it_is_not() -> None:
+    inside = figures.figure5({"push": scores("tsm", "lstm", "multistep")})
+    assert texts(inside) == ""
+    low, high = inside.axes[0].get_ylim()
+    seeds = np.concatenate(list(scores("tsm", "lstm", "multistep").values()))
+    assert low < seeds.min() < seeds.max() < high
+
+
+def test_a_diverged_curve_is_cut_with_an_arrow_and_its_furthest_value() -> None:
+    rows = curves("tsm", "lstm", "multistep") | {"onestep": np.exp(np.arange(30.0))[None]}
+    figure = figures.against_horizon({"push": rows}, "NRMSE")
+    assert texts(figure).strip() == "one-step to 3.9×10¹²"
+    assert figure.axes[0].get_ylim()[1] < 50
+    arrows = [text for text in figure.axes[0].texts if getattr(text, "arrow_patch", None)]
+    assert len(arrows) == 1
+    shown = figures.against_horizon({"push": curves("tsm", "lstm")}, "NRMSE")
+    assert texts(shown) == ""
+
+
+def test_a_band_that_leaves_the_axis_is_told_too() -> None:
+    rows = curves("tsm", "lstm", "multistep") | {"onestep": np.array([[1.0], [2.0], [9.0]]) * np.ones(30)}
+    text = texts(figures.against_horizon({"push": rows}, "NRMSE"))
+    mean, half = style.interval(np.array([1.0, 2.0, 9.0]))
+    assert f"one-step, band to −{abs(mean - half):.3g}" in text
+
+
+def test_the_mean_over_seeds_is_drawn_against_steps_from_one() -> None:
+    rows = curves("lstm")
+    ax = figures.against_horizon({"push": rows}, "NRMSE").axes[0]
+    (line,) = lines(ax, "lstm")
+    np.testing.assert_array_equal(line.get_xdata(), np.arange(1, 31))
+    np.testing.assert_allclose(line.get_ydata(), rows["lstm"].mean(0))
+    assert len(ax.collections) == 1
+    assert not figures.against_horizon({"push": curves("lstm", seeds=1)}, "NRMSE").axes[0].collections
+
+
+def test_a_second_label_of_a_model_is_dashed() -> None:
+    ax = figures.against_horizon({"push": curves("tsm", "tsm free")}, "NRMSE").axes[0]
+    assert len({line.get_linestyle() for line in lines(ax, "tsm")}) == 2
+
+
+def test_calibration_has_the_ideal_as_its_diagonal() -> None:
+    ax = EVERY["calibration"]().axes[0]
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), [[0, 0], [1, 1]])
+
+
+def test_a_difference_is_filled_only_where_its_interval_excludes_zero() -> None:
+    sure, open_, single = np.array([1.0, 1.1, 1.2]), np.array([-1.0, 0.2, 1.0]), np.array([1.0])
+    figure = figures.differences({"push": {"onestep": sure, "lstm": open_, "ensemble": single}}, "nats")
+    faces = {m: to_hex(lines(figure.axes[0], m)[-1].get_markerfacecolor()) for m in ("onestep", "lstm", "ensemble")}
+    assert faces == {"onestep": style.COLOURS["onestep"].lower(), "lstm": "#ffffff", "ensemble": "#ffffff"}
+    assert "TSM better →" in texts(figure)
+
+
+def test_where_lower_is_better_the_sides_of_zero_change() -> None:
+    figure = figures.differences({"energy": scores("lstm")}, "energy score", lower_is_better=["energy"])
+    assert "← TSM better" in texts(figure)
+    assert "worse →" in texts(figure)
+
+
+def test_zero_is_always_in_sight() -> None:
+    low, high = figures.differences({"push": {"lstm": np.array([7.0, 7.1])}}, "nats").axes[0].get_xlim()
+    assert low < 0 < 7.1 < high
+
+
+def test_a_diverged_difference_is_told_beside_its_row() -> None:
+    values = scores("lstm", "ensemble", "multistep") | {"onestep": np.array([1e5, 1e5, 1e5])}
+    assert "mean 10⁵" in texts(figures.differences({"push": values}, "nats"))
+
+
+def test_the_gallery_shows_best_median_and_worst_by_energy_score() -> None:
+    figure = figures.gallery(*episodes("tsm", "lstm"))
+    assert [ax.get_ylabel() for ax in figure.axes[::2]] == ["best", "median", "worst"]
+    assert [ax.get_title("left") for ax in figure.axes[::2]] == [f"energy score {score}" for score in (1, 3, 5)]
+    assert all(ax.get_aspect() == 1 for ax in figure.axes)
+    black = [line for line in figure.axes[0].lines if line.get_color() == "black" and len(line.get_xdata()) > 1]
+    np.testing.assert_allclose(black[0].get_xdata(), episodes("tsm")[0][4, :, 4])
+
+
+def test_one_model_may_choose_the_episodes_of_all() -> None:
+    true, predicted, energy, names = episodes("tsm", "lstm")
+    energy["lstm"] = energy["tsm"][::-1]
+    figure = figures.gallery(true, predicted, energy, names, by="tsm")
+    assert figure.axes[0].get_ylabel() == "best for TSM"
+    assert figure.axes[1].get_title("left") == "energy score 5"
+
+
+def test_samples_that_leave_the_picture_are_counted() -> None:
+    true, predicted, energy, names = episodes("tsm", "lstm")
+    predicted["lstm"][:3, 4, -1, 4] += 1e6
+    figure = figures.gallery(true, predicted, energy, names)
+    assert "3 of 4 leave,\nto 10⁶ m off" in texts(figure)
+    assert np.ptp(figure.axes[0].get_xlim()) < 0.5
+    assert "leave" not in texts(figures.gallery(*episodes("tsm", "lstm")))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (0.5, "0.5"), (-12.34, "−12.3"), (1234.5, "1234"), (-123456, "−1.2×10⁵"), (1e-5, "10⁻⁵")],
+)
+def test_numbers_in_words(value: float, text: str) -> None:
+    assert predict_figures._spell(value) == text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: figures.figure5({}), "nothing to draw"),
+        (lambda: figures.figure5({"push": {"gru": noise(3)}}), "starts with 'gru', expected one of tsm"),
+        (lambda: figures.figure5({"push": {"tsm": noise(3, 2)}}), r"push, tsm has shape \(3, 2\), expected \(k\)"),
+        (lambda: figures.figure5({"push": {"tsm": np.array([1, np.nan])}}), "push, tsm: 1 of 2 values are not finite"),
+        (lambda: figures.figure5({"a": {"push": {"tsm": noise(3)}}}, {"b": "nats"}), "panel 'a' is missing"),
+        (lambda: figures.against_horizon({"push": {"tsm": noise(9)}}, "e"), r"shape \(9,\), expected \(k, T\)"),
+        (lambda: figures.against_horizon({"push": curves("tsm")}, "e", log=["reach"]), "log names a panel 'reach'"),
+        (lambda: figures.against_horizon({"push": {"tsm": -np.ones((1, 3))}}, "e", log=["push"]), "−1 cannot stand"),
+        (lambda: figures.calibration(LEVELS, {"push": {"tsm": LEVELS[:4]}}), r"shape \(4,\), expected \(9\)"),
+        (lambda: figures.calibration(LEVELS, {"push": {"tsm": 100 * LEVELS}}), "10 to 90, expected shares"),
+        (lambda: figures.differences({"push": scores("lstm")}, "nats", lower_is_better=["x"]), "there are push"),
+        (lambda: figures.gallery(*episodes("tsm"), path="elbow"), "no path of the elbow; there are tip, block"),
+        (lambda: figures.gallery(*episodes("tsm"), by="lstm"), "energy holds tsm; 'lstm' is missing"),
+        (lambda: figures.gallery(*episodes("tsm"), contact=np.zeros(4)), r"contact has shape \(4,\), expected \(5\)"),
+        (lambda: figures.gallery(noise(2, 9, 6), {"tsm": noise(4, 2, 9, 6)}, {"tsm": noise(2)}, NAMES), "at least 3"),
+    ],
+)  # fmt: skip
+def test_a_wrong_input_is_named(wrong: Callable[[], Figure], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        wrong()
+    assert plt.get_fignums() == []
