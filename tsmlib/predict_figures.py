@@ -487,7 +487,8 @@ def gallery(
     true: (N, T, dx); predicted: label -> (S, N, T, dx), all S are drawn; energy: label -> (N,); contact: (N,) first
     step with contact, negative where there is none; by: the model whose scores choose the episodes for all columns
     (None: each its own). path: whose way is drawn thick, "block" (with the fingertip's thinner) or "tip" (with the
-    block where it starts); radius: the block's, in m. Rows share a scale. Samples that leave the picture are marked.
+    block where it starts); radius: the block's, in m. Episodes in a row share a scale.
+    Samples that leave the picture are marked and counted.
     """
     true = _finite("true", true, "N T dx")
     n, steps, size = true.shape
@@ -507,7 +508,10 @@ def gallery(
 
     count, rows = len(looks), ("best", "median", "worst")
     size_in = min(1.75, (WIDTH - 0.25) / count)
-    figure, grid = plt.subplots(3, count, figsize=(size_in * count + 0.25, 3 * (size_in + 0.42) + 0.45), squeeze=False)
+    down, across = (3, count) if count > 1 else (1, 3)  # a single model lies on its side
+    figure, grid = plt.subplots(down, across, squeeze=False,
+                                figsize=(size_in * across + 0.25, down * (size_in + 0.42) + 0.45))  # fmt: skip
+    grid = grid.reshape(3, count)
     for row, row_word in enumerate(rows):
         boxes, needed, wanted = {}, 0.05, 0.0
         for label in looks:
@@ -575,5 +579,5 @@ def gallery(
     if first is not None:
         handles.append(Line2D([], [], ls="", marker="*", mfc="white", mec="black", mew=0.7, ms=6.5,
                               label="fingertip at first contact"))  # fmt: skip
-    legend(figure, handles, columns=5 if size_in * count > 5 else 2 if size_in * count > 3 else 1)
+    legend(figure, handles, columns=5 if size_in * across > 6.2 else 3)
     return figure
