@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
-from tsmlib import evaluate, runs, store, study
+from tsmlib import evaluate, runs, scoreboard, store, study
 from tsmlib.envs import ENV_IDS
 from tsmlib.nets import Features, Noise, standard_normal
 from tsmlib.trajectory import Segment, Trajectories
@@ -248,26 +248,22 @@ def main() -> None:
     data, validation, test = (study.dataset(run, arguments.env, split) for split in study.SPLITS)
     test, word = test.take(slice(arguments.episodes)), MODELS[arguments.form]
     features = Features(data.states.shape[2], data.angles).fit(torch.from_numpy(data.states))
-    model, took = train(
-        arguments.form, features, data, validation, seconds=arguments.seconds, seed=arguments.seed
-    )  # fmt: skip
+    model, took = train(arguments.form, features, data, validation, seconds=arguments.seconds, seed=arguments.seed)
     peer = Peer(network_of(model), features)
     check(model, peer, test)
     print(f"{arguments.env}, {word}: " + ", ".join(f"{name} {value:,.4g}" for name, value in took.items()))
     began = time.perf_counter()
-    scores = evaluate.score(
-        peer, features, test, validation, samples=arguments.samples, seed=arguments.seed, progress=word
-    )  # fmt: skip
+    splits, options = (test, validation), dict(samples=arguments.samples, seed=arguments.seed)
+    open_loop = evaluate.score(peer, features, *splits, progress=f"{word}, open loop", **options)
+    options |= dict(starts=scoreboard.SEGMENTS, horizon=10)
+    segments = evaluate.score(peer, features, *splits, progress=f"{word}, segments", **options)
     print(f"{arguments.samples} samples of {len(test)} trajectories scored in {time.perf_counter() - began:.0f} s")
-    common = dict(
-        env=arguments.env, sim="pymunk" if "Pymunk" in arguments.env else "mujoco", model=word, planner="none",
-        condition="clean", seed=arguments.seed, scale=run.scale,
-    )  # fmt: skip
-    took["outside"] = scores.outside.mean().item()
-    rows = [dict(common, metric=name, value=value, unit=UNITS.get(name, "")) for name, value in took.items()]
-    for metric, curve in scores.against_horizon().items():
+    for metric, curve in open_loop.against_horizon().items():
         print(f"    {metric:18} at 10 steps {curve[9]:9.3f}   at 80 steps {curve[79]:9.3f}")
-        rows += [dict(common, metric=metric, horizon=h, value=float(curve[h - 1]), n=len(test)) for h in (10, 80)]
+    common = dict(seed=arguments.seed, scale=run.scale)
+    rows = scoreboard.rows(arguments.env, word, open_loop, segments, test, **common)
+    about = {name: rows[0][name] for name in ("env", "sim", "model", "planner", "condition")} | common
+    rows += [dict(about, metric=name, value=value, unit=UNITS.get(name, "")) for name, value in took.items()]
     path = arguments.out or run.metrics / "peers_pets.csv"
     table(path, rows)
     print(path)
