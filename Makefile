@@ -5,17 +5,18 @@ VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
-.PHONY: help collect train control test lint clean
+.PHONY: help collect train predict control test lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
 	@echo "make collect   collect data      (notebooks/01_collect.ipynb)"
 	@echo "make train     train the models  (notebooks/02_train.ipynb)"
+	@echo "make predict   who predicts best    (notebooks/03_predict.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
-collect train control: $(READY)
+collect train predict control: $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)

@@ -96,7 +96,7 @@ def uses() -> dict[str, set[str]]:
     return {name: needs - {name} for name, needs in found.items()}
 
 
-PICTURES = {"style", "diagrams", "film", "plan_figures", "figures"}
+PICTURES = {"style", "diagrams", "film", "plan_figures", "predict_figures", "figures"}
 ALONE = {"envs", "rewards", "nets", "trajectory", "style"}
 
 
@@ -106,14 +106,14 @@ def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
 
 def test_figures_know_nothing_but_figures() -> None:
     needs = uses()
-    for name in ("diagrams", "film", "plan_figures"):
+    for name in ("diagrams", "film", "plan_figures", "predict_figures"):
         assert needs[name] == {"style"}, name
     assert needs["figures"] <= PICTURES
 
 
 def test_what_computes_draws_nothing() -> None:
     for name, needs in uses().items():
-        if name not in PICTURES | {"report"}:
+        if name not in PICTURES | {"report", "scoreboard"}:
             assert not needs & PICTURES, name
 
 

@@ -229,7 +229,7 @@ def _new(model: str, data: Trajectories) -> Any:
 def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluate.Scores:
     """``evaluate.score`` of a trained model on test episodes: open loop, or ``segments`` from the true past.
 
-    Smoke 8 episodes and samples, laptop 200 episodes and 32 samples, paper 1,000 and 100. Scores are kept in the run's
+    Smoke 8 episodes and samples, laptop 200 episodes and 32 samples, paper 1,000 and 50. Scores are kept in the run's
     folder and found again as long as weights, data and sizes are the same.
     """
     net, _ = load_or_train(run, env, model)
@@ -237,7 +237,7 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
     test, held_out = (
         data.take(slice(run.pick(smoke=8, laptop=200, paper=n))) for data, n in ((test, 1000), (held_out, 200))
     )
-    samples = run.pick(smoke=8, laptop=32, paper=100) if getattr(net, "stochastic", True) else 100
+    samples = run.pick(smoke=8, laptop=32, paper=50)  # of a model without samples: noisy copies
     path = run.folder(f"scores/{short(env)}") / f"{model}{'-segments' * segments}.safetensors"
     made_from = {
         "weights": store.digest(net.state_dict()), "samples": samples, "seed": run.seed,
