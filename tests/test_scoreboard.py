@@ -1,0 +1,128 @@
+"""Rows of the scoreboard say what the scores say, and pairs, curves and tables say what the rows say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tsmlib import evaluate, scoreboard, study
+from tsmlib.runs import Run
+
+ENV = "tsm/ReacherPush-v0"
+N, T, D = 6, 90, 4
+
+
+def scores(n: int, steps: int, level: float = 0.0) -> evaluate.Scores:
+    """Scores that grow by one per step, from ``level`` on; the truth lies at the median."""
+    ramp = level + torch.arange(1.0, steps + 1).expand(n, -1)
+    values = {metric: ramp.clone() for metric in ("ll_paper", "energy_score_noise")} | {"squared_error": ramp.square()}
+    fitted = evaluate.Fitted(0.1, 0.1, torch.ones(steps, D), torch.ones(steps, D), 0.1)
+    outside = torch.zeros(n)
+    outside[0] = 0.5
+    return evaluate.Scores(values, torch.full((n, steps, D), 0.5), outside, fitted)
+
+
+@pytest.fixture(scope="module")
+def found() -> list[dict]:
+    test = study.random_data(ENV, N, seed=0)
+    rows = []
+    for seed in (0, 1, 2):
+        for model, level in (("tsm", 0.0), ("lstm", 10.0 + seed)):
+            pair = scores(N, T, level), scores(N * len(scoreboard.SEGMENTS), 10, level)
+            rows += scoreboard.rows(ENV, model, *pair, test, seed=seed, scale="smoke")
+    return rows
+
+
+def test_a_row_without_horizon_is_the_mean_over_all_steps(found: list[dict]) -> None:
+    assert scoreboard.values(found, "ll_paper", env=ENV)["tsm"] == pytest.approx([45.5] * 3)
+    steps = torch.arange(1.0, 91)
+    assert scoreboard.values(found, "nrmse", env=ENV)["tsm"][0] == pytest.approx(steps.square().mean().sqrt().item())
+    assert scoreboard.values(found, "ll_paper", env=ENV, condition="segments")["tsm"] == pytest.approx([5.5] * 3)
+
+
+def test_a_row_with_a_horizon_is_the_score_at_that_step(found: list[dict]) -> None:
+    for h in scoreboard.HORIZONS:
+        assert scoreboard.values(found, "ll_paper", env=ENV, horizon=h)["lstm"] == pytest.approx(
+            [10 + h, 11 + h, 12 + h]
+        )
+
+
+def test_contact_rows_average_from_the_first_touch_on(found: list[dict]) -> None:
+    test = study.random_data(ENV, N, seed=0)
+    after = evaluate.after_first(scoreboard.touches(test, scores(N, T)))
+    assert after.any()
+    assert not after.all()
+    expected = torch.arange(1.0, 91).expand(N, -1)[after].mean().item()
+    assert scoreboard.values(found, "ll_paper", env=ENV, condition="contact")["tsm"] == pytest.approx([expected] * 3)
+    (n,) = {row["n"] for row in found if row["condition"] == "contact"}
+    assert n == int(after.any(1).sum())
+
+
+def test_the_share_of_diverged_rollouts_is_a_row(found: list[dict]) -> None:
+    assert scoreboard.values(found, "diverged", env=ENV)["tsm"] == pytest.approx([0.5 / N] * 3)
+
+
+def test_differences_are_paired_by_seed(found: list[dict]) -> None:
+    difference = scoreboard.paired(found, "tsm", "ll_paper", env=ENV)
+    assert list(difference) == ["lstm"]
+    np.testing.assert_allclose(difference["lstm"], [-10, -11, -12])
+    fewer = [row for row in found if (row["model"], row["seed"]) != ("tsm", 1)]
+    np.testing.assert_allclose(scoreboard.paired(fewer, "tsm", "ll_paper", env=ENV)["lstm"], [-10, -12])
+
+
+def test_curves_pass_through_the_rows(found: list[dict]) -> None:
+    curves = scoreboard.curves(found, "ll_paper", env=ENV)
+    assert curves["lstm"].shape == (3, 90)
+    np.testing.assert_allclose(curves["tsm"][0], np.arange(1, 91), rtol=1e-6)
+
+
+def test_a_truth_at_the_median_is_within_every_central_interval(found: list[dict]) -> None:
+    np.testing.assert_allclose(scoreboard.calibration(found, env=ENV)["tsm"], 1.0)
+
+
+def test_the_table_gives_mean_and_half_of_the_interval(found: list[dict]) -> None:
+    table = scoreboard.board(found, ("ll_paper",), env=ENV, horizons=(10,))
+    half = 4.303 * 1 / math.sqrt(3)
+    assert table.splitlines()[0] == "| model | ll_paper at 10 |"
+    assert f"| lstm | 21 ± {half:.2g} |" in table
+    one = [row for row in found if row["seed"] == 0]
+    assert "| lstm | 20 |" in scoreboard.board(one, ("ll_paper",), env=ENV, horizons=(10,))
+
+
+def test_an_arm_alone_has_no_rows_of_contact() -> None:
+    env = "tsm/Reacher-v0"
+    test = study.random_data(env, 2, seed=0)
+    rows = scoreboard.rows(env, "tsm", scores(2, T), scores(18, 10), test, seed=0, scale="smoke")
+    assert {row["condition"] for row in rows} == {"clean", "segments"}
+
+
+# Scores at a scale ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return Run("03_predict", "smoke", 0, tmp_path_factory.mktemp("run"))
+
+
+@pytest.mark.parametrize("model", ["lstm", "ensemble"])
+@pytest.mark.parametrize("segments", [False, True])
+def test_scores_are_found_again_as_they_were(run: Run, model: str, segments: bool, monkeypatch) -> None:
+    first = study.scores(run, ENV, model, segments=segments)
+    monkeypatch.setattr(evaluate, "score", None)  # nothing is computed again
+    second = study.scores(run, ENV, model, segments=segments)
+    assert first.values.keys() == second.values.keys()
+    assert all(torch.equal(first.values[metric], second.values[metric]) for metric in first.values)
+    assert torch.equal(first.pit, second.pit)
+    assert torch.equal(first.outside, second.outside)
+    assert math.isclose(first.fitted.shared, second.fitted.shared, rel_tol=1e-6)
+    assert torch.equal(first.fitted.own, second.fitted.own)
+
+
+def test_scores_of_other_weights_are_not_taken(run: Run) -> None:
+    before = study.scores(run, ENV, "lstm").values["ll_paper"]
+    (run.models / study.short(ENV) / "lstm.safetensors").unlink()
+    other = Run(run.notebook, run.scale, 1, run.dir)  # another seed trains other weights into the same folder
+    assert not torch.equal(study.scores(other, ENV, "lstm").values["ll_paper"], before)
