@@ -4,7 +4,7 @@ Conditions, in the table's column of that name:
 
     clean              open loop from the first H observed steps to the end of the episode, all test episodes
     contact            the same, from the first touch of arm and obstacle or object on
-    segments           H steps from the true past, from everywhere (what the model defines)
+    segments           H steps from the true past, three to an episode (what the model defines)
     segments contact   the same, segments with a touch in them
 
 A row with an empty horizon is the mean over all predicted steps, the paper's "per timestep".
@@ -24,7 +24,7 @@ from tsmlib.evaluate import LEVELS, Scores, after_first, contact_steps, cut
 from tsmlib.style import interval
 from tsmlib.trajectory import Trajectories
 
-SEGMENTS = range(10, 100, 10)  # where the segments scored from the true past begin
+SEGMENTS = range(10, 100, 30)  # steps at which the segments that are scored from the true past begin
 HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
 Rows = Sequence[Mapping[str, Any]]
