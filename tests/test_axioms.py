@@ -64,6 +64,7 @@ MODELS = {
     "tsm, obstacle": Case(
         lambda dx: TSM(dx, DU, head_channels=16, **SMALL), state_dim=10, constant=(6, 7, 8, 9), **SAME
     ),
+    "tsm, direct": Case(lambda dx: TSM(dx, DU, direct_channels=16, **SMALL), **SAME),
     "onestep": Case(
         lambda dx: OneStep(dx, DU, hidden=16, layers=2), stochastic=False,
         losses=(("loss", ()), ("multi_step_loss", ())),

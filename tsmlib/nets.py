@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -85,6 +86,7 @@ class CausalDecoder(nn.Module):
         *,
         channels: int = 32,
         head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
+        direct_channels: int = 0,  # two 1x1 layers that see the inputs beside the stack's output, in its place; 0: none
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
     ) -> None:
         super().__init__()
@@ -92,13 +94,19 @@ class CausalDecoder(nn.Module):
         self.dilations = dilations
         self.layers = nn.ModuleList(GatedLayer(channels) for _ in dilations)
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
-        head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
-        self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
+        self.direct = bool(direct_channels)
+        if direct_channels:
+            widths = [channels + input_dim, direct_channels, direct_channels]
+            inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
+            self.head = nn.Sequential(*inner, nn.Linear(direct_channels, output_dim))
+        else:
+            head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
+            self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
 
     def forward(self, inputs: Tensor, z: Tensor) -> Tensor:
         """(B, P, input_dim), (B, dz) -> (B, P, output_dim)."""
         _, total = self._parallel(inputs, z, len(self.layers))
-        return self.head(total)
+        return self._out(total, inputs)
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
@@ -116,7 +124,10 @@ class CausalDecoder(nn.Module):
             window.append(s)
             s, skip = layer(window.pop(0), s, code)
             total = skip if total is None else total + skip
-        return self.head(total)
+        return self._out(total, inputs)
+
+    def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
+        return self.head(torch.cat([total, inputs], dim=-1) if self.direct else total)
 
     def _parallel(self, inputs: Tensor, z: Tensor, n_layers: int) -> tuple[list[Tensor], Tensor]:
         """The inputs of the first ``n_layers`` layers and of the one after them, and the sum of their skips."""

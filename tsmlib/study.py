@@ -44,7 +44,7 @@ SPLITS = ("train", "validation", "test")
 CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows a + is an option of the class
     "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
 }  # fmt: skip
-DYNAMICS = ("tsm", "tsm+energy", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")  # what 03 compares
+DYNAMICS = ("tsm", "tsm+energy", "tsm+energy+direct", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
 MODELS = (*DYNAMICS, "tsm+teacher", "prior")
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80, "ReacherObstacle": 120, "ReacherPush": 290,
@@ -130,8 +130,9 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     """How a model is trained: every dynamics model of an environment for about the same time on one core.
 
     tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
-    error and KL, or by the energy score. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step
-    ahead. multistep, lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
+    error and KL, or by the energy score. tsm+energy+direct: the same with a head that sees the state itself, over a
+    narrower stack. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step ahead. multistep,
+    lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":
         return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
@@ -147,6 +148,7 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     return {
         "tsm": [teacher, stage("loss", 10.5 if wide else 16, **free)],
         "tsm+energy": [teacher, stage("energy_loss", 6.9 if wide else 11, **free)],
+        "tsm+energy+direct": [stage("teacher_forced_loss", 26, 0.25, future_len=10), stage("energy_loss", 9.1, **free)],
         "tsm+teacher": [stage("teacher_forced_loss", 20 if wide else 30, future_len=10)],
         "onestep": [stage("loss", 36)],
         "multistep": [stage("multi_step_loss", 21)],
@@ -216,7 +218,9 @@ def _new(model: str, data: Trajectories) -> Any:
         return ActionPrior(actions.shape[2]).fit_scale(torch.from_numpy(actions))
     kind, _, option = model.partition("+")
     options: dict[str, Any] = {"gaussian": option != "mse"} if kind == "ensemble" else {}
-    if kind == "tsm" and has_block(data.env):
+    if kind == "tsm" and option.endswith("direct"):
+        options = dict(channels=32, direct_channels=200)
+    elif kind == "tsm" and has_block(data.env):
         options = dict(channels=64, head_channels=128)  # appendix A.1
     net = CLASSES[kind](states.shape[2], actions.shape[2], angles=data.angles, **options)
     net.features.fit(torch.from_numpy(states))

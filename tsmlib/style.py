@@ -32,6 +32,7 @@ WIDTH = 7.0  # inches: the text width of a two-column journal page
 COLOURS = {
     "tsm": "#0072B2",
     "tsm+energy": "#56B4E9",
+    "tsm+energy+direct": "#003C8F",
     "tsm+teacher": "#1B2A5C",
     "onestep": "#E69F00",
     "multistep": "#D55E00",
@@ -47,6 +48,7 @@ COLOURS = {
 NAMES = {
     "tsm": "TSM",
     "tsm+energy": "TSM + energy",
+    "tsm+energy+direct": "TSM + energy + direct",
     "tsm+teacher": "TSM, teacher forcing only",
     "onestep": "one-step",
     "multistep": "multi-step",

@@ -45,13 +45,15 @@ class TSM(nn.Module):
         latent_dim: int = 8,  # section 5.1
         channels: int = 32,
         head_channels: int = 0,
+        direct_channels: int = 0,
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),  # receptive field 20 = 2 H
         beta: float = 1.0,
     ) -> None:
         super().__init__()
         self._config = dict(
             state_dim=state_dim, action_dim=action_dim, angles=list(angles), segment_len=segment_len,
-            latent_dim=latent_dim, channels=channels, head_channels=head_channels, dilations=list(dilations), beta=beta,
+            latent_dim=latent_dim, channels=channels, head_channels=head_channels, direct_channels=direct_channels,
+            dilations=list(dilations), beta=beta,
         )  # fmt: skip
         self.segment_len = self.past_len = segment_len
         self.latent_dim = latent_dim
@@ -60,7 +62,7 @@ class TSM(nn.Module):
         self.encoder = Encoder(self.features.dim, segment_len, latent_dim)
         self.decoder = CausalDecoder(
             self.features.dim + action_dim, state_dim, latent_dim,
-            channels=channels, head_channels=head_channels, dilations=tuple(dilations),
+            channels=channels, head_channels=head_channels, direct_channels=direct_channels, dilations=tuple(dilations),
         )  # fmt: skip
 
     def config(self) -> dict[str, Any]:
