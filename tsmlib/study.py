@@ -148,7 +148,10 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     return {
         "tsm": [teacher, stage("loss", 10.5 if wide else 16, **free)],
         "tsm+energy": [teacher, stage("energy_loss", 6.9 if wide else 11, **free)],
-        "tsm+energy+direct": [stage("teacher_forced_loss", 26, 0.25, future_len=10), stage("energy_loss", 9.1, **free)],
+        "tsm+energy+direct": [
+            stage("teacher_forced_loss", 26, 0.4, future_len=10),
+            stage("energy_loss", 8, 0.6, lr=2e-3, batch=128),
+        ],
         "tsm+teacher": [stage("teacher_forced_loss", 20 if wide else 30, future_len=10)],
         "onestep": [stage("loss", 36)],
         "multistep": [stage("multi_step_loss", 21)],
