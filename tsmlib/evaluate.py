@@ -119,19 +119,6 @@ def score(
     return Scores(values, torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts]), fitted)
 
 
-def scores(
-    samples: Tensor, truth: Tensor, validation: tuple[Tensor, Tensor]
-) -> tuple[dict[str, Tensor], dict[str, float]]:
-    """Every score of ``predict``'s samples against the horizon, metric -> (T,), and the two fitted scalar variances.
-
-    validation: samples and truth of the validation set. ``score`` does the same without holding all samples.
-    """
-    fitted, generator = fit(*validation, copies=len(samples)), _generator(2, 0)
-    values, pit = measure(samples, truth, fitted, len(samples), generator)
-    curves = Scores(values, pit, torch.zeros(len(truth)), fitted).against_horizon()
-    return curves, {"floor": fitted.floor, "shared": fitted.shared}
-
-
 # Samples -------------------------------------------------------------------------------------------------------------
 
 

@@ -46,6 +46,7 @@ CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows
 }  # fmt: skip
 DYNAMICS = ("tsm", "tsm+energy", "tsm+energy+direct", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
 MODELS = (*DYNAMICS, "tsm+teacher", "prior")
+OURS = tuple(word for word in MODELS if word.startswith(("tsm", "prior")))  # what 02 trains and looks at
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80, "ReacherObstacle": 120, "ReacherPush": 290,
     "PymunkReacher": 40, "PymunkObstacle": 40, "PymunkPush": 60,
