@@ -493,6 +493,4 @@ def test_a_step_touches_if_the_arm_is_at_the_block_before_or_after_it() -> None:
     steps = evaluate.contact_steps(states, "tsm/ReacherPush-v0")
     assert steps.tolist() == [[False, True, True, False]]
     assert evaluate.after_first(steps).tolist() == [[False, True, True, True]]
-    assert evaluate.any_in_segment(steps, 2).tolist() == [[True, True, True, True]]
-    assert evaluate.any_in_segment(steps, 3).tolist() == [[True, True, True, False]]
     assert evaluate.cut(steps, (0, 2), 2).tolist() == [[False, True], [True, False]]

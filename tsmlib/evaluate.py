@@ -377,11 +377,6 @@ def after_first(steps: Tensor) -> Tensor:
     return steps.cummax(1).values
 
 
-def any_in_segment(steps: Tensor, segment_len: int = 10) -> Tensor:
-    """(N, T) bool -> (N, T) bool: there is one in the same segment of ``segment_len`` steps."""
-    return torch.cat([part.any(1, keepdim=True).expand_as(part) for part in steps.split(segment_len, dim=1)], dim=1)
-
-
 def _generator(*key: int) -> torch.Generator:
     """Random numbers of their own for every key; seeds that differ by a sum could meet."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
