@@ -326,7 +326,7 @@ def freeze_tasks() -> None:
 def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Trial:
     """Plan with one method and execute open loop in the true simulator.
 
-    model: tsm, tsm+energy, or oracle (the true simulator), or none. planner: adam (from zero, as the paper),
+    model: any of DYNAMICS, or oracle (the true simulator), or none. planner: adam (from zero, as the paper),
     adam+starts (from the best of sampled candidates), cem; with model none: random or zero torques. prior: codes
     (Eq. 3) or actions (Eq. 2). iterations: of the planner; 0 means the scale's default.
     """
