@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib import figures, predict_figures, style
+from tsmlib import axes, figures, gallery, predict_figures, style
 
 MODELS = ("tsm", "tsm+energy", "tsm+teacher", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
@@ -41,6 +41,10 @@ def episodes(*models: str) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str,
 
 def texts(figure: Figure) -> str:
     return "\n".join(text.get_text() for ax in figure.axes for text in ax.texts)
+
+
+def below(figure: Figure) -> str:
+    return " ".join(ax.get_xlabel() for ax in figure.axes).replace("\n", " ")
 
 
 def lines(ax: Axes, model: str) -> list[plt.Line2D]:
@@ -74,13 +78,14 @@ def test_every_figure_is_laid_out_without_warnings_and_none_is_left_open(name: s
 
 
 def test_every_figure_of_predictions_is_tested_and_reached_from_figures() -> None:
-    public = {name for name, value in vars(predict_figures).items() if getattr(value, "__wrapped__", None)}
+    modules = vars(predict_figures) | vars(gallery)
+    public = {name for name, value in modules.items() if getattr(value, "__wrapped__", None)}
     assert public == {name.partition(",")[0] for name in EVERY}
-    assert all(getattr(figures, name) is getattr(predict_figures, name) for name in public)
+    assert all(getattr(figures, name) is modules[name] for name in public)
 
 
 def test_every_model_has_its_colour_and_marker_in_every_figure() -> None:
-    assert len({style.COLOURS[m] for m in MODELS}) == len({predict_figures.MARKERS[m] for m in MODELS}) == len(MODELS)
+    assert len({style.COLOURS[m] for m in MODELS}) == len({axes.MARKERS[m] for m in MODELS}) == len(MODELS)
     for name in ("figure5", "against_horizon", "calibration", "gallery, tip"):
         figure = EVERY[name]()
         assert all(any(lines(ax, m) for ax in figure.axes) for m in MODELS), name
@@ -110,39 +115,44 @@ def test_figure5_keeps_the_place_of_a_model_that_one_environment_lacks() -> None
 def test_a_diverged_model_leaves_the_others_readable_and_its_value_in_words() -> None:
     good = scores("tsm", "tsm+energy", "lstm")
     figure = figures.figure5({"push": good | {"onestep": np.array([-1e5, -2e5, -3e5]), "ensemble": [5.0, 5, 300]}})
-    assert "mean −2.0×10⁵" in texts(figure)
-    assert "mean 103" in texts(figure)
-    ends = figure.axes[0].get_ylim()
+    assert below(figure).startswith("outside: push, one-step −2.0×10⁵ ± 2.5×10⁵ push, ensemble (Gaussian) 103 ± ")
+    low, high = figure.axes[0].get_ylim()
     seen = np.concatenate(list(good.values()))
-    assert ends[0] < seen.min() < seen.max() < ends[1]
-    assert np.ptp(ends) < 20
-    assert all(tick >= -20 for tick in figure.axes[0].get_yticks())
+    assert low < seen.min() < seen.max() < high < low + 20
+    assert {"v", "^"} <= {line.get_marker() for line in lines(figure.axes[0], "onestep")}  # its interval leaves twice
 
 
-def test_a_value_beyond_the_scale_is_noted_and_one_within_it_is_not() -> None:
-    inside = figures.figure5({"push": scores("tsm", "lstm", "multistep")})
-    assert texts(inside) == ""
-    low, high = inside.axes[0].get_ylim()
-    seeds = np.concatenate(list(scores("tsm", "lstm", "multistep").values()))
-    assert low < seeds.min() < seeds.max() < high
+def test_what_lies_within_the_axis_is_not_told() -> None:
+    seen = scores("tsm", "lstm", "multistep")
+    figure = figures.figure5({"push": seen})
+    low, high = figure.axes[0].get_ylim()
+    assert low < np.concatenate(list(seen.values())).min() < np.concatenate(list(seen.values())).max() < high
+    assert below(figure) == ""
+    assert below(figures.against_horizon({"push": curves("tsm", "lstm")}, "NRMSE")) == "steps ahead"
+    assert below(figures.differences({"push": seen}, "nats")) == "nats"
 
 
-def test_a_diverged_curve_is_cut_with_an_arrow_and_its_furthest_value() -> None:
+def test_environments_whose_scores_lie_apart_share_an_axis() -> None:
+    points = np.concatenate([-12.5 + noise(14), -19 + noise(7)])
+    low, high = axes.limits(points, points)
+    assert low < points.min() < points.max() < high
+
+
+def test_a_diverged_curve_ends_in_an_arrow_and_its_furthest_value_in_words() -> None:
     rows = curves("tsm", "lstm", "multistep") | {"onestep": np.exp(np.arange(30.0))[None]}
     figure = figures.against_horizon({"push": rows}, "NRMSE")
-    assert texts(figure).strip() == "one-step to 3.9×10¹²"
+    assert below(figure) == "steps ahead outside: one-step to 3.9×10¹²"
     assert figure.axes[0].get_ylim()[1] < 50
-    arrows = [text for text in figure.axes[0].texts if getattr(text, "arrow_patch", None)]
-    assert len(arrows) == 1
-    shown = figures.against_horizon({"push": curves("tsm", "lstm")}, "NRMSE")
-    assert texts(shown) == ""
+    (arrow,) = (line for line in lines(figure.axes[0], "onestep") if line.get_marker() == "^")
+    assert arrow.get_ydata() == figure.axes[0].get_ylim()[1]
 
 
-def test_a_band_that_leaves_the_axis_is_told_too() -> None:
-    rows = curves("tsm", "lstm", "multistep") | {"onestep": np.array([[1.0], [2.0], [9.0]]) * np.ones(30)}
-    text = texts(figures.against_horizon({"push": rows}, "NRMSE"))
-    mean, half = style.interval(np.array([1.0, 2.0, 9.0]))
-    assert f"one-step, band to −{abs(mean - half):.3g}" in text
+@pytest.mark.parametrize(("low", "high"), [(1.1, 1.9), (0.3, 2), (0.01, 5), (1e-3, 1e6)])
+def test_a_logarithmic_axis_has_some_ticks_and_not_too_many(low: float, high: float) -> None:
+    ax = Figure().add_subplot()
+    axes.log_axis(ax, low, high)
+    ax.set_ylim(low, high)
+    assert 2 <= sum(low <= tick <= high for tick in ax.get_yticks()) <= 10
 
 
 def test_the_mean_over_seeds_is_drawn_against_steps_from_one() -> None:
@@ -184,9 +194,9 @@ def test_zero_is_always_in_sight() -> None:
     assert low < 0 < 7.1 < high
 
 
-def test_a_diverged_difference_is_told_beside_its_row() -> None:
+def test_a_diverged_difference_is_told_below() -> None:
     values = scores("lstm", "ensemble", "multistep") | {"onestep": np.array([1e5, 1e5, 1e5])}
-    assert "mean 10⁵" in texts(figures.differences({"push": values}, "nats"))
+    assert "outside: one-step 10⁵" in below(figures.differences({"push": values}, "nats"))
 
 
 def test_the_gallery_shows_best_median_and_worst_by_energy_score() -> None:
@@ -220,7 +230,7 @@ def test_samples_that_leave_the_picture_are_counted() -> None:
     [(0, "0"), (0.5, "0.5"), (-12.34, "−12.3"), (1234.5, "1234"), (-123456, "−1.2×10⁵"), (1e-5, "10⁻⁵")],
 )
 def test_numbers_in_words(value: float, text: str) -> None:
-    assert predict_figures._spell(value) == text
+    assert axes.spell(value) == text
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def uses() -> dict[str, set[str]]:
     return {name: needs - {name} for name, needs in found.items()}
 
 
-PICTURES = {"style", "diagrams", "film", "plan_figures", "predict_figures", "figures"}
+PICTURES = {"style", "axes", "diagrams", "film", "plan_figures", "predict_figures", "gallery", "figures"}
 ALONE = {"envs", "rewards", "nets", "trajectory", "style"}
 
 
@@ -106,8 +106,10 @@ def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
 
 def test_figures_know_nothing_but_figures() -> None:
     needs = uses()
-    for name in ("diagrams", "film", "plan_figures", "predict_figures"):
+    for name in ("diagrams", "film", "plan_figures", "axes"):
         assert needs[name] == {"style"}, name
+    for name in ("predict_figures", "gallery"):
+        assert needs[name] == {"axes", "style"}, name
     assert needs["figures"] <= PICTURES
 
 

@@ -27,8 +27,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from tsmlib.diagrams import figure1, figure2, figure3  # noqa: F401
 from tsmlib.film import embed, side_by_side, video  # noqa: F401
+from tsmlib.gallery import gallery  # noqa: F401
 from tsmlib.plan_figures import figure6, plan_actions, plan_strip, predicted_vs_true  # noqa: F401
-from tsmlib.predict_figures import against_horizon, calibration, differences, figure5, gallery  # noqa: F401
+from tsmlib.predict_figures import against_horizon, calibration, differences, figure5  # noqa: F401
 from tsmlib.style import (  # noqa: F401
     COLOURS,
     WIDTH,
