@@ -21,8 +21,8 @@ from tsmlib.style import COLOURS, colour, interval, legend, name, shaped, tint, 
 
 Values = Mapping[str, Mapping[str, np.ndarray]]  # panel or environment -> label -> array
 
-MARKERS = {"tsm": "o", "tsm+energy": "D", "tsm+energy+direct": "*", "tsm+teacher": "p", "onestep": "s", "multistep": "^", "lstm": "v",
-           "ensemble": "P", "ensemble+mse": "X"}  # fmt: skip
+MARKERS = {"tsm": "o", "tsm+energy": "D", "tsm+energy+direct": "*", "tsm+teacher": "p", "onestep": "s",
+           "multistep": "^", "lstm": "v", "ensemble": "P", "ensemble+mse": "X"}  # fmt: skip
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
