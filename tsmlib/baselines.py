@@ -192,7 +192,7 @@ class Ensemble(nn.Module):
         if generator is None:
             x, states = past.states[:, -1], []
             for u in actions.unbind(1):
-                mean, _ = self.increments(*(part.expand(self.members, -1, -1) for part in (x, u)))
+                mean, _ = self.increments(x.expand(self.members, -1, -1), u.expand(self.members, -1, -1))
                 x = x + self.features.step_std * mean.mean(0)
                 states.append(x)
             return torch.stack(states, dim=1)
@@ -203,8 +203,8 @@ class Ensemble(nn.Module):
         predicted = actions.new_empty(rows, steps, dx)
         for m in range(self.members):
             mine = (member == m).nonzero()[:, 0]
-            states = self._by_member(m, past.states[mine, -1], actions[mine], noise[mine])
-            predicted = predicted.index_put((mine,), states)
+            own = self._by_member(m, past.states[mine, -1], actions[mine], noise[mine])
+            predicted = predicted.index_put((mine,), own)
         return predicted
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -119,7 +120,7 @@ class CausalDecoder(nn.Module):
     def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
         """One position: (B, input_dim) and ``self.codes(z)`` -> (B, output_dim). Moves ``cache`` one position on."""
         s = self.inlet(inputs)  # (B, C)
-        total = None
+        total: Any = None
         for layer, code, window in zip(self.layers, codes.chunk(len(self.layers), dim=-1), cache, strict=True):
             window.append(s)
             s, skip = layer(window.pop(0), s, code)
