@@ -328,7 +328,7 @@ def test_residual_noise_makes_a_forecast_of_a_point() -> None:
     truth = 0.3 * normal(3000, 2, 1)
     point = torch.zeros(1, 3000, 2, 1)
     fitted = evaluate.fit(point, truth, copies=200)
-    assert math.sqrt(fitted.noise) == pytest.approx(0.3, rel=0.25)  # the next one of the grid
+    assert fitted.noise.sqrt().median() == pytest.approx(0.3, rel=0.25)  # the next one of the grid
     scores = measured(point, truth, fitted, copies=200)
     assert scores["energy_score"].mean() == pytest.approx(0.3 * math.sqrt(2 / math.pi), rel=0.02)  # E|x|
     for metric in ("energy_score_noise", "crps_noise"):
@@ -336,9 +336,9 @@ def test_residual_noise_makes_a_forecast_of_a_point() -> None:
 
 
 def test_samples_that_are_right_get_no_noise_and_narrow_ones_get_what_they_lack(fitted: Fitted) -> None:
-    assert math.sqrt(fitted.noise) < 0.15  # the system's own noise builds up to 0.3 .. 0.7
+    assert fitted.noise.sqrt().median() < 0.15  # the system's own noise builds up to 0.3 .. 0.7
     samples, truth = 0.8 * normal(60, 3000, 1, 2), normal(3000, 1, 2, seed=1)
-    assert math.sqrt(evaluate.fit_noise(samples, truth, copies=60)) == pytest.approx(0.6, rel=0.25)
+    assert evaluate.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
 
 
 # Coverage ------------------------------------------------------------------------------------------------------------
@@ -351,7 +351,7 @@ def test_the_truth_lies_within_the_interval_as_often_as_stated(values: dict[str,
 
 @pytest.mark.parametrize("count", [19, 200])
 def test_few_samples_cover_as_often_as_many(count: int) -> None:
-    pit = evaluate.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1))
+    pit = evaluate.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
     for level in evaluate.LEVELS:
         assert evaluate.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
 
@@ -359,7 +359,7 @@ def test_few_samples_cover_as_often_as_many(count: int) -> None:
 def test_overconfidence_shows(predicted: tuple[Tensor, Tensor]) -> None:
     samples, truth = predicted
     centre = samples.mean(0)
-    pit = evaluate.rank(centre + 0.5 * (samples - centre), truth)
+    pit = evaluate.rank(centre + 0.5 * (samples - centre), truth, torch.Generator())
     inside = math.erf(0.5 * 1.2816 / math.sqrt(2))  # of the 80 % interval at half the width
     assert evaluate.coverage(pit, 0.8).mean() == pytest.approx(inside, abs=0.02)
 
@@ -382,11 +382,11 @@ def test_scoring_block_by_block_is_scoring_all_samples_at_once(model: Linear) ->
     scores = run(model, episodes(21))
     samples, truth = draw(model, episodes(21), samples=20)
     whole, pit = evaluate.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(scores.pit, pit)
+    torch.testing.assert_close(scores.pit, pit, rtol=0, atol=1 / 21)  # ranks are drawn between two samples
     assert set(scores.values) == set(whole)
     for metric, value in scores.values.items():
         assert value.shape == (21, HORIZON)
-        if metric.endswith("_noise"):  # drawn anew in each block
+        if metric.endswith("_noise") or metric.startswith("coverage"):  # drawn anew in each block
             assert value.mean() == pytest.approx(whole[metric].mean().item(), rel=0.1)
         else:
             torch.testing.assert_close(value, whole[metric])

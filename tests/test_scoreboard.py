@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import evaluate, scoreboard, study
+from tsmlib import evaluate, scoreboard, store, study
 from tsmlib.runs import Run
 
 ENV = "tsm/ReacherPush-v0"
@@ -57,8 +57,9 @@ def test_contact_rows_average_from_the_first_touch_on(found: list[dict]) -> None
     assert not after.all()
     expected = torch.arange(1.0, 91).expand(N, -1)[after].mean().item()
     assert scoreboard.values(found, "ll_paper", env=ENV, condition="contact")["tsm"] == pytest.approx([expected] * 3)
-    (n,) = {row["n"] for row in found if row["condition"] == "contact"}
-    assert n == int(after.any(1).sum())
+    n = {row.get("horizon", ""): row["n"] for row in found if row["condition"] == "contact"}
+    assert n[""] == n[90] == int(after.any(1).sum())
+    assert n.get(1, 0) == int(after[:, 0].sum())
 
 
 def test_the_share_of_diverged_rollouts_is_a_row(found: list[dict]) -> None:
@@ -95,7 +96,9 @@ def test_the_table_gives_mean_and_half_of_the_interval(found: list[dict]) -> Non
 def test_an_arm_alone_has_no_rows_of_contact() -> None:
     env = "tsm/Reacher-v0"
     test = study.random_data(env, 2, seed=0)
-    rows = scoreboard.rows(env, "tsm", scores(2, T), scores(18, 10), test, seed=0, scale="smoke")
+    rows = scoreboard.rows(
+        env, "tsm", scores(2, T), scores(2 * len(scoreboard.SEGMENTS), 10), test, seed=0, scale="smoke"
+    )
     assert {row["condition"] for row in rows} == {"clean", "segments"}
 
 
@@ -123,6 +126,34 @@ def test_scores_are_found_again_as_they_were(run: Run, model: str, segments: boo
 
 def test_scores_of_other_weights_are_not_taken(run: Run) -> None:
     before = study.scores(run, ENV, "lstm").values["ll_paper"]
-    (run.models / study.short(ENV) / "lstm.safetensors").unlink()
-    other = Run(run.notebook, run.scale, 1, run.dir)  # another seed trains other weights into the same folder
-    assert not torch.equal(study.scores(other, ENV, "lstm").values["ll_paper"], before)
+    path = run.models / study.short(ENV) / "lstm.safetensors"
+    net, header = study.load_or_train(run, ENV, "lstm")
+    with torch.no_grad():
+        net.out.bias += 0.1
+    store.save_model(path, net, {k: header[k] for k in ("fingerprint", "model", "seed", "scale", "curves", "seconds")})
+    assert not torch.equal(study.scores(run, ENV, "lstm").values["ll_paper"], before)
+
+
+def test_scores_of_another_version_are_not_taken(run: Run, monkeypatch) -> None:
+    study.scores(run, ENV, "ensemble")
+    monkeypatch.setattr(evaluate, "VERSION", evaluate.VERSION + 1)
+    monkeypatch.setattr(evaluate, "score", None)
+    with pytest.raises(TypeError):
+        study.scores(run, ENV, "ensemble")
+
+
+def test_at_scale_laptop_an_environment_that_is_not_published_shows_its_own_rows(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(study, "RESULTS", tmp_path)
+    row = dict(sim="mujoco", model="tsm", metric="nrmse", condition="clean", value=1.0, n=1, seed=0, scale="paper")
+    store.save_table(tmp_path / "03_predict.csv", [dict(row, env="tsm/Reacher-v0")])
+    own = [dict(row, env=env, value=2.0) for env in ("tsm/Reacher-v0", "tsm/PymunkPush-v0")]
+    drawn = study.evidence(Run("03_predict", "laptop", 0, tmp_path / "seed0"), own)
+    assert {r["env"]: r["value"] for r in drawn} == {"tsm/Reacher-v0": 1.0, "tsm/PymunkPush-v0": 2.0}
+    assert study.evidence(Run("03_predict", "smoke", 0, tmp_path / "seed0"), own) == own
+
+
+def test_at_scale_paper_the_other_seeds_are_drawn_too(tmp_path) -> None:
+    row = dict(env=ENV, sim="mujoco", model="tsm", metric="nrmse", condition="clean", value=1.0, n=1, scale="paper")
+    store.save_table(tmp_path / "seed1" / "metrics" / "03_predict.csv", [dict(row, seed=1)])
+    drawn = study.evidence(Run("03_predict", "paper", 0, tmp_path / "seed0"), [dict(row, seed=0)])
+    assert [r["seed"] for r in drawn] == [0, 1]

@@ -11,12 +11,12 @@ every model. Letters in shapes: S samples, N trajectories or segments, T predict
     ll_own              the model's own density: an equal mixture of Gaussians around its samples, whose one variance
                         per step and dimension is residual noise
     energy_score, crps  proper scores of the samples themselves; lower is better
-    ..._noise           the same after Gaussian residual noise, one scalar per model, was added to every sample
+    ..._noise           the same after Gaussian residual noise, one variance per step, was added to every sample
     squared_error       of the samples' mean, mean over dimensions; its root mean is the NRMSE
 
 A model that is deterministic says so by an attribute ``stochastic = False`` and is one sample. Then ll_paper is the
 paper's likelihood of its baselines, ll_own is ll_horizon, energy score and CRPS are distances, and the Gaussian of
-ll_shared takes the place of the samples in coverage. With residual noise it becomes S noisy copies.
+ll_horizon takes the place of the samples in coverage. With residual noise it becomes S noisy copies.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from tsmlib.envs import closest_gap
 from tsmlib.nets import Features
 from tsmlib.trajectory import Segment, Trajectories
 
+VERSION = 2  # raise it when a score changes: scores that are kept are found again only by the version that made them
 ROWS = 800  # samples times trajectories that are rolled out and scored at once
 SHIFTS = 4  # pairs (s, s + 1), ..., (s, s + 4) of samples estimate the spread E|X - X'|
 WORST = 1e6  # where a sample that is not finite, or beyond, is kept: it counts as worst, and every score stays finite
@@ -52,7 +53,7 @@ class Fitted:
     shared: float  # of ll_shared
     horizon: Tensor  # (T, D), of ll_horizon
     own: Tensor  # (T, D), of ll_own
-    noise: float  # of the ..._noise scores, where it is a residual variance
+    noise: Tensor  # (T,), of the ..._noise scores, where it is a residual variance
 
 
 @dataclass(frozen=True)
@@ -262,16 +263,19 @@ def fit_own(samples: Tensor, truth: Tensor, *, iterations: int = 30) -> Tensor:
     return torch.stack(variances)
 
 
-def fit_noise(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> float:
-    """The residual variance that minimises the energy score, from the squares of ``NOISE``, by at most 50 samples."""
+def fit_noise(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> Tensor:
+    """The residual variance (T,) that minimises each step's energy score, of the squares of ``NOISE``.
+
+    By at most 50 samples.
+    """
     few = samples[:50]
     noise = torch.randn((min(50, copies), *truth.shape), generator=_generator(3, seed))  # the same for every deviation
-    values = torch.zeros(len(NOISE))
+    values = torch.zeros(len(NOISE), truth.shape[1])
     for block in torch.arange(len(truth)).split(16):
         for index, deviation in enumerate(NOISE):
             noisy = few[:, block] + deviation * noise[:, block]
-            values[index] += distances(noisy, truth[block], shifts=2)[0].sum()
-    return float(NOISE[values.argmin()].square())
+            values[index] += distances(noisy, truth[block], shifts=2)[0].sum(0)
+    return NOISE[values.argmin(0)].square()
 
 
 # Scores --------------------------------------------------------------------------------------------------------------
@@ -284,11 +288,11 @@ def measure(
     mean = samples.mean(0)
     error = truth - mean
     if len(samples) == 1:
-        pit = torch.special.ndtr(error / math.sqrt(fitted.shared))
+        pit = torch.special.ndtr(error / fitted.horizon.sqrt())
     else:
-        pit = rank(samples, truth)
+        pit = rank(samples, truth, generator)
     noise = torch.randn((max(copies, len(samples)), *truth.shape), generator=generator)
-    noisy = noise.mul_(math.sqrt(fitted.noise)).add_(samples)
+    noisy = noise.mul_(fitted.noise.sqrt()[:, None]).add_(samples)
     values = {
         "ll_paper": gaussian(error, spread(samples) + fitted.floor),
         "ll_shared": gaussian(error, torch.tensor(fitted.shared)),
@@ -349,10 +353,13 @@ def distances(samples: Tensor, truth: Tensor, *, shifts: int = SHIFTS) -> tuple[
     return energy, crps
 
 
-def rank(samples: Tensor, truth: Tensor) -> Tensor:
-    """PIT values (N, T, D): the share of samples below the truth, uniform on [0, 1] if both are drawn alike."""
+def rank(samples: Tensor, truth: Tensor, generator: torch.Generator) -> Tensor:
+    """PIT values (N, T, D): where the truth falls among the samples, uniform on [0, 1] if both are drawn alike.
+
+    A place drawn at random between the two samples around the truth, so that this holds for few samples too.
+    """
     below = (len(samples) + (truth - samples).sign_().sum(0)) / 2  # a tie counts half
-    return (below + 0.5) / (len(samples) + 1)
+    return (below + torch.rand(below.shape, generator=generator)) / (len(samples) + 1)
 
 
 def coverage(pit: Tensor, level: float) -> Tensor:

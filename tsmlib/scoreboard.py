@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from tsmlib.control import sim_of
@@ -42,12 +43,17 @@ def rows(
         subsets["segments contact"] = (segments, touched.expand(-1, segments.pit.shape[1]))
     found = []
     for condition, (scores, where) in subsets.items():
+        n = torch.full((scores.pit.shape[1],), len(scores.outside)) if where is None else where.sum(0)  # at each step
+        if not n.any():
+            continue
         here = dict(common, condition=condition, n=len(scores.outside) if where is None else int(where.any(1).sum()))
         curves = scores.against_horizon(where)
         for metric, value in means(scores, where).items():
             found.append(dict(here, metric=metric, value=value))
-            steps = [h for h in HORIZONS if h <= len(curves[metric])] if scores is open_loop else []
-            found += [dict(here, metric=metric, horizon=h, value=float(curves[metric][h - 1])) for h in steps]
+            steps = [h for h in HORIZONS if h <= len(n) and n[h - 1]] if scores is open_loop else []
+            found += [
+                dict(here, metric=metric, horizon=h, value=float(curves[metric][h - 1]), n=int(n[h - 1])) for h in steps
+            ]
         if scores is open_loop:
             observed = scores.calibration(where)
             found += [
@@ -58,7 +64,7 @@ def rows(
         dict(common, condition="clean", n=len(open_loop.outside), metric="diverged", unit="share",
              value=float(open_loop.outside.mean()))
     )  # fmt: skip
-    return [row for row in found if math.isfinite(row["value"])]  # no episode had touched anything by that step
+    return found
 
 
 def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:

@@ -246,20 +246,22 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
         data.take(slice(run.pick(smoke=8, laptop=200, paper=n))) for data, n in ((test, 1000), (held_out, 200))
     )
     samples = run.pick(smoke=8, laptop=16, paper=32)  # of a model without samples: noisy copies
+    options: dict[str, Any] = {"horizon": 90}
+    if segments:
+        options = {"horizon": 10, "starts": list(scoreboard.SEGMENTS)}
     path = run.folder(f"scores/{short(env)}") / f"{model}{'-segments' * segments}.safetensors"
     made_from = {
-        "weights": store.digest(net.state_dict()), "samples": samples, "seed": run.seed,
-        "test": store.digest({"states": torch.from_numpy(test.states)}),
-        "validation": store.digest({"states": torch.from_numpy(held_out.states)}),
+        "version": evaluate.VERSION, "rows": evaluate.ROWS, "samples": samples, "seed": run.seed, **options,
+        "model": net.config(), "weights": store.digest(net.state_dict()),
+        **{split: store.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})
+           for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
     if path.exists() and store.read_header(path)["made_from"] == made_from:
         return _unpacked(*store.load(path, kind="scores"))
-    with torch.autocast("cpu", torch.bfloat16, enabled=model.startswith("tsm")):  # NRMSE changes by less than 0.001
-        found = evaluate.score(
-            net, net.features, test, held_out, samples=samples, seed=run.seed,
-            progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
-            **(dict(horizon=10, starts=scoreboard.SEGMENTS) if segments else dict(horizon=90)),
-        )  # fmt: skip
+    found = evaluate.score(
+        net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
+        progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
+    )  # fmt: skip
     tensors = {f"values.{metric}": value for metric, value in found.values.items()}
     tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
     tensors |= {"pit": found.pit, "outside": found.outside}
@@ -270,12 +272,14 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
 def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
-    Scale paper: the given rows and those of the other seeds beside this run. Laptop: the published ones; where nothing
-    is published, and at scale smoke, the given rows.
+    Scale paper: the given rows and those of the other seeds beside this run. Laptop: the published ones, and the given
+    rows of environments that are not among them. Smoke: the given rows.
     """
     name = f"{run.notebook}.csv"
     if run.scale == "laptop" and (RESULTS / name).exists():
-        return store.load_table(RESULTS / name)
+        published = store.load_table(RESULTS / name)
+        known = {row["env"] for row in published}
+        return [*published, *(row for row in rows if row["env"] not in known)]
     if run.scale != "paper":
         return rows
     others = [path for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.dir not in path.parents]
