@@ -130,7 +130,7 @@ class LSTM(nn.Module):
 
 
 class Ensemble(nn.Module):
-    """PETS: networks that differ in their weights and in the data they see, each of which states a Gaussian.
+    """PETS: networks that differ in their first weights and in the order of their data, each stating a Gaussian.
 
     gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the
     choice of the member is random). members, hidden, layers: the defaults of PETS. segment_len: a member is drawn for

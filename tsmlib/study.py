@@ -131,8 +131,8 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     """How a model is trained: every dynamics model of an environment for about the same time on one core.
 
     tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
-    error and KL, or by the energy score. tsm+energy+direct: the same with a head that sees the state itself, over a
-    narrower stack. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step ahead. multistep,
+    error and KL, or by the energy score. tsm+energy+direct: more teacher forcing, and a head that sees the state itself
+    over a narrower stack. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step ahead. multistep,
     lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":

@@ -32,6 +32,7 @@ class TSM(nn.Module):
 
     state_dim, action_dim: dx, du. angles: state dimensions in radians.
     channels, head_channels: 32 and 0 on the basic arm, 64 and 128 where there are contacts (appendix A.1).
+    direct_channels: above 0, a head of that width that sees state and torque themselves, beyond the paper.
     beta: weight of the KL divergence against the summed squared error in standardised units.
     """
 

@@ -239,7 +239,7 @@ def main() -> None:
     parser.add_argument("--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)")
     parser.add_argument("--seconds", type=float, default=300, help="processor time of training (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default 0)")
-    parser.add_argument("--samples", type=int, default=64, help="per trajectory (default 64)")
+    parser.add_argument("--samples", type=int, default=32, help="per trajectory (default 32, as 03_predict)")
     parser.add_argument("--episodes", type=int, default=1000, help="of the test split (default 1000)")
     parser.add_argument("--run-dir", type=Path, default=Path("runs/paper/seed0"), help="default runs/paper/seed0")
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/peers_pets.csv of the run)")
