@@ -65,7 +65,7 @@ def readme_results() -> str:
     envs = list(dict.fromkeys(row["env"] for row in predict))
     seeds = {env: len({row["seed"] for row in predict if row["env"] == env}) for env in envs}
     boards = "\n\n".join(
-        f"`{env}`, {seeds[env]} training seed{'s' * (seeds[env] > 1)}:\n\n"
+        f"`{env}`, {seeds[env]} training seed{'s' * (seeds[env] > 1)}{' unless said' * (seeds[env] > 1)}:\n\n"
         + scoreboard.board(predict, METRICS, env=env)
         for env in envs
     )
@@ -74,8 +74,8 @@ def readme_results() -> str:
 
 **Prediction.** {n:,} test episodes, open loop with the true torques for 90 steps after ten observed ones; means over
 steps, in standardised units, with half the 95 % t interval where there are several training seeds. Higher is better for
-the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. Every model of an environment was trained
-for about the same time on one core.
+the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models of an
+environment got as many updates as fit into the same time on one idle core (`study.BUDGET`).
 
 {boards}
 

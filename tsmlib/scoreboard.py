@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.control import sim_of
+from tsmlib.envs import has_block
 from tsmlib.evaluate import LEVELS, Scores, after_first, contact_steps, cut
 from tsmlib.style import interval
 from tsmlib.trajectory import Trajectories
@@ -37,7 +38,7 @@ def rows(
     """One model's rows of metrics/03_predict.csv. common: seed and scale."""
     common = dict(env=env, sim=sim_of(env), model=model, planner="none", **common)
     subsets: dict[str, tuple[Scores, Tensor | None]] = {"clean": (open_loop, None), "segments": (segments, None)}
-    if has_contacts(test):
+    if has_block(test.env):
         touched = touches(test, segments, SEGMENTS).any(1, keepdim=True)
         subsets["contact"] = (open_loop, after_first(touches(test, open_loop)))
         subsets["segments contact"] = (segments, touched.expand(-1, segments.pit.shape[1]))
@@ -74,11 +75,6 @@ def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:
     }
     found["nrmse"] = math.sqrt(found.pop("squared_error"))
     return found
-
-
-def has_contacts(test: Trajectories) -> bool:
-    """Whether there is something that the arm can touch."""
-    return "block_x" in test.names
 
 
 def touches(test: Trajectories, scores: Scores, starts: Sequence[int] = (10,)) -> Tensor:
@@ -125,13 +121,17 @@ def calibration(found: Rows, *, env: str, condition: str = "clean") -> dict[str,
 def board(
     found: Rows, metrics: Sequence[str], *, env: str, condition: str = "clean", horizons: Sequence[Any] = ("",)
 ) -> str:
-    """A Markdown table: one line per model, mean over seeds ± half its 95 % interval."""
+    """A Markdown table: one line per model, mean over seeds ± half its 95 % interval; fewer seeds are said."""
     columns = [(metric, h) for metric in metrics for h in horizons]
     cells = {c: values(found, c[0], env=env, condition=condition, horizon=c[1]) for c in columns}
     heads = [metric + (f" at {h}" if h != "" else "") for metric, h in columns]
     lines = ["| model | " + " | ".join(heads) + " |", "|---" * (len(columns) + 1) + "|"]
-    for model in cells[columns[0]]:
-        lines.append(f"| {model} | " + " | ".join(_spell(by_model.get(model)) for by_model in cells.values()) + " |")
+    most = max((len(seeds) for seeds in cells[columns[0]].values()), default=0)
+    for model, seeds in cells[columns[0]].items():
+        fewer = f" (seeds: {len(seeds)})" if len(seeds) < most else ""
+        lines.append(
+            f"| {model}{fewer} | " + " | ".join(_spell(by_model.get(model)) for by_model in cells.values()) + " |"
+        )
     return "\n".join(lines)
 
 

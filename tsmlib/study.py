@@ -21,6 +21,7 @@ from tsmlib import evaluate, scoreboard, store
 from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.envs import has_block
 from tsmlib.envs.base import DT, STATE_NAMES
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, ParameterError, Run
@@ -73,17 +74,12 @@ def short(env: str) -> str:
     return env.partition("/")[2].partition("-")[0]
 
 
-def has_block(env: str) -> bool:
-    """Whether there is an obstacle or object, and so contacts."""
-    return "Reacher-v0" not in env
-
-
 def chosen(parameter: str, text: str, known: Sequence[str]) -> list[str]:
     """The value of a notebook parameter that names one of ``known``, several with commas between, or all."""
     names = list(known) if text == "all" else [word.strip() for word in text.split(",")]
     if unknown := [word for word in names if word not in known]:
         raise ParameterError(f"{parameter} names {unknown[0]!r:.80}, expected some of {', '.join(known)}; or all.")
-    return names
+    return list(dict.fromkeys(names))
 
 
 # Data ----------------------------------------------------------------------------------------------------------------
@@ -257,7 +253,8 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
            for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
     if path.exists() and store.read_header(path)["made_from"] == made_from:
-        return _unpacked(*store.load(path, kind="scores"))
+        tensors, _ = store.load(path, kind="scores")
+        return _unpacked(tensors)
     found = evaluate.score(
         net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
         progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
@@ -286,7 +283,7 @@ def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [*rows, *(row for path in others for row in store.load_table(path))]
 
 
-def _unpacked(tensors: dict[str, torch.Tensor], _: Any) -> evaluate.Scores:
+def _unpacked(tensors: dict[str, torch.Tensor]) -> evaluate.Scores:
     values = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("values.")}
     fitted = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("fitted.")}
     numbers: dict[str, Any] = {name: tensor if tensor.ndim else float(tensor) for name, tensor in fitted.items()}

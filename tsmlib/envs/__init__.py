@@ -24,4 +24,11 @@ for _id in ENV_IDS:
             max_episode_steps=100,
         )
 
-__all__ = ["ENV_IDS", "MUJOCO_IDS", "PYMUNK_IDS", "ArmEnv", "ArmVectorEnv", "SimulationUnstable", "closest_gap"]
+
+def has_block(env: str) -> bool:
+    """Whether there is an obstacle or object, and so something that the arm can touch."""
+    return "Reacher-v0" not in env
+
+
+__all__ = ["ENV_IDS", "MUJOCO_IDS", "PYMUNK_IDS", "ArmEnv", "ArmVectorEnv", "SimulationUnstable", "closest_gap",
+           "has_block"]  # fmt: skip
