@@ -128,7 +128,7 @@ def figure6(results: Results) -> Figure:
                           textcoords="offset points", ha="right", va="center_baseline", fontsize=7,
                           color=COLOURS[model], weight="bold")  # fmt: skip
         cost.set_title(f"{task.capitalize()}: true cost (lower is better)")
-        gap.set_title(f"{task.capitalize()}: exploitation gap (nearer 0 is better)")
+        gap.set_title(f"{task.capitalize()}: gap (0 is best)")
         cost.set_xlabel("−return of the executed plan")
         gap.set_xlabel("predicted − true return")
     dark = COLOURS["data"]
