@@ -277,7 +277,7 @@ def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: P
 def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     store.save_model(path, Line(inputs=3))
-    with pytest.raises(StoreError, match="holds a Line, expected a Curve"):
+    with pytest.raises(StoreError, match="holds a 'Line', expected a Curve"):
         store.load_model(path, Curve)
     tensors, header = store.load(path, kind="model")
     store.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
@@ -412,7 +412,7 @@ def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
     entries = {"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}
-    text = json.dumps({"files": entries, "sha256": store._entries_digest(entries)})
+    text = json.dumps(store.sealed({"files": entries}))
     (tmp_path / store.MANIFEST).write_text(text)
     with pytest.raises(StoreError, match="outside its own folder"):
         store.verify(tmp_path)
