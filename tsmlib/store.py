@@ -243,8 +243,8 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
         with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
-            planned = _layout(cls(**config).state_dict())
-        differs = differences(_layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
+            planned = layout(cls(**config).state_dict())
+        differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
     except Exception as error:  # what the file says goes to a constructor, which may fail in any way
         raise StoreError(
             f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_again('model')}"
@@ -271,7 +271,8 @@ def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_s
     ]
 
 
-def _layout(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+def layout(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Type and shape of each array, in words."""
     return {
         name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}" for name, tensor in tensors.items()
     }
