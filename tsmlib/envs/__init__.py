@@ -4,9 +4,20 @@
 whole action sequences at once. The state is the observation, and its layout is the same in both simulators.
 """
 
+from typing import Any
+
 import gymnasium
 
-from tsmlib.envs.base import ArmEnv, ArmVectorEnv, SimulationUnstable, closest_gap
+from tsmlib.envs.base import (
+    DT,
+    STATE_NAMES,
+    STATE_UNITS,
+    ArmEnv,
+    ArmVectorEnv,
+    SimulationUnstable,
+    closest_gap,
+    task_of,
+)
 
 MUJOCO_IDS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
 PYMUNK_IDS = ("tsm/PymunkReacher-v0", "tsm/PymunkObstacle-v0", "tsm/PymunkPush-v0")
@@ -24,4 +35,30 @@ for _id in ENV_IDS:
             max_episode_steps=100,
         )
 
-__all__ = ["ENV_IDS", "MUJOCO_IDS", "PYMUNK_IDS", "ArmEnv", "ArmVectorEnv", "SimulationUnstable", "closest_gap"]
+
+def fingerprint(env_id: str, *, noise: float = 0.0, delay: int = 0) -> dict[str, Any]:
+    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit.
+
+    noise: sigma of `SensorNoise`; delay: tau of `ActionDelay`, steps.
+    """
+    if env_id in PYMUNK_IDS:
+        from tsmlib.envs.pymunk_arm import physics_hash
+    else:
+        from tsmlib.envs.mujoco_arm import physics_hash
+    dx = 6 if task_of(env_id) == "reacher" else 10
+    return {
+        "env": env_id, "dt": DT, "names": list(STATE_NAMES[:dx]), "units": list(STATE_UNITS[:dx]), "angles": [0, 1],
+        "noise": noise, "delay": delay, "simulator": physics_hash(env_id),
+    }  # fmt: skip
+
+
+__all__ = [
+    "ENV_IDS",
+    "MUJOCO_IDS",
+    "PYMUNK_IDS",
+    "ArmEnv",
+    "ArmVectorEnv",
+    "SimulationUnstable",
+    "closest_gap",
+    "fingerprint",
+]
