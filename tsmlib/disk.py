@@ -80,8 +80,15 @@ def only_writer(folder: PathLike, purpose: str) -> Iterator[None]:
     except ImportError:  # no such locks on Windows
         yield
         return
-    _make(Path(folder))
-    with open(Path(folder) / ".lock", "a+") as lock:
+    try:
+        _make(Path(folder))
+        lock = open(Path(folder) / ".lock", "a+")  # noqa: SIM115 - closed below
+    except OSError as error:
+        raise StoreError(
+            f"cannot write in {folder}: {error.strerror or error}. Make room or permission there, or name another "
+            "folder with TSM_RUN_DIR."
+        ) from error
+    with lock:
         for attempt in range(20):
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
