@@ -179,15 +179,25 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
 
     command = f"python -m tsmlib run {notebook[3:]} --scale {run.scale} --seed {run.seed}"
     path = run.dir / store.STATUS
-    entry = store.read_json(path).get(notebook, {}) if path.exists() else {}
-    state = entry.get("state", "not run")
+    status = store.read_json(path) if path.exists() else {}
+    entry = status.get(notebook, {"state": "not run"}) if isinstance(status, dict) else None
+    state = entry.get("state") if isinstance(entry, dict) else "damaged"
     if state == "running" and not _alive(entry):
         state = "interrupted: its process is gone"
-    if state != "complete" or not (store.intact(entry) or "files" not in entry):
-        raise RunError(f"{notebook} in {run.dir} is {state}, expected complete. Run it: {command}")
-    for name, file in entry.get("files", {}).items():
-        if not (run.dir / name).is_file() or store.sha256(run.dir / name) != file["sha256"]:
-            raise RunError(f"{run.dir / name} is not what {notebook} made (or is gone). Run it again: {command}")
+    if state == "complete" and "files" in entry and not store.intact(entry):
+        state = "damaged"
+    if state != "complete":
+        raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. Run it: {command}")
+    try:
+        changed = [
+            name
+            for name, file in entry.get("files", {}).items()
+            if not (run.dir / name).is_file() or store.sha256(run.dir / name) != file["sha256"]
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        changed = [f"{store.STATUS} ({error!r:.80})"]
+    if changed:
+        raise RunError(f"{run.dir / changed[0]} is not what {notebook} made, or is gone. Run it again: {command}")
     return entry
 
 
