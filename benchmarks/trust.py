@@ -58,9 +58,8 @@ def main() -> None:
     ratio = np.array(seconds["with"]) / np.array(seconds["without"])
     load, read = (1000 * np.median(seconds[way]) for way in ("load", "read"))
     print(f"{ENV}, {arguments.steps} steps, {arguments.rounds} rounds, {torch.get_num_threads()} threads")
-    print(
-        f"training with checkpoints takes {np.median(ratio):.3f}x ({ratio.min():.3f} to {ratio.max():.3f}); at most 1.05x"
-    )
+    spread = f"({ratio.min():.3f} to {ratio.max():.3f})"
+    print(f"training with checkpoints takes {np.median(ratio):.3f} times as long {spread}; at most 1.05")
     print(f"loading a shipped model takes {load:.1f} ms, {load - read:.1f} ms more than its bytes; at most 50 ms more")
     common = dict(env=ENV, sim="mujoco", model="tsm", n=arguments.rounds)
     rows = [
