@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import importlib.metadata
 import platform
@@ -21,10 +20,9 @@ def provenance() -> dict[str, Any]:
 
     Two results with equal provenance, seed and inputs should be equal bit for bit.
     """
-    return {**_fixed(), "threads": torch.get_num_threads()}
+    return {**_FIXED, "threads": torch.get_num_threads()}
 
 
-@functools.cache
 def _fixed() -> dict[str, Any]:
     package = Path(__file__).parent
     sources = hashlib.sha256()
@@ -60,3 +58,6 @@ def _processor() -> str:
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
+
+
+_FIXED = _fixed()  # now, since sources may change while they are in use

@@ -179,12 +179,13 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
 
     command = f"python -m tsmlib run {notebook[3:]} --scale {run.scale} --seed {run.seed}"
     path = run.dir / store.STATUS
-    status = store.read_json(path) if path.exists() else {}
-    entry = status.get(notebook, {"state": "not run"}) if isinstance(status, dict) else None
+    entry: Any = (
+        store.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
+    )
     state = entry.get("state") if isinstance(entry, dict) else "damaged"
     if state == "running" and not _alive(entry):
         state = "interrupted: its process is gone"
-    if state == "complete" and "files" in entry and not store.intact(entry):
+    if state == "complete" and {"files", "sha256"} & set(entry) and not store.intact(entry):  # older ones have neither
         state = "damaged"
     if state != "complete":
         raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. Run it: {command}")
@@ -273,7 +274,7 @@ def _note(run: Run, entry: Mapping[str, Any]) -> None:
     from tsmlib import store
 
     path = run.dir / store.STATUS
-    entries: dict[str, Any] = dict(store.read_json(path)) if path.exists() else {}
+    entries: dict[str, Any] = store.read_own_json(path) if path.exists() else {}
     entries[run.notebook] = store.sealed(entry)
     for name, other in entries.items():
         if name != run.notebook and store.intact(other) and set(other.get("files", {})) & set(entry.get("files", {})):

@@ -331,6 +331,20 @@ def read_json(path: PathLike) -> Any:
         raise StoreError(f"{path} is not valid JSON: {error}. {_again(None)}") from error
 
 
+def read_own_json(path: PathLike) -> Any:
+    """Read a manifest or a status, which must be as ``write_json`` left it, to the byte."""
+    path = Path(path)
+    data = _read(path)
+    try:
+        value = _loads(data)
+        as_written = data == (_dumps(path, value, indent=1) + "\n").encode()
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged: {error}. {_restore(path)}") from error
+    if not as_written or not isinstance(value, dict):
+        raise StoreError(f"{path} is damaged: it is not as it was written. {_restore(path)}")
+    return value
+
+
 def _plain(value: Any) -> Any:
     """JSON and CSV know Python's own numbers only."""
     if isinstance(value, bool | np.bool_):
@@ -461,7 +475,7 @@ def verify(path: PathLike) -> list[Path]:
 def _manifest(path: Path) -> dict[str, str]:
     """File name -> SHA-256, from a manifest that is itself intact, or from the complete notebooks of a status."""
     try:
-        value = _loads(_read(path))
+        value = read_own_json(path)
         if path.name == STATUS:
             entries = [entry for entry in value.values() if "files" in entry and entry["state"] == "complete"]
         else:
