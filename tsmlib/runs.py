@@ -105,7 +105,7 @@ def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "",
     except (OSError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
-        raise ParameterError(f"run_dir is {str(base)[:80]!a}, which cannot be a folder here: {error}.") from None
+        raise ParameterError(f"run_dir is {str(base)[:80]!a}, expected the name of a folder: {error}.") from None
     return Run(notebook, scale, seed, base / scale / f"seed{seed}")
 
 

@@ -438,7 +438,7 @@ def hostile_parameters(trials: int = 0) -> Outcome:
                         hostile = [text for text in hostile if text]  # '' is a scale
                     per_parameter.append(len(hostile))
                     for text in hostile:
-                        given = [f"--{name}={text}"] if name in ("scale", "seed") else ["-p", f"{name}={text}"]
+                        given = [f"--{name}={text}"] if name in ("scale", "seed") else [f"-p{name}={text}"]
                         errors = io.StringIO()
                         with contextlib.redirect_stderr(errors):
                             code = main(["run", word, *given])
@@ -447,7 +447,7 @@ def hostile_parameters(trials: int = 0) -> Outcome:
                         found.count(code == 2 and clear, f"{word} {name}={text[:40]!r}: {code} {line[:200]}")
                 for name in names:
                     with contextlib.redirect_stderr(io.StringIO()):
-                        found.count(main(["run", word, "-p", f"{name}=1"]) == 2, f"{word} {name!r}")
+                        found.count(main(["run", word, f"-p{name}=1"]) == 2, f"{word} {name!r}")
             for bad in (*hostile_texts(), -1, 2**31, 1.0, True, None, [], {}, b"x", float("nan"), 10**30, object()):
                 for name in ("scale", "seed", "run_dir", "env", "models", "n_targets"):
                     try:
