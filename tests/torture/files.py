@@ -403,7 +403,20 @@ def hostile_texts() -> list[str]:
     texts += [
         f"{text}{tail}" for text in ("../", "~", "a\0", "a\n", "\u202e") for tail in ("1", "smoke", "tsm", "x" * 20)
     ]
-    controls = [chr(code) for code in (*range(1, 32), *range(127, 160), 0x200E, 0x200F, 0x2066, 0x2069, 0xE0001)]
+    controls = [
+        chr(code)
+        for code in (
+            *range(1, 32),
+            *range(127, 161),
+            *range(0x2028, 0x2030),
+            *range(0x2060, 0x2070),
+            0x200E,
+            0x200F,
+            0x2066,
+            0x2069,
+            0xE0001,
+        )
+    ]
     return texts + [f"a{control}b" for control in controls]
 
 
@@ -413,7 +426,7 @@ def hostile_numbers() -> list[str]:
         "-1", "-0.5", "1e9", "1e308", "nan", "NaN", "inf", "-inf", "infinity", "true", "True", "None", "null", "0x10",
         "0b1", "0o7", "1_000", "1,5", "1;2", "10**9", "1+1", "[1]", "{}", "()", "", " ", "1 ", " 1", "+", "-", "--1",
         "1.", ".5", "1.0", "1e3", "1/2", "½", "²", "１", "٣", "1e", "e1", "1j", "$1", "`id`", "$(id)", "%s", "{seed}",
-        "{x.__class__}", "__import__('os')", "9" * 19, "9" * 5000, "2147483648", "-2147483649", "smoke", "seed=1",
+        "{x.__class__}", "__import__('os')", "9" * 19, "9" * 5000, "2147483648", "-2147483649", "Smoke", "seed=1",
     ]  # fmt: skip
 
 
