@@ -19,8 +19,9 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import papermill_plugin, parameters, runs
+from tsmlib import papermill_plugin, parameters, runs, study
 from tsmlib.__main__ import main
+from tsmlib.envs import ENV_IDS
 from tsmlib.runs import ParameterError, RunError, resolve
 
 PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
@@ -117,6 +118,15 @@ def test_a_folder_that_cannot_be_made_is_one_clear_message() -> None:
 def test_values_take_the_type_of_the_default(place: Path) -> None:
     given = {"seed": "7", "rate": "1e-3", "name": "007", "fast": "True"}
     assert parameters.typed(runs.notebooks()["first"], given) == {"seed": 7, "rate": 0.001, "name": "007", "fast": True}
+
+
+def test_the_schema_knows_every_environment_model_and_parameter() -> None:
+    assert set(parameters.ENVS) == set(ENV_IDS)
+    assert set(study.MODELS) <= set(parameters.MODELS)
+    for notebook in runs.notebooks().values():
+        assert set(parameters.declared(notebook)) <= set(parameters.SCHEMA), notebook.name
+        for name, default in parameters.declared(notebook).items():
+            assert parameters.check(name, default) == default
 
 
 BAD_PARAMETERS = [

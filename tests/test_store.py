@@ -20,6 +20,7 @@ import safetensors.torch
 import torch
 
 from tsmlib import store
+from tsmlib.runs import Run, RunError, _note, require
 from tsmlib.store import StoreError
 from tsmlib.trajectory import Trajectories
 
@@ -408,6 +409,55 @@ def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
     for name in ("a.safetensors", "b.safetensors", "t.csv"):
         assert name in str(caught.value)
     assert "c.safetensors" not in str(caught.value)
+
+
+def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> None:
+    run = Run("05_control", "smoke", 0, tmp_path)
+    table = run.metrics / "05_control.csv"
+    store.save_table(table, [{"metric": "success", "value": 0.5}])
+    _note(run, {"state": "complete", "files": store.listing(run.dir, [table])})
+    assert table in store.verify(tmp_path)
+    assert require(run, "05_control")["state"] == "complete"
+    table.write_text(table.read_text().replace("0.5", "0.9"))
+    with pytest.raises(StoreError, match="05_control.csv has SHA-256"):
+        store.verify(tmp_path)
+    with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed after its run was complete"):
+        store.load_table(table)
+    with pytest.raises(RunError, match="python -m tsmlib run control --scale smoke --seed 0"):
+        require(run, "05_control")
+    with pytest.raises(RunError, match="02_train in .* is not run, expected complete"):
+        require(run, "02_train")
+
+
+def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.safetensors"
+    expect = {**FINGERPRINT, "noise": 0.0}
+    store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    with pytest.raises(StoreError, match="noise is 'not stated' in the file, expected 0.0"):
+        store.load_model(path, Line, expect=expect)
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "SCHEMA", 1)
+        store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    store.load_model(path, Line, expect=expect)
+    with pytest.raises(StoreError, match="dt is 0.02 in the file, expected 0.01"):
+        store.load_model(path, Line, expect={**expect, "dt": 0.01})
+
+
+def test_an_artefact_states_what_made_it(saved: Path) -> None:
+    found = store.read_provenance(saved)
+    assert found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
+    assert found["threads"] == torch.get_num_threads()
+    assert {"code", "commit", "cpu", "mujoco", "numpy"} <= set(found)
+
+
+def test_a_model_as_large_as_a_forger_likes_is_refused_without_making_it(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    with torch.device("meta"):
+        huge = Line(inputs=10**12)
+    huge.load_state_dict({"linear.weight": torch.zeros(1, 3), "linear.bias": torch.zeros(1)}, strict=False, assign=True)
+    store.save_model(path, huge)
+    with pytest.raises(StoreError, match=r"linear.weight is 'float32 \[1, 3\]' in the file, expected .*1000000000000"):
+        store.load_model(path, Line)
 
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
