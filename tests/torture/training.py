@@ -94,7 +94,7 @@ def at_every_call(trials: int = 0) -> Outcome:
     return found
 
 
-def at_every_system_call(trials: int = 0) -> Outcome:
+def at_every_system_call(trials: int = 1000) -> Outcome:
     """R2 and R3a with strace: the same at each writing system call, and the order write, fsync, rename, fsync."""
     found = Outcome(note="strace is not installed: not done")
     if shutil.which("strace") is None:
@@ -113,7 +113,7 @@ def at_every_system_call(trials: int = 0) -> Outcome:
             )
         for fault in ("signal=SIGKILL", "error=ENOSPC", "error=EIO"):
             for call in ("write", "fsync", "rename", "unlink", "ftruncate"):
-                for k in range(1, 1000):
+                for k in range(1, trials + 1):
                     with folder() as place:
                         shutil.copytree(start / "run", place / "run")
                         options = ["-e", f"trace={call}", "-e", f"inject={call}:{fault}:when={k}"]
