@@ -1,4 +1,4 @@
-"""The long form: ``make torture``, or ``make torture PARTS="files simulators"`` for some of it; ``--quick`` as in the tests.
+"""The long form: ``make torture``, or ``make torture PARTS="files simulators"`` for some; ``--quick``: as in tests.
 
 Each check is run at full length; its line is kept in ``runs/torture`` and the table of docs/trust.md is written from
 all lines there are, so that the parts may be run one after another. Ends with status 1 where a trial went wrong.
