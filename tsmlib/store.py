@@ -186,11 +186,9 @@ def load_trajectories(
     tensors, about = _load(path, "trajectories")
     try:
         fields = about["header"]["trajectories"]
-        if wrong := {name: t.dtype for name, t in tensors.items() if t.dtype != torch.float32} or set(tensors) ^ {
-            "states",
-            "actions",
-        }:
-            raise TypeError(f"found {wrong}, expected 'states' and 'actions' in torch.float32")
+        kinds = {name: str(tensor.dtype) for name, tensor in tensors.items()}
+        if kinds != dict.fromkeys(("states", "actions"), "torch.float32"):
+            raise TypeError(f"found {kinds}, expected 'states' and 'actions' in torch.float32")
         words = [fields["env"], *fields["names"], *fields["units"]]
         size = tensors["states"].shape[-1]
         if not all(isinstance(word, str) for word in words) or not 0 < fields["dt"] < math.inf:
