@@ -5,7 +5,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
-.PHONY: help collect train predict control test lint clean
+.PHONY: help collect train predict control test torture lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
@@ -13,6 +13,7 @@ help:
 	@echo "make train     train the models  (notebooks/02_train.ipynb)"
 	@echo "make predict   who predicts best    (notebooks/03_predict.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
+	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (half an hour)"
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
@@ -22,6 +23,9 @@ collect train predict control: $(READY)
 test: $(READY)
 	$(PY) -m pytest
 	$(PY) -m pytest --nbval-lax notebooks
+
+torture: $(READY)
+	$(PY) tests/torture $(PARTS)
 
 lint: $(READY)
 	$(PY) -m ruff check .

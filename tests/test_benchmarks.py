@@ -15,11 +15,14 @@ from tsmlib.__main__ import main
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2", "--rounds", "2"],
     "plan": ["--targets", "2", "--iterations", "1", "--samples", "1", "--rounds", "2"],
+    "trust": ["--steps", "2", "--loads", "1", "--rounds", "2"],
 }
+
 RATIOS = {"ratio_lowest", "ratio_median", "ratio_highest"}
 SPEEDS = {"steps_per_second", "steps_per_core_second", *RATIOS}
 ROWS = {  # condition -> metrics
     "collect": {"bulk": SPEEDS, "env.step": SPEEDS, "mj_step": SPEEDS, "": {"peak_bytes"}},
+    "trust": {"checkpoints": RATIOS, "load": {"seconds"}, "checks": {"seconds"}},
     "plan": {
         "plan": {"plan_seconds", *RATIOS},
         **{
@@ -50,4 +53,4 @@ def test_a_benchmark_states_ratios_with_their_spread(
 
 def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "there are collect, plan, or all" in capsys.readouterr().err
+    assert "there are collect, plan, trust, or all" in capsys.readouterr().err

@@ -186,10 +186,11 @@ def test_energy_does_not_grow_without_torque(env_id: str) -> None:
     env, start = arms(env_id, 150)
     rng = np.random.default_rng(0)
     start[:, :4] = np.concatenate([rng.uniform(-2.5, 2.5, (150, 2)), rng.uniform(-10, 10, (150, 2))], axis=1)
-    env.reset(options={"states": start})
-    states = np.concatenate([start[:, None], env.rollout(np.zeros((150, 200, 2)))], axis=1)
     if env_id != REACHER:
-        states = states[closest_gap(start, env_id) > 0]  # the others begin inside the block
+        start = start[closest_gap(start, env_id) > 0]  # the others begin inside the block
+        env, _ = arms(env_id, len(start))
+    env.reset(options={"states": start})
+    states = np.concatenate([start[:, None], env.rollout(np.zeros((len(start), 200, 2)))], axis=1)
     energy = 0.5 * (states[..., 2:4] ** 2).sum(axis=-1)  # 1 kg m^2 in each joint; the links add a thousandth
     if env_id == PUSH:
         energy += 0.5 * (states[..., 8:] ** 2).sum(axis=-1)
@@ -209,10 +210,11 @@ def test_a_blow_up_is_raised_with_episode_and_step(
     snapshot[277, 1 + env.model.nq] = value  # the shoulder's velocity
     with pytest.raises(SimulationUnstable, match="episode 277"):
         env.set_state(snapshot)
-    env._physics = snapshot[:, :-2]
+    env._physics = snapshot[:, :-2]  # as if it had come about by itself
     with pytest.raises(SimulationUnstable) as caught:
         env.rollout(np.zeros((300, 4, 2)))
-    assert (caught.value.env, caught.value.episode, caught.value.step) == (env_id, 277, 0)
+    assert (caught.value.env, caught.value.episode, caught.value.step) == (env_id, 277, 3)  # steps since reset
+    assert "QVEL" in caught.value.reason
     assert not os.listdir(tmp_path)  # MuJoCo would leave a log file here
 
 

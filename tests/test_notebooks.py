@@ -11,7 +11,7 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import runs, store
+from tsmlib import parameters, runs, store
 
 NOTEBOOKS = list(runs.notebooks().values())
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -51,7 +51,7 @@ def test_a_notebook_calls_the_library_and_defines_nothing(path: Path) -> None:
 
 @each_notebook
 def test_a_notebook_takes_a_scale_a_seed_and_a_folder(path: Path) -> None:
-    defaults = runs.parameters(path)
+    defaults = parameters.declared(path)
     assert {"scale": "", "seed": 0, "run_dir": ""}.items() <= defaults.items()
     assert {type(value) for value in defaults.values()} <= {str, int, float, bool}
 

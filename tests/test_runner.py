@@ -19,8 +19,9 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import papermill_plugin, runs
+from tsmlib import papermill_plugin, parameters, runs, study
 from tsmlib.__main__ import main
+from tsmlib.envs import ENV_IDS
 from tsmlib.runs import ParameterError, RunError, resolve
 
 PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
@@ -82,7 +83,7 @@ def test_folders_exist_when_they_are_asked_for_and_not_before(place: Path) -> No
 
 
 def test_a_run_picks_by_scale() -> None:
-    assert [resolve("x", scale=scale).pick(smoke=1, laptop=2, paper=3) for scale in runs.SCALES] == [1, 2, 3]
+    assert [resolve("x", scale=scale).pick(smoke=1, laptop=2, paper=3) for scale in parameters.SCALES] == [1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,16 @@ def test_a_folder_that_cannot_be_made_is_one_clear_message() -> None:
 
 def test_values_take_the_type_of_the_default(place: Path) -> None:
     given = {"seed": "7", "rate": "1e-3", "name": "007", "fast": "True"}
-    assert runs.typed(runs.notebooks()["first"], given) == {"seed": 7, "rate": 0.001, "name": "007", "fast": True}
+    assert parameters.typed(runs.notebooks()["first"], given) == {"seed": 7, "rate": 0.001, "name": "007", "fast": True}
+
+
+def test_the_schema_knows_every_environment_model_and_parameter() -> None:
+    assert set(parameters.ENVS) == set(ENV_IDS)
+    assert set(study.MODELS) <= set(parameters.MODELS)
+    for notebook in runs.notebooks().values():
+        assert set(parameters.declared(notebook)) <= set(parameters.SCHEMA), notebook.name
+        for name, default in parameters.declared(notebook).items():
+            assert parameters.check(name, default) == default
 
 
 BAD_PARAMETERS = [
@@ -157,7 +167,7 @@ def test_an_unknown_notebook_is_refused_listing_those_that_exist(
 @pytest.mark.parametrize("source", ["x = 1 + y", "import os", "x, y = 1, 2", "x = open('f')", "x ="])
 def test_a_parameters_cell_holds_literals_only(place: Path, source: str) -> None:
     with pytest.raises(ParameterError, match="parameters cell"):
-        runs.parameters(write_notebook(place / "03_bad.ipynb", parameters=source))
+        parameters.declared(write_notebook(place / "03_bad.ipynb", parameters=source))
 
 
 # Execution -----------------------------------------------------------------------------------------------------------
@@ -173,6 +183,8 @@ def test_a_notebook_runs_with_its_parameters_into_its_folder(place: Path, capsys
     assert entry["state"] == "complete"
     assert entry["parameters"]["seed"] == 3
     assert not list(executed.parent.glob(".*.ipynb"))
+    assert entry["provenance"]["torch"]
+    assert (entry["scale"], entry["seed"]) == ("smoke", 3)
 
 
 UNFINISHED = {
@@ -245,7 +257,7 @@ def test_one_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
     process = start(place)
     try:
         second = runs.notebooks()["second"]
-        with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid}, 01_first"):
+        with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid} on .*, 01_first, since"):
             runs.execute(second, progress=False)
         assert set(status(place)) == {"01_first"}
     finally:

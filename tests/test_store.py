@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import pickle
 import random
@@ -20,6 +19,7 @@ import safetensors.torch
 import torch
 
 from tsmlib import store
+from tsmlib.runs import Run, RunError, _note, require
 from tsmlib.store import StoreError
 from tsmlib.trajectory import Trajectories
 
@@ -277,7 +277,7 @@ def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: P
 def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     store.save_model(path, Line(inputs=3))
-    with pytest.raises(StoreError, match="holds a Line, expected a Curve"):
+    with pytest.raises(StoreError, match="holds a 'Line', expected a Curve"):
         store.load_model(path, Curve)
     tensors, header = store.load(path, kind="model")
     store.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
@@ -410,10 +410,57 @@ def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
     assert "c.safetensors" not in str(caught.value)
 
 
+def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> None:
+    run = Run("05_control", "smoke", 0, tmp_path)
+    table = run.metrics / "05_control.csv"
+    store.save_table(table, [{"metric": "success", "value": 0.5}])
+    _note(run, {"state": "complete", "files": store.listing(run.dir, [table])})
+    assert table in store.verify(tmp_path)
+    assert require(run, "05_control")["state"] == "complete"
+    table.write_text(table.read_text().replace("0.5", "0.9"))
+    with pytest.raises(StoreError, match="05_control.csv has SHA-256"):
+        store.verify(tmp_path)
+    with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed after its run was complete"):
+        store.load_table(table)
+    with pytest.raises(RunError, match="python -m tsmlib run control --scale smoke --seed 0"):
+        require(run, "05_control")
+    with pytest.raises(RunError, match="02_train in .* is not run, expected complete"):
+        require(run, "02_train")
+
+
+def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.safetensors"
+    expect = {**FINGERPRINT, "noise": 0.0}
+    store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    with pytest.raises(StoreError, match="noise is 'not stated' in the file, expected 0.0"):
+        store.load_model(path, Line, expect=expect)
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "SCHEMA", 1)
+        store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    store.load_model(path, Line, expect=expect)
+    with pytest.raises(StoreError, match="dt is 0.02 in the file, expected 0.01"):
+        store.load_model(path, Line, expect={**expect, "dt": 0.01})
+
+
+def test_an_artefact_states_what_made_it(saved: Path) -> None:
+    found = store.read_provenance(saved)
+    assert found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
+    assert found["threads"] == torch.get_num_threads()
+    assert {"code", "commit", "cpu", "mujoco", "numpy"} <= set(found)
+
+
+def test_a_model_as_large_as_a_forger_likes_is_refused_without_making_it(tmp_path: Path) -> None:
+    path = tmp_path / "m.safetensors"
+    forged = Line(inputs=3)
+    forged.inputs = 10**12
+    store.save_model(path, forged)
+    with pytest.raises(StoreError, match=r"linear.weight is 'float32 \[1, 3\]' in the file, expected .*1000000000000"):
+        store.load_model(path, Line)
+
+
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
     entries = {"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}
-    text = json.dumps({"files": entries, "sha256": store._entries_digest(entries)})
-    (tmp_path / store.MANIFEST).write_text(text)
+    store.write_json(tmp_path / store.MANIFEST, store.sealed({"files": entries}))
     with pytest.raises(StoreError, match="outside its own folder"):
         store.verify(tmp_path)
 

@@ -121,7 +121,7 @@ def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pyt
     monkeypatch.setattr(study, "fit", stopped)
     with pytest.raises(KeyboardInterrupt):
         study.load_or_train(run, REACHER, "prior")
-    assert [p.name for p in path.parent.glob("prior*")] == ["prior-loss.checkpoint.safetensors"]
+    assert [p.name for p in path.parent.glob("prior*")] == ["prior-loss.checkpoint"]
     monkeypatch.setattr(study, "fit", fit)
     again, _ = study.load_or_train(run, REACHER, "prior")
     whole, _ = study.load_or_train(made, REACHER, "prior")

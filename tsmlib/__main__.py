@@ -1,4 +1,4 @@
-"""Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify PATH`` hashes again.
+"""Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify [PATH]`` hashes again.
 ``python -m tsmlib bench [NAME]`` measures speed. ``python -m tsmlib publish`` copies a paper-scale run to what ships.
 
 Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tsmlib import runs
+from tsmlib import parameters, runs
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,8 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
-    verify = commands.add_parser("verify", help="hash an artefact, or a folder of them, again")
-    verify.add_argument("path", type=Path)
+    verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
+    verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
     bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
     bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, or all (default)")
     publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             case "bench":
                 return _bench(arguments.name)
             case "publish":
-                return _publish(runs.convert("seed", arguments.seed, int))
+                return _publish(parameters.convert("seed", arguments.seed))
             case _:
                 return _run(arguments)
     except runs.ParameterError as error:
@@ -59,7 +59,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise runs.ParameterError(
             f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
         )
-    seed = runs.convert("seed", arguments.seed, int)
+    seed = parameters.convert("seed", arguments.seed)
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")
@@ -70,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> int:
         given[name] = text
     chosen = list(present.values()) if word == "all" else [present[word]]
     for notebook in chosen:  # all of them, before the first one starts
-        runs.typed(notebook, given)
+        parameters.typed(notebook, given)
         runs.resolve(notebook.stem, scale=arguments.scale, seed=seed)
     for notebook in chosen:
         print(runs.execute(notebook, scale=arguments.scale, seed=seed, given=given))
@@ -80,8 +80,10 @@ def _run(arguments: argparse.Namespace) -> int:
 def _verify(path: Path) -> int:
     from tsmlib import store
 
-    for file in store.verify(path):
+    files = store.verify(path)
+    for file in files:
         print(f"ok  {file}")
+    print(f"{len(files)} files are as they were made")
     return 0
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from tsmlib import scoreboard, store, study
 from tsmlib.report import report
-from tsmlib.runs import ROOT, Run, RunError
+from tsmlib.runs import ROOT, Run, require
 from tsmlib.study import RESULTS
 
 README = ROOT / "README.md"
@@ -18,13 +18,11 @@ def publish(run: Run) -> None:
     """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results.
 
     The table of 03_predict has the rows of the other seeds beside this run as well.
-    Raises RunError, before anything is written, unless the notebooks ran to their end.
+    Raises RunError, before anything is written, unless the notebooks ran to their end and
+    their results are as they left them.
     """
-    status = store.read_json(run.dir / "status.json")
     for notebook in ("01_collect", "02_train", "03_predict", "05_control"):
-        state = status.get(notebook, {}).get("state", "missing")
-        if state != "complete":
-            raise RunError(f"{notebook} in {run.dir} is {state}; python -m tsmlib run all --scale paper completes it")
+        require(run, notebook)
     for source, pattern, target in (
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),

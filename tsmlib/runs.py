@@ -1,18 +1,16 @@
-"""Where the results of a notebook live, which parameters it takes, and how it is executed.
+"""Where the results of a notebook live, how it is executed, and what is known of a run afterwards.
 
 Everything that a run makes is in one folder, ``runs/<scale>/seed<k>/``: ``data``, ``models``, ``metrics``, ``figures``,
 the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (an executed notebook
-whose kernel was killed looks complete).
+whose kernel was killed looks complete): running, complete, failed or interrupted, with what made it and the SHA-256 of
+each table and picture. `require` refuses what is not complete.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import json
-import math
 import os
-import re
 import signal
 import time
 from collections.abc import Iterator, Mapping
@@ -21,19 +19,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tsmlib import parameters as schema
+from tsmlib.parameters import ParameterError
+
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = ROOT / "notebooks"
-SCALES = ("smoke", "laptop", "paper")
 
 T = TypeVar("T")
 
 
-class ParameterError(ValueError):
-    """A parameter that is unknown, of the wrong type or out of range. Raised before any file exists."""
-
-
 class RunError(RuntimeError):
-    """A notebook that did not run to its end."""
+    """A notebook that did not run to its end, or whose results are asked for all the same."""
 
 
 # Where things live ---------------------------------------------------------------------------------------------------
@@ -89,95 +85,42 @@ class Run:
         return folder
 
 
-def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "") -> Run:
+def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", **others: Any) -> Run:
     """The run that a notebook belongs to. Touches no file.
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
     run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
+    others: the notebook's other parameters, checked against the same schema.
     Raises ParameterError naming the value and what is allowed.
     """
-    if type(scale) is not str:
-        raise ParameterError(f"scale is {scale!r}, expected a string: one of {', '.join(SCALES)}, or ''.")
-    scale, origin = (scale, "scale") if scale else (os.environ.get("TSM_SCALE") or "laptop", "TSM_SCALE")
-    if scale not in SCALES:
-        raise ParameterError(f"{origin} is {scale!r:.80}, expected one of {', '.join(SCALES)}.")
-    if type(seed) is not int or not 0 <= seed < 2**31:
-        raise ParameterError(f"seed is {seed!r:.80}, expected a whole number from 0 to {2**31 - 1}.")
-    if type(run_dir) is not str:
-        raise ParameterError(f"run_dir is {run_dir!r:.80}, expected a folder name as a string.")
-    run_dir, origin = (run_dir, "run_dir") if run_dir else (os.environ.get("TSM_RUN_DIR") or "runs", "TSM_RUN_DIR")
-    if not run_dir.isprintable() or len(run_dir) > 1000 or run_dir.startswith("~") or ".." in Path(run_dir).parts:
-        raise ParameterError(
-            f"{origin} is {run_dir!r:.80}, expected an absolute path, or one inside the repository, without '..', a "
-            "leading '~' or control characters."
-        )
-    base = ROOT / run_dir
-    if base.exists() and not base.is_dir():
-        raise ParameterError(f"{origin} is {base}, which is a file; expected a folder.")
+    schema.check("seed", seed)
+    scale = _setting("scale", scale, "TSM_SCALE", "laptop")
+    base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
+    defaults = schema.declared(notebooks()[notebook[3:]]) if others and notebook[3:] in notebooks() else {}
+    for name, value in others.items():
+        schema.check(name, value, default=defaults.get(name, value))
+    try:
+        if base.exists() and not base.is_dir():
+            raise ParameterError(f"run_dir is {base}, which is a file; expected a folder.")
+    except (OSError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(f"run_dir is {str(base)[:80]!a}, expected the name of a folder: {error}.") from None
     return Run(notebook, scale, seed, base / scale / f"seed{seed}")
 
 
-# Notebooks and their parameters --------------------------------------------------------------------------------------
+def _setting(name: str, value: str, variable: str, default: str) -> str:
+    """A parameter, else its environment variable, else ``default``."""
+    schema.check(name, value)
+    return value or schema.check(name, os.environ.get(variable, ""), origin=variable) or default
+
+
+# Notebooks ------------------------------------------------------------------------------------------------------------
 
 
 def notebooks() -> dict[str, Path]:
     """Word -> file, in order: 'control' is notebooks/05_control.ipynb."""
     return {path.stem[3:]: path for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
-
-
-def parameters(notebook: Path) -> dict[str, Any]:
-    """Name -> default of every parameter: the literals in the cell tagged ``parameters``."""
-    try:
-        cells = json.loads(notebook.read_text())["cells"]
-        tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
-        sources = ["".join(cell["source"]) for cell in tagged]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ParameterError(f"{notebook} is not a notebook: {error}. Restore it.") from error
-    if len(sources) != 1:
-        raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one.")
-    found: dict[str, Any] = {}
-    try:
-        for statement in ast.parse(sources[0]).body:
-            match statement:
-                case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                    found[name] = ast.literal_eval(value)
-                case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
-                    found[name] = ast.literal_eval(value)
-                case _:
-                    raise ValueError(f"line {statement.lineno} is not 'name = literal'")
-    except (ValueError, SyntaxError) as error:
-        raise ParameterError(f"{notebook.name}, parameters cell: {error}; expected 'name = literal' only.") from error
-    return found
-
-
-def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Any]:
-    """Values for a notebook's parameters from their text, with the types of its defaults.
-
-    Unknown names are refused here because papermill only warns about them, and executes them as code.
-    """
-    defaults = parameters(notebook)
-    values: dict[str, Any] = {}
-    for name, text in given.items():
-        if name not in defaults:
-            raise ParameterError(f"{notebook.stem} has no parameter {name!r:.80}; it has {', '.join(defaults)}.")
-        values[name] = convert(f"{notebook.stem}: {name}", text, type(defaults[name]))
-    return values
-
-
-def convert(name: str, text: str, kind: type) -> Any:
-    """``text`` as a bool, int, float or string; ParameterError, naming ``name``, if it is none."""
-    if kind is bool and text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    if kind is int and re.fullmatch(r"[+-]?[0-9]{1,18}", text):
-        return int(text)
-    if kind is float and re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", text):
-        if math.isfinite(float(text)):
-            return float(text)
-    elif kind is str and text.isprintable() and len(text) <= 1000:
-        return text
-    kinds = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text on one line"}
-    expected = kinds.get(kind, "to be left as it is: edit the notebook to change it")
-    raise ParameterError(f"{name} is {text!r:.80}, expected {expected}.")
 
 
 # Execution -----------------------------------------------------------------------------------------------------------
@@ -192,19 +135,32 @@ def execute(
     Raises ParameterError for bad parameters, RunError if another process writes to the same run or the notebook does
     not reach its end.
     """
-    values = {"scale": scale, "seed": seed, **typed(notebook, given or {})}
-    values = {name: values[name] for name in parameters(notebook) if name in values}
+    defaults = schema.declared(notebook)
+    values = {"scale": scale, "seed": seed, **schema.typed(notebook, given or {})}
+    values = {name: values[name] for name in defaults if name in values}
     run = resolve(notebook.stem, **{name: values[name] for name in ("scale", "seed", "run_dir") if name in values})
     if "scale" in values:
         values["scale"] = run.scale
-    with _only_writer(run), _terminable():
+    from tsmlib import store  # heavy, and not needed to refuse a parameter
+    from tsmlib.disk import only_writer
+    from tsmlib.provenance import provenance
+
+    try:
+        hold = contextlib.ExitStack()
+        hold.enter_context(only_writer(run.dir, run.notebook))
+    except store.StoreError as error:
+        raise RunError(str(error)) from None
+    with hold, _terminable():
         began = time.monotonic()
+        before = _stamps(run)
         status: dict[str, Any] = {"pid": os.getpid(), "started": _now(), "parameters": values}
+        status |= {"scale": run.scale, "seed": run.seed, "provenance": provenance()}
         _note(run, {**status, "state": "running"})
-        ended = {"state": "interrupted", "error": "stopped before its end"}
+        ended: dict[str, Any] = {"state": "interrupted", "error": "stopped before its end"}
         try:
             executed = _papermill(notebook, run, values, progress)
-            ended = {"state": "complete"}
+            made = [path for path, stamp in _stamps(run).items() if before.get(path) != stamp]
+            ended = {"state": "complete", "files": store.listing(run.dir, sorted(made))}
         except RunError as error:
             ended = {"state": "failed", "error": str(error)}
             raise
@@ -212,6 +168,54 @@ def execute(
             seconds = round(time.monotonic() - began, 1)
             _note(run, {**status, **ended, "finished": _now(), "seconds": seconds})
     return executed
+
+
+def require(run: Run, notebook: str) -> dict[str, Any]:
+    """The status entry of a notebook of ``run`` that is complete and whose results are as it left them.
+
+    Raises RunError naming the state and the command that makes what is missing.
+    """
+    from tsmlib import store
+
+    command = f"python -m tsmlib run {notebook[3:]} --scale {run.scale} --seed {run.seed}"
+    path = run.dir / store.STATUS
+    entry: Any = (
+        store.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
+    )
+    state = entry.get("state") if isinstance(entry, dict) else "damaged"
+    if state == "running" and not _alive(entry):
+        state = "interrupted: its process is gone"
+    if state == "complete" and {"files", "sha256"} & set(entry) and not store.intact(entry):  # older ones have neither
+        state = "damaged"
+    if state != "complete":
+        raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. Run it: {command}")
+    try:
+        changed = [
+            name
+            for name, file in entry.get("files", {}).items()
+            if not (run.dir / name).is_file() or store.sha256(run.dir / name) != file["sha256"]
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        changed = [f"{store.STATUS} ({error!r:.80})"]
+    if changed:
+        raise RunError(f"{run.dir / changed[0]} is not what {notebook} made, or is gone. Run it again: {command}")
+    return entry
+
+
+def _alive(entry: Mapping[str, Any]) -> bool:
+    try:
+        os.kill(int(entry["pid"]), 0)
+    except (KeyError, TypeError, ValueError, OverflowError, ProcessLookupError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
+    """Tables and pictures of a run, and when each was written."""
+    found = [path for folder in ("metrics", "figures") for path in (run.dir / folder).glob("[!.]*") if path.is_file()]
+    return {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in found}
 
 
 def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool) -> Path:
@@ -240,11 +244,20 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
     except Exception as error:  # a dead kernel, a full disk, ...
         failure = f"{type(error).__name__}: {error}"
     finally:
-        if unfinished.exists():
+        if unfinished.exists() and _is_whole(unfinished):
             os.replace(unfinished, output)
+        unfinished.unlink(missing_ok=True)
     if failure:
         raise RunError(f"{notebook.stem} failed: {failure}\nSee {output}")
     return output
+
+
+def _is_whole(notebook: Path) -> bool:
+    """Whether papermill came to the end of writing it, which a full disk prevents."""
+    try:
+        return bool(json.loads(notebook.read_text())["cells"])
+    except (OSError, ValueError, KeyError):
+        return False
 
 
 def _literally(path: Path) -> str:
@@ -257,38 +270,17 @@ def _now() -> str:
 
 
 def _note(run: Run, entry: Mapping[str, Any]) -> None:
-    """Write this notebook's entry of status.json."""
+    """Write this notebook's entry of status.json. A file that it made again is no longer another's."""
     from tsmlib import store
 
-    path = run.dir / "status.json"
-    entries: dict[str, Any] = {}
-    with contextlib.suppress(store.StoreError):
-        entries = dict(store.read_json(path))
-    store.write_json(path, {**entries, run.notebook: entry})
-
-
-@contextlib.contextmanager
-def _only_writer(run: Run) -> Iterator[None]:
-    """Hold the run's folder; the lock goes when this process does."""
-    try:
-        import fcntl
-    except ImportError:  # no such locks on Windows
-        yield
-        return
-    run.folder()
-    with open(run.dir / ".lock", "a+") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.seek(0)
-            raise RunError(
-                f"{run.dir} is being written by another process ({lock.read().strip() or 'unknown'}). Wait for it, or "
-                "take another seed, or another folder with TSM_RUN_DIR."
-            ) from None
-        lock.truncate(0)
-        lock.write(f"pid {os.getpid()}, {run.notebook}, since {_now()}")
-        lock.flush()
-        yield
+    path = run.dir / store.STATUS
+    entries: dict[str, Any] = store.read_own_json(path) if path.exists() else {}
+    entries[run.notebook] = store.sealed(entry)
+    for name, other in entries.items():
+        if name != run.notebook and store.intact(other) and set(other.get("files", {})) & set(entry.get("files", {})):
+            rest = {file: stated for file, stated in other["files"].items() if file not in entry["files"]}
+            entries[name] = store.sealed({**other, "files": rest})
+    store.write_json(path, entries)
 
 
 @contextlib.contextmanager

@@ -1,9 +1,10 @@
-"""Artefacts on disk: datasets, models, tables and small JSON files. Nothing else in tsmlib writes or reads them.
+"""Artefacts on disk: datasets, models, checkpoints, tables, JSON. Nothing else in tsmlib writes or reads them.
 
 An artefact is one safetensors file that any safetensors reader opens. Its metadata holds one entry, ``tsmlib``, a JSON
 text whose first field is the SHA-256 of the whole file, taken with that field filled with zeros. So a single rename
-publishes data and checksum together, and a flipped bit, a cut or an appended byte anywhere in the file is found when it
-is loaded. Nothing is pickled, and nothing found in a file is executed.
+publishes data, manifest and checksum together, and a flipped bit, a cut or an appended byte anywhere in the file is
+found when it is loaded. Tables and JSON are listed in a manifest, or in the ``status.json`` of the run that made them.
+Nothing is pickled, and nothing found in a file is executed.
 
 Files are written beside their final name, flushed to the disk and renamed: a reader meets the old file or the new one.
 """
@@ -16,7 +17,6 @@ import hashlib
 import io
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -27,10 +27,12 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from tsmlib.disk import PathLike, StoreError, write_bytes
+from tsmlib.provenance import provenance
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
-SCHEMA = 1
-MANIFEST = "MANIFEST.json"
+SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
+MANIFEST, STATUS = "MANIFEST.json", "status.json"
 COLUMNS = (
     *("env", "sim", "task", "model", "planner", "prior", "horizon", "condition"),
     *("metric", "value", "unit", "n", "seed", "scale"),
@@ -39,12 +41,6 @@ COLUMNS = (
 _ZEROS = "0" * 64
 _MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
 _REMEDY = {"trajectories": "python -m tsmlib run collect", "model": "python -m tsmlib run train"}
-
-PathLike = str | os.PathLike[str]
-
-
-class StoreError(ValueError):
-    """An artefact that cannot be written, read or trusted: names the file, what was found and expected, the remedy."""
 
 
 class Model(Protocol):
@@ -65,7 +61,7 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
     """Write named arrays and a JSON ``header`` to ``path`` (``*.safetensors``), replacing what was there in one step.
 
     kind: one word that ``load`` must ask for. header: plain JSON values; ``{"inputs": {path: sha256}}`` in it, paths
-    relative to this file, names the files that this one was made from, for ``verify``.
+    relative to this file, names the files that this one was made from, for ``verify``. Provenance is added.
     Raises StoreError before writing anything if a value is not finite or the header is not JSON.
     """
     path = Path(path)
@@ -73,7 +69,9 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
         raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'.")
     arrays = {name: _owned(value) for name, value in tensors.items()}
     _require_finite(path, arrays, "Nothing was written.")
-    about = _dumps(path, {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind, "header": dict(header)})
+    about = _dumps(
+        path, {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind, "header": dict(header), "provenance": provenance()}
+    )
     data = safetensors.torch.save(arrays, metadata={"tsmlib": about})
     at = data.index(_MARK) + len(_MARK)
     digest = hashlib.sha256(data).hexdigest().encode()
@@ -85,19 +83,28 @@ def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Any
 
     Raises StoreError if the file is missing, damaged, of another kind, or holds a value that is not finite.
     """
-    path = Path(path)
-    data, about = _read_checked(path, kind)
-    try:
-        tensors = safetensors.torch.load(data)
-    except (safetensors.SafetensorError, ValueError, KeyError) as error:
-        raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(kind)}") from error
-    _require_finite(path, tensors, _again(kind))
+    tensors, about = _load(Path(path), kind)
+    _require_finite(Path(path), tensors, _again(kind))
     return tensors, about["header"]
 
 
 def read_header(path: PathLike) -> dict[str, Any]:
     """The header alone, of an artefact of any kind. The whole file is checked all the same."""
     return _read_checked(Path(path))[1]["header"]
+
+
+def read_provenance(path: PathLike) -> dict[str, Any]:
+    """What made an artefact, see ``provenance``; empty for files of format 1. The whole file is checked."""
+    return _read_checked(Path(path))[1].get("provenance", {})
+
+
+def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Arrays, not yet known to be finite, and everything that the ``tsmlib`` entry says."""
+    data, about = _read_checked(path, kind)
+    try:
+        return safetensors.torch.load(data), about
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(kind)}") from error
 
 
 def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str, Any]]:
@@ -121,14 +128,16 @@ def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str,
             f"{stated[:12]!a}.... {_again(kind)}"
         )
     try:
-        about = json.loads(json.loads(data[8:header_end])["__metadata__"]["tsmlib"])
-        schema, found, _ = about["schema"], about["kind"], dict(about["header"])
+        about = _loads(_loads(data[8:header_end])["__metadata__"]["tsmlib"])
+        schema, found, _ = about["schema"], about["kind"], {**about["header"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {_again(kind)}") from error
-    if schema != SCHEMA:
-        raise StoreError(f"{path} is written in format {schema}, expected {SCHEMA}. Update tsmlib, or make it again.")
+    if type(schema) is not int or not 1 <= schema <= SCHEMA:
+        raise StoreError(
+            f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
+        )
     if kind is not None and found != kind:
-        raise StoreError(f"{path} holds '{found}', expected '{kind}'. {_again(kind)}")
+        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_again(kind)}")
     return data, about
 
 
@@ -159,18 +168,33 @@ def _again(kind: str | None) -> str:
 
 
 def save_trajectories(path: PathLike, trajectories: Trajectories, header: Mapping[str, Any] | None = None) -> None:
-    """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, ...)."""
+    """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, fingerprint, ...)."""
     t = trajectories
     fields = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
     arrays = {"states": t.states.astype(np.float32), "actions": t.actions.astype(np.float32)}
     save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": fields})
 
 
-def load_trajectories(path: PathLike, *, env: str | None = None) -> Trajectories:
-    """Read what ``save_trajectories`` wrote; with ``env``, refuse data of another environment."""
-    tensors, header = load(path, kind="trajectories")
+def load_trajectories(
+    path: PathLike, *, env: str | None = None, expect: Mapping[str, Any] | None = None
+) -> Trajectories:
+    """Read what ``save_trajectories`` wrote; with ``env`` or ``expect``, a fingerprint, refuse data of anything else.
+
+    Raises StoreError naming episode, step and field of a value that is not finite.
+    """
+    path = Path(path)
+    tensors, about = _load(path, "trajectories")
     try:
-        fields = header["trajectories"]
+        fields = about["header"]["trajectories"]
+        kinds = {name: str(tensor.dtype) for name, tensor in tensors.items()}
+        if kinds != dict.fromkeys(("states", "actions"), "torch.float32"):
+            raise TypeError(f"found {kinds}, expected 'states' and 'actions' in torch.float32")
+        words = [fields["env"], *fields["names"], *fields["units"]]
+        size = tensors["states"].shape[-1]
+        if not all(isinstance(word, str) for word in words) or not 0 < fields["dt"] < math.inf:
+            raise TypeError(f"env, names, units or dt make no sense: {fields!r:.200}")
+        if not all(type(index) is int and 0 <= index < size for index in fields["angles"]):
+            raise TypeError(f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions")
         found = Trajectories(
             states=tensors["states"].numpy(),
             actions=tensors["actions"].numpy(),
@@ -180,10 +204,13 @@ def load_trajectories(path: PathLike, *, env: str | None = None) -> Trajectories
             units=tuple(fields["units"]),
             angles=tuple(fields["angles"]),
         )
-    except (KeyError, TypeError, TrajectoryError) as error:
+        fingerprint = {**about["header"].get("fingerprint", {}), **fields}
+    except (KeyError, IndexError, TypeError, TrajectoryError) as error:
         raise StoreError(f"{path} holds no usable trajectories: {error}. {_again('trajectories')}") from error
     if env is not None and found.env != env:
         raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_again('trajectories')}")
+    if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_again('trajectories')}")
     return found
 
 
@@ -191,8 +218,11 @@ def save_model(path: PathLike, model: Model, header: Mapping[str, Any] | None = 
     """Write the weights of ``model`` with its class name and constructor arguments.
 
     header["fingerprint"]: what the model fits (env, dt, names, ...), compared field by field by ``load_model``.
+    The length H of its segments joins it there.
     """
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
+    if hasattr(model, "segment_len"):
+        about["fingerprint"] = {"segment_len": model.segment_len, **about.get("fingerprint", {})}
     save(path, model.state_dict(), kind="model", header=about)
 
 
@@ -200,27 +230,50 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     """Build ``cls(**config)`` from the file and load its weights, strictly.
 
     expect: fields that the file's fingerprint must hold with these values. Raises StoreError naming both sides of
-    every field that differs, and for a file of another class or with other weights.
+    every field that differs, and for a file of another class or with weights of other shapes or types.
     """
-    tensors, header = load(path, kind="model")
+    path = Path(path)
+    tensors, about = _load(path, "model")
+    _require_finite(path, tensors, _again("model"))
+    header = about["header"]
     if header.get("class") != cls.__name__:
-        raise StoreError(f"{path} holds a {header.get('class')}, expected a {cls.__name__}. {_again('model')}")
-    fingerprint = header.get("fingerprint", {})
-    wanted = json.loads(_dumps(Path(path), dict(expect or {})))  # tuples become lists, as in the file
-    differs = [
-        f"{name} is {fingerprint.get(name, 'not stated')!r} in the file, expected {value!r}"
-        for name, value in wanted.items()
-        if name not in fingerprint or fingerprint[name] != value
-    ]
-    if differs:
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. Load a model that does, or {_REMEDY['model']}")
+        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_again('model')}")
     try:
-        model = cls(**header["config"])
-        model.load_state_dict(tensors, strict=True)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        first = str(error).strip().replace("\n\t", " ")
-        raise StoreError(f"{path} does not fit the present {cls.__name__}: {first} {_again('model')}") from error
+        config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
+        with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
+            planned = layout(cls(**config).state_dict())
+        differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
+    except Exception as error:  # what the file says goes to a constructor, which may fail in any way
+        raise StoreError(
+            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_again('model')}"
+        ) from error
+    if differs:
+        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_again('model')}")
+    if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. Load a model that does, or {_REMEDY['model']}")
+    model = cls(**config)
+    model.load_state_dict(tensors, strict=True)
     return model
+
+
+def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_stated: bool = False) -> list[str]:
+    """What ``expected`` asks for and ``found``, from a file, does not hold, naming both sides.
+
+    only_stated: what ``found`` does not mention is not asked for, except the environment.
+    """
+    wanted = json.loads(json.dumps(dict(expected)))  # tuples become lists, as in a file
+    return [
+        f"{name} is {found.get(name, 'not stated')!r} in the file, expected {value!r}"
+        for name, value in wanted.items()
+        if found.get(name) != value and (name in found or name == "env" or not only_stated)
+    ]
+
+
+def layout(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Type and shape of each array, in words."""
+    return {
+        name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}" for name, tensor in tensors.items()
+    }
 
 
 # Tables and JSON -----------------------------------------------------------------------------------------------------
@@ -269,11 +322,25 @@ def write_json(path: PathLike, value: Any) -> None:
 def read_json(path: PathLike) -> Any:
     """Read a JSON file. Checked against the folder's manifest, if any."""
     try:
-        return json.loads(_text(Path(path)))
+        return _loads(_text(Path(path)))
     except (ValueError, RecursionError) as error:
         if isinstance(error, StoreError):
             raise
         raise StoreError(f"{path} is not valid JSON: {error}. {_again(None)}") from error
+
+
+def read_own_json(path: PathLike) -> Any:
+    """Read a manifest or a status, which must be as ``write_json`` left it, to the byte."""
+    path = Path(path)
+    data = _read(path)
+    try:
+        value = _loads(data)
+        as_written = data == (_dumps(path, value, indent=1) + "\n").encode()
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged: {error}. {_restore(path)}") from error
+    if not as_written or not isinstance(value, dict):
+        raise StoreError(f"{path} is damaged: it is not as it was written. {_restore(path)}")
+    return value
 
 
 def _plain(value: Any) -> Any:
@@ -288,6 +355,15 @@ def _number(field: str) -> Any:
         with contextlib.suppress(ValueError):
             return convert(field)
     return field
+
+
+def _loads(text: str | bytes) -> Any:
+    """JSON without the numbers that JSON does not have."""
+
+    def refuse(word: str) -> Any:
+        raise ValueError(f"{word} is not a JSON value")
+
+    return json.loads(text, parse_constant=refuse)
 
 
 def _dumps(path: Path, value: Any, indent: int | None = None) -> str:
@@ -323,15 +399,35 @@ def write_manifest(folder: PathLike) -> None:
     """Write ``MANIFEST.json``: size and SHA-256 of every file under ``folder`` (for folders that are shipped)."""
     folder = Path(folder)
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != MANIFEST and not p.name.startswith(".")]
-    entries = {p.relative_to(folder).as_posix(): {"bytes": p.stat().st_size, "sha256": sha256(p)} for p in files}
-    write_json(folder / MANIFEST, {"files": entries, "sha256": _entries_digest(entries)})
+    write_json(folder / MANIFEST, sealed({"files": listing(folder, files)}))
+
+
+def listing(folder: Path, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of each file, by its name relative to ``folder``."""
+    return {p.relative_to(folder).as_posix(): {"bytes": p.stat().st_size, "sha256": sha256(p)} for p in files}
+
+
+def sealed(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A JSON object with the SHA-256 of its other fields in ``sha256``."""
+    return {**entry, "sha256": _seal(entry)}
+
+
+def intact(entry: Any) -> bool:
+    """Whether an object that ``sealed`` made is as it was."""
+    return isinstance(entry, dict) and "sha256" in entry and entry["sha256"] == _seal(entry)
+
+
+def _seal(entry: Mapping[str, Any]) -> str:
+    rest = {name: value for name, value in entry.items() if name != "sha256"}
+    text = json.dumps(rest["files"] if set(rest) == {"files"} else rest, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def verify(path: PathLike) -> list[Path]:
     """Hash again an artefact and the inputs it names, or everything under a folder. Returns the files checked.
 
-    In a folder, every artefact and every file that a manifest lists is checked. Inputs that are no longer there are
-    passed over. Raises StoreError listing every problem, one a line.
+    In a folder, every artefact and every file that a manifest or a run's status lists is checked. Inputs that are no
+    longer there are passed over. Raises StoreError listing every problem, one a line.
     """
     path = Path(path)
     if not path.exists():
@@ -356,7 +452,7 @@ def verify(path: PathLike) -> list[Path]:
     path = path.resolve()
     found = [path] if path.is_file() else sorted(path.rglob("*"))
     for file in found:
-        if file.name == MANIFEST:
+        if file.name in (MANIFEST, STATUS):
             try:
                 for name, digest in _manifest(file).items():
                     check(file.parent / name, digest)
@@ -375,80 +471,50 @@ def verify(path: PathLike) -> list[Path]:
 
 
 def _manifest(path: Path) -> dict[str, str]:
-    """File name -> SHA-256, from a manifest that is itself intact."""
+    """File name -> SHA-256, from a manifest that is itself intact, or from the complete notebooks of a status."""
     try:
-        value = json.loads(_read(path))
-        entries = value["files"]
-        intact = _entries_digest(entries) == value["sha256"] and set(value) == {"files", "sha256"}
-        digests = {name: str(entry["sha256"]) for name, entry in entries.items()}
+        value = read_own_json(path)
+        if path.name == STATUS:
+            entries = [entry for entry in value.values() if "files" in entry and entry["state"] == "complete"]
+        else:
+            entries = [value]
+            if set(value) != {"files", "sha256"}:
+                raise TypeError("expected 'files' and 'sha256'")
+        digests = {name: str(file["sha256"]) for entry in entries for name, file in entry["files"].items()}
+        whole = all(map(intact, entries))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         if isinstance(error, StoreError):
             raise
-        raise StoreError(f"{path} is not a manifest ({error!r}). Restore it.") from error
-    if not intact:
-        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. Restore it.")
+        raise StoreError(f"{path} is not a manifest ({error!r}). {_restore(path)}") from error
+    if not whole:
+        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {_restore(path)}")
     if any(name.is_absolute() or ".." in name.parts for name in map(Path, digests)):
-        raise StoreError(f"{path} lists files outside its own folder. Restore it.")
+        raise StoreError(f"{path} lists files outside its own folder. {_restore(path)}")
     return digests
 
 
-def _entries_digest(entries: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+def _restore(path: Path) -> str:
+    if path.name == STATUS:
+        return "Delete it and run the notebooks again: python -m tsmlib run all"
+    return "Restore it: git checkout -- data, where it came with the repository."
 
 
 def _listed(path: Path) -> str | None:
-    """The SHA-256 that the nearest manifest states for ``path``."""
+    """The SHA-256 that the nearest manifest or status states for ``path``."""
     for folder in path.parents:
-        if (folder / MANIFEST).is_file():
-            return _manifest(folder / MANIFEST).get(path.relative_to(folder).as_posix())
+        for name in (MANIFEST, STATUS):
+            if (folder / name).is_file():
+                return _manifest(folder / name).get(path.relative_to(folder).as_posix())
     return None
 
 
 # Bytes ---------------------------------------------------------------------------------------------------------------
 
 
-def write_bytes(path: PathLike, data: bytes) -> None:
-    """Replace ``path`` by ``data`` in one step, creating its folder; on failure the old file stays and nothing else."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for left in path.parent.glob(f".{path.name}.tmp-*"):  # by a process that was killed
-            if not _alive(left.name.rpartition("-")[2]):
-                left.unlink(missing_ok=True)
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        if os.name != "nt":  # Windows opens no folders
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-    except OSError as error:
-        raise StoreError(
-            f"cannot write {path} ({len(data)} bytes): {error.strerror or error}. Make room or permission there, or "
-            "name another folder with TSM_RUN_DIR."
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def _alive(pid: str) -> bool:
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OverflowError, PermissionError):
-        pass
-    return True
-
-
 def _read(path: Path, kind: str | None = None) -> bytes:
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("it is a folder or a device, expected a file")
         return path.read_bytes()
     except FileNotFoundError:
         command = _REMEDY.get(kind or "")
@@ -460,8 +526,11 @@ def _read(path: Path, kind: str | None = None) -> bytes:
 def _text(path: Path) -> str:
     data = _read(path)
     wanted = _listed(path.resolve())
-    if wanted is not None and hashlib.sha256(data).hexdigest() != wanted:
-        raise StoreError(f"{path} is damaged: its SHA-256 is not the one in {MANIFEST}. {_again(None)}")
+    if wanted is not None and (found := hashlib.sha256(data).hexdigest()) != wanted:
+        raise StoreError(
+            f"{path} is damaged, or was changed after its run was complete: its SHA-256 is {found[:12]}..., expected "
+            f"{wanted[:12]}.... {_again(None)}"
+        )
     try:
         return data.decode()
     except UnicodeDecodeError as error:

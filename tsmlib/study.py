@@ -6,6 +6,8 @@ with a progress bar. This is the only module that knows how much of everything e
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,7 +24,6 @@ from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
 from tsmlib.envs import has_block
-from tsmlib.envs.base import DT, STATE_NAMES
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ROOT, ParameterError, Run
 from tsmlib.train import fit
@@ -96,12 +97,14 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     n = sizes(run, env)[split]
     path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
     if path.exists():
-        return store.load_trajectories(path, env=env)
+        return store.load_trajectories(path, env=env, expect=fingerprint(env))
     if run.seed in HELD_OUT_SEED.values():
         raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
     seed = HELD_OUT_SEED.get(split, run.seed)
     data = random_data(env, n, seed=seed)
-    store.save_trajectories(path, data, {"split": split, "seed": seed, "scale": run.scale})
+    store.save_trajectories(
+        path, data, {"split": split, "seed": seed, "scale": run.scale, "fingerprint": fingerprint(env)}
+    )
     return data
 
 
@@ -116,8 +119,7 @@ def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajector
 
 def fingerprint(env: str) -> dict[str, Any]:
     """What a model of this environment was made for; a file that says otherwise is refused."""
-    names = STATE_NAMES if has_block(env) else STATE_NAMES[:6]
-    return {"env": env, "dt": DT, "names": list(names)}
+    return tsmlib.envs.fingerprint(env)
 
 
 # Models --------------------------------------------------------------------------------------------------------------
@@ -185,7 +187,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
     net = fresh(run, model, data)
     curves = {}
     for stage in schedule(run, env, model):
-        checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint.safetensors")
+        checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint")
         curve = fit(
             net, getattr(net, stage.loss), data, held_out,
             past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr,
@@ -198,11 +200,18 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
         "seconds": sum(c["seconds"][-1] for c in curves.values()), "torch": torch.__version__,
         "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+        "inputs": _inputs(run, env, path),
     }  # fmt: skip
     store.save_model(path, net, header)
     for stage in schedule(run, env, model):
-        path.with_name(f"{model}-{stage.loss}.checkpoint.safetensors").unlink()
+        shutil.rmtree(path.with_name(f"{model}-{stage.loss}.checkpoint"))
     return net, store.read_header(path)
+
+
+def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
+    """The data that a model in ``path`` was trained on: file, relative to the model, and SHA-256."""
+    files = [run.data / short(env) / f"{split}.safetensors" for split in ("train", "validation")]
+    return {Path(os.path.relpath(file, path.parent)).as_posix(): store.sha256(file) for file in files}
 
 
 def fresh(run: Run, model: str, data: Trajectories) -> Any:

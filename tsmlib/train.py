@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from tsmlib import store
+from tsmlib.checkpoint import Curve, Progress, TrainingStopped
+from tsmlib.disk import only_writer
+from tsmlib.store import digest
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
+__all__ = ["Curve", "TrainingStopped", "fit", "fixed_windows", "schedule", "validate"]
+
 Loss = Callable[[Window, torch.Generator], Tensor]
-
-
-class TrainingStopped(RuntimeError):
-    """The loss was not finite; the model holds the last good weights. The message names step and remedy."""
-
-
-@dataclass
-class Curve:
-    """What a fit recorded at each validation: optimiser step, seconds, training and validation loss."""
-
-    step: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    train: list[float] = field(default_factory=list)
-    validation: list[float] = field(default_factory=list)
 
 
 def fit(
@@ -52,14 +41,14 @@ def fit(
     patience: int = 0,  # validations without improvement before stopping early; 0: never
     seed: int = 0,
     bf16: bool = False,  # matrix products in bfloat16, weights in float32
-    checkpoint: Path | None = None,
+    checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
 ) -> Curve:
     """Minimise ``loss`` over random windows with Adam; leave the weights with the best validation loss in ``model``.
 
-    Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint`` continues as if it
-    had not stopped. Raises TrainingStopped at the first loss that is not finite, with the best weights so far in
-    ``model``, and store.StoreError for a checkpoint of another run.
+    Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint``, a folder, continues
+    as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
+    weights so far in ``model``, and StoreError for a checkpoint of another run, or one that another process writes.
     """
     if steps < 1 or batch_size < 1 or validate_every < 1:
         raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
@@ -69,120 +58,56 @@ def fit(
         past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final,
         warmup=warmup, clip=clip, validate_every=validate_every, patience=patience, seed=seed, bf16=bf16,
         loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
+        data=[_digest(data) for data in (train, validation)],
     )  # fmt: skip
-    if checkpoint is not None and checkpoint.exists():
-        state.load(checkpoint, identity)
     generator = torch.Generator()
     held_out = fixed_windows(validation, past_len, future_len)
     draw = batches(
         train.padded(past_len),
         past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator,
     )  # fmt: skip
-    began, total, counted = time.perf_counter() - state.seconds, 0.0, 0
-    bar = tqdm(total=steps, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
-    for step in range(state.step, steps):
-        if patience and step - state.best_step >= patience * validate_every:
-            break
-        generator.manual_seed(seed * 1_000_003 + step)
-        for group in optimizer.param_groups:
-            group["lr"] = schedule(step, steps, lr, lr_final, warmup)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            value = loss(next(draw), generator)
-        if not torch.isfinite(value):
-            raise state.stopped("training", value.item(), f"{step} of {steps}", lr)
-        optimizer.zero_grad(set_to_none=True)
-        value.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), clip)
-        optimizer.step()
-        total, counted = total + value.item(), counted + 1
-        bar.update()
-        if (step + 1) % validate_every == 0 or step + 1 == steps:
-            state.step, state.seconds = step + 1, time.perf_counter() - began
-            held_out_loss = validate(loss, held_out, seed)
-            if not math.isfinite(held_out_loss):
-                raise state.stopped("validation", held_out_loss, f"{step + 1} of {steps}", lr)
-            state.record(total / counted, held_out_loss)
-            bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
-            total, counted = 0.0, 0
-            if checkpoint is not None:
-                state.save(checkpoint, identity)
-    bar.close()
+    with contextlib.ExitStack() as stack:
+        if checkpoint is not None:
+            stack.enter_context(only_writer(checkpoint, f"training, seed {seed}"))
+            state.load(checkpoint, identity)
+        began, total, counted = time.perf_counter() - state.seconds, 0.0, 0
+        bar = stack.enter_context(
+            tqdm(total=steps, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
+        )
+        for step in range(state.step, steps):
+            if patience and step - state.best_step >= patience * validate_every:
+                break
+            generator.manual_seed(seed * 1_000_003 + step)
+            for group in optimizer.param_groups:
+                group["lr"] = schedule(step, steps, lr, lr_final, warmup)
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                value = loss(next(draw), generator)
+            if not torch.isfinite(value):
+                raise state.stopped("training loss", value.item(), f"{step} of {steps}", lr)
+            optimizer.zero_grad(set_to_none=True)
+            value.backward()
+            norm = nn.utils.clip_grad_norm_(model.parameters(), clip)
+            if not torch.isfinite(norm):  # before it reaches the weights
+                raise state.stopped("gradient", norm.item(), f"{step} of {steps}", lr)
+            optimizer.step()
+            total, counted = total + value.item(), counted + 1
+            bar.update()
+            if (step + 1) % validate_every == 0 or step + 1 == steps:
+                state.step, state.seconds = step + 1, time.perf_counter() - began
+                held_out_loss = validate(loss, held_out, seed)
+                if not math.isfinite(held_out_loss):
+                    raise state.stopped("validation loss", held_out_loss, f"{step + 1} of {steps}", lr)
+                state.record(total / counted, held_out_loss)
+                bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
+                total, counted = 0.0, 0
+                if checkpoint is not None:
+                    state.save(checkpoint, identity)
     state.restore_best()
     return state.curve
 
 
-class Progress:
-    """All that a run needs to continue: weights, Adam's moments, the step, the best weights and the curve so far."""
-
-    def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> None:
-        self.model, self.optimizer = model, optimizer
-        self.step, self.seconds, self.curve = 0, 0.0, Curve()
-        self.best, self.best_step, self.best_loss = _copy(model.state_dict()), 0, math.inf
-
-    def record(self, train: float, validation: float) -> None:
-        """Add a point to the curve; keep the weights if they are the best so far."""
-        self.curve.step.append(self.step)
-        self.curve.seconds.append(self.seconds)
-        self.curve.train.append(train)
-        self.curve.validation.append(validation)
-        if validation < self.best_loss:
-            self.best, self.best_step, self.best_loss = _copy(self.model.state_dict()), self.step, validation
-
-    def restore_best(self) -> None:
-        """Put the weights with the best validation loss into the model."""
-        self.model.load_state_dict(self.best)
-
-    def stopped(self, which: str, loss: float, at: str, lr: float) -> TrainingStopped:
-        """Go back to the best weights; the error to raise."""
-        self.restore_best()
-        return TrainingStopped(
-            f"the {which} loss became {loss} at step {at}; the weights of step {self.best_step} are kept. "
-            f"Check the data, or train with a smaller lr than {lr:g}"
-        )
-
-    def save(self, path: Path, identity: dict[str, Any]) -> None:
-        """Write one checkpoint, replacing the one before it in a single step."""
-        adam = self.optimizer.state_dict()["state"]
-        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
-        tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
-        tensors |= {f"adam.{i}.{name}": tensor for i, moments in adam.items() for name, tensor in moments.items()}
-        header = dict(
-            identity=identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
-            best_step=self.best_step, best_loss=self.best_loss,
-        )  # fmt: skip
-        store.save(path, tensors, kind="checkpoint", header=header)
-
-    def load(self, path: Path, identity: dict[str, Any]) -> None:
-        """Continue from a checkpoint of the same run; StoreError names what differs otherwise."""
-        tensors, header = store.load(path, kind="checkpoint")
-        differs = [
-            f"{k} is {header['identity'].get(k)!r}, now {v!r}"
-            for k, v in identity.items()
-            if header["identity"].get(k) != v
-        ]
-        if differs:
-            raise store.StoreError(
-                f"{path} is the checkpoint of another run: {'; '.join(differs)}. Delete it to start anew"
-            )
-        groups: dict[str, dict[str, Tensor]] = {"model": {}, "best": {}, "adam": {}}
-        for name, tensor in tensors.items():
-            group, _, rest = name.partition(".")
-            groups[group][rest] = tensor
-        try:
-            self.model.load_state_dict(groups["model"])
-        except RuntimeError as error:
-            first = str(error).partition("\n\t")[2].partition("\n")[0]
-            raise store.StoreError(
-                f"{path} holds the weights of another model: {first} Delete it to start anew"
-            ) from error
-        self.best = groups["best"]
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in groups["adam"].items():
-            index, _, moment = name.partition(".")
-            moments.setdefault(int(index), {})[moment] = tensor
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
-        self.step, self.seconds, self.curve = header["step"], header["seconds"], Curve(**header["curve"])
-        self.best_step, self.best_loss = header["best_step"], header["best_loss"]
+def _digest(data: Trajectories) -> str:
+    return digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})[:16]
 
 
 def schedule(step: int, steps: int, lr: float, lr_final: float, warmup: int) -> float:
@@ -210,7 +135,3 @@ def fixed_windows(data: Trajectories, past_len: int, future_len: int, n_windows:
 def validate(loss: Loss, window: Window, seed: int) -> float:
     """The loss on fixed windows with fixed noise."""
     return loss(window, torch.Generator().manual_seed(seed)).item()
-
-
-def _copy(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in state.items()}

@@ -4,9 +4,19 @@
 whole action sequences at once. The state is the observation, and its layout is the same in both simulators.
 """
 
+from typing import Any
+
 import gymnasium
 
-from tsmlib.envs.base import ArmEnv, ArmVectorEnv, SimulationUnstable, closest_gap
+from tsmlib.envs.base import (
+    DT,
+    STATE_NAMES,
+    STATE_UNITS,
+    ArmEnv,
+    ArmVectorEnv,
+    SimulationUnstable,
+    closest_gap,
+)
 
 MUJOCO_IDS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
 PYMUNK_IDS = ("tsm/PymunkReacher-v0", "tsm/PymunkObstacle-v0", "tsm/PymunkPush-v0")
@@ -30,5 +40,30 @@ def has_block(env: str) -> bool:
     return "Reacher-v0" not in env
 
 
-__all__ = ["ENV_IDS", "MUJOCO_IDS", "PYMUNK_IDS", "ArmEnv", "ArmVectorEnv", "SimulationUnstable", "closest_gap",
-           "has_block"]  # fmt: skip
+def fingerprint(env_id: str, *, noise: float = 0.0, delay: int = 0) -> dict[str, Any]:
+    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit.
+
+    noise: sigma of `SensorNoise`; delay: tau of `ActionDelay`, steps.
+    """
+    if env_id in PYMUNK_IDS:
+        from tsmlib.envs.pymunk_arm import physics_hash
+    else:
+        from tsmlib.envs.mujoco_arm import physics_hash
+    dx = 10 if has_block(env_id) else 6
+    return {
+        "env": env_id, "dt": DT, "names": list(STATE_NAMES[:dx]), "units": list(STATE_UNITS[:dx]), "angles": [0, 1],
+        "noise": noise, "delay": delay, "simulator": physics_hash(env_id),
+    }  # fmt: skip
+
+
+__all__ = [
+    "ENV_IDS",
+    "MUJOCO_IDS",
+    "PYMUNK_IDS",
+    "ArmEnv",
+    "ArmVectorEnv",
+    "SimulationUnstable",
+    "closest_gap",
+    "fingerprint",
+    "has_block",
+]

@@ -38,6 +38,7 @@ RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off 
 FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
 BLOCK_RING = (0.08, 0.17)  # m; distance of the block's centre from the shoulder at reset: within reach all around
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
+MAX_OVERLAP = 0.005  # m of block and arm in a given start; impacts reach 1.5 mm
 
 START_ANGLE = 0.1  # rad, rad/s and m: the reset distribution of Gymnasium's Reacher
 START_VELOCITY = 0.005
@@ -50,7 +51,7 @@ STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
 
 
 class SimulationUnstable(RuntimeError):
-    """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` (both from 0) and ``reason``."""
+    """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` since reset (from 0), ``reason``."""
 
     def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
         super().__init__(
@@ -150,7 +151,7 @@ class ArmVectorEnv(VectorEnv, ABC):
     def _simulate(self, actions: np.ndarray) -> np.ndarray:
         """Advance by float64 ``actions`` (N, T, 2), finite and in [-1, 1], to states (N, T, dx).
 
-        Raises SimulationUnstable, ``step`` counted from the beginning of ``actions``.
+        Raises SimulationUnstable, ``step`` counted from the beginning of ``actions``; `rollout` adds those before.
         """
 
     @abstractmethod
@@ -179,6 +180,7 @@ class ArmVectorEnv(VectorEnv, ABC):
         if "states" in options:
             states = self._checked(options["states"], self._states.shape, "states")
             states[:, 4:6] = fingertip(states[:, :2])
+            self._require_apart(states)
             target = np.stack([_in_ring(rng, 0.0, TARGET_RADIUS) for rng in rngs])
         else:
             states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
@@ -209,7 +211,11 @@ class ArmVectorEnv(VectorEnv, ABC):
             )
         if actions.shape[1] == 0:
             return np.zeros((self.num_envs, 0, len(self.names)))
-        states = self._simulate(np.clip(actions, -1.0, 1.0))
+        try:
+            states = self._simulate(np.clip(actions, -1.0, 1.0))
+        except SimulationUnstable as fault:
+            step = self._elapsed + fault.step
+            raise SimulationUnstable(fault.env, fault.episode, step, fault.reason) from None
         self._states = states[:, -1].copy()
         self._elapsed += actions.shape[1]
         return states
@@ -246,6 +252,16 @@ class ArmVectorEnv(VectorEnv, ABC):
             with_block = np.concatenate([state, _in_ring(rng, *BLOCK_RING), np.zeros(2)])
             if closest_gap(with_block, self.env_id) > BLOCK_CLEARANCE:
                 return with_block, target
+
+    def _require_apart(self, states: np.ndarray) -> None:
+        """Raise where a start puts the block into the arm, from where a simulator would throw it out."""
+        if self.task == "reacher":
+            return
+        gap = closest_gap(states, self.env_id)
+        if (gap < -MAX_OVERLAP).any():
+            episode = int(np.argmax(gap < -MAX_OVERLAP))
+            reason = f"block and arm overlap by {-1000 * gap[episode]:.1f} mm, at most {1000 * MAX_OVERLAP:g} mm may"
+            raise SimulationUnstable(self.env_id, episode, 0, reason)
 
     def _checked(self, given: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
         array = np.array(given, np.float64)

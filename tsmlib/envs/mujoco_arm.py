@@ -2,13 +2,16 @@
 
 The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions, velocities and time
 are the whole state (no automatic reset, no warm start of the constraint solver). ``mujoco.rollout`` simulates all
-episodes in C++ threads; memory is bounded by passing it a few hundred episodes at a time.
+episodes in C++ threads; memory is bounded by passing it a few hundred episodes at a time. It stops an episode at
+MuJoCo's first warning, which its clock then shows.
 
 Contacts have no friction: torques of 200 N m are so strong that friction would wedge the arm against the obstacle.
 """
 
 from __future__ import annotations
 
+import hashlib
+import operator
 import os
 import sys
 import warnings
@@ -65,6 +68,22 @@ def load_model(env_id: str) -> mujoco.MjModel:
         model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
     return model
+
+
+@cache
+def physics_hash(env_id: str) -> str:
+    """SHA-256 of the numbers that decide how an environment moves, as compiled; the same on every machine."""
+    model = load_model(env_id)
+    found = hashlib.sha256(repr((model.opt.timestep, int(model.opt.integrator), model.opt.disableflags)).encode())
+    for name in (
+        "opt.gravity", "body_mass", "body_inertia", "body_pos", "body_parentid", "jnt_type", "jnt_axis", "jnt_range",
+        "jnt_solref", "jnt_solimp", "dof_damping", "dof_armature", "geom_type", "geom_size", "geom_pos", "geom_bodyid",
+        "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_solref", "geom_solimp",
+        "actuator_gear", "actuator_ctrlrange",
+    ):  # fmt: skip
+        values = np.asarray(operator.attrgetter(name)(model), np.float64)
+        found.update(f"{name} {np.round(values, 9).ravel().tolist()}\n".encode())
+    return found.hexdigest()
 
 
 def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
@@ -164,16 +183,24 @@ class MujocoArm(ArmVectorEnv):
         ends = np.empty_like(self._physics)
         for first in range(0, self.num_envs, CHUNK):
             part = slice(first, first + CHUNK)
-            physics = self._advance(self._physics[part], self._obstacle[part], actions[part])
-            self._check(physics, self._physics[part, 0], first)
+            physics, warned = self._advance(self._physics[part], self._obstacle[part], actions[part])
+            try:
+                self._check(physics, self._physics[part, 0], first, warned)
+            except SimulationUnstable as fault:
+                warning = self._warning(fault.episode, actions[fault.episode, : fault.step + 1])
+                raise SimulationUnstable(fault.env, fault.episode, fault.step, fault.reason + warning) from None
             states[part] = self._to_states(physics, self._obstacle[part])
             ends[part] = physics[:, -1]
         self._physics = ends
         return states
 
-    def _advance(self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps."""
+    def _advance(self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps; whether the last one warned (n,).
+
+        One more substep is taken and forgotten: an episode that stands still in it had a warning in the one before.
+        """
         control = np.repeat(actions, self.frame_skip, axis=1)
+        control = np.concatenate([control, control[:, -1:]], axis=1)
         spec = mujoco.mjtState.mjSTATE_CTRL.value
         if self.task == "obstacle":
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
@@ -185,7 +212,8 @@ class MujocoArm(ArmVectorEnv):
             physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
         finally:
             mujoco.set_mju_user_warning(handler)
-        return physics[:, self.frame_skip - 1 :: self.frame_skip].copy()
+        warned = physics[:, -1, 0] == physics[:, -2, 0]
+        return physics[:, self.frame_skip - 1 : -1 : self.frame_skip].copy(), warned
 
     def _to_states(self, physics: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
         """MuJoCo states (n, T, ...) to states (n, T, dx)."""
@@ -199,15 +227,38 @@ class MujocoArm(ArmVectorEnv):
             parts += [fixed, np.zeros_like(fixed)]
         return np.concatenate(parts, axis=-1)
 
-    def _check(self, physics: np.ndarray, start_time: np.ndarray, first: int) -> None:
+    def _warning(self, episode: int, actions: np.ndarray) -> str:
+        """What MuJoCo warns of when an episode is stepped again from where this call began, one substep at a time."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_setState(self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        if self.task == "obstacle":
+            data.mocap_pos[0] = (*self._obstacle[episode], PLANE)
+        handler = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(_ignore)
+        try:
+            for action in np.repeat(actions, self.frame_skip, axis=0):
+                data.ctrl[:] = action
+                mujoco.mj_step(self.model, data)
+                for kind, warning in enumerate(data.warning):
+                    if warning.number:
+                        return f" (MuJoCo: {mujoco.mju_warningText(kind, warning.lastinfo).rstrip('.')})"
+        finally:
+            mujoco.set_mju_user_warning(handler)
+        return ""
+
+    def _check(
+        self, physics: np.ndarray, start_time: np.ndarray, first: int, warned: np.ndarray | bool = False
+    ) -> None:
         """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond `MAX_SPEED`."""
         nq = self.model.nq
         clock = start_time[:, None] + DT * np.arange(1, physics.shape[1] + 1)
+        stopped = np.abs(physics[..., 0] - clock) > DT / 2
+        stopped[:, -1] |= warned
         with np.errstate(invalid="ignore"):
             reasons = (
                 ("the state is not finite", ~np.isfinite(physics).all(axis=-1)),
                 (f"speed above {MAX_SPEED:g} rad/s", (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1)),
-                ("MuJoCo stopped it", np.abs(physics[..., 0] - clock) > DT / 2),
+                ("MuJoCo stopped it", stopped),
             )
         wrong = reasons[0][1] | reasons[1][1] | reasons[2][1]
         if wrong.any():

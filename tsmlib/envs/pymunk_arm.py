@@ -11,6 +11,7 @@ joint, so a torque at the elbow does not turn the first link there. Here it does
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import Any
 
@@ -48,6 +49,15 @@ MAX_JOINT_SPEED = 1e3  # rad/s; full torque throughout reaches about 200
 MAX_BLOCK_SPEED = 100.0  # m/s
 
 ARM, BLOCK, WALLS = 0b001, 0b010, 0b100  # the arm meets the block only, and passes over the walls and itself
+
+
+def physics_hash(env_id: str) -> str:
+    """SHA-256 of the numbers that decide how an environment moves; the same on every machine."""
+    numbers = (
+        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, GEAR, LINK_LENGTHS, LINK1_CAPSULE, ARM_RADIUS, ARMATURE, DAMPING,
+        ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT, BLOCK_RADIUS, BLOCK_MASS, BLOCK_DECAY, FRICTION, RESTITUTION, WALL,
+    )  # fmt: skip
+    return hashlib.sha256(repr(numbers).encode()).hexdigest()
 
 
 class PymunkArm(ArmVectorEnv):

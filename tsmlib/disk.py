@@ -1,0 +1,110 @@
+"""How bytes reach the disk: all of a file or none of it, even through a power cut, and one writer per folder."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+PathLike = str | os.PathLike[str]
+
+
+class StoreError(ValueError):
+    """An artefact that cannot be written, read or trusted: names the file, what was found and expected, the remedy."""
+
+
+def write_bytes(path: PathLike, data: bytes) -> None:
+    """Replace ``path`` by ``data`` in one step, creating its folder; on failure the old file stays and nothing else."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    try:
+        _make(path.parent)
+        for left in path.parent.glob(".*.tmp-*"):  # by a process that was killed
+            if not _alive(left.name.rpartition("-")[2]):
+                left.unlink(missing_ok=True)
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _sync(path.parent)
+    except OSError as error:
+        raise StoreError(
+            f"cannot write {path} ({len(data)} bytes): {error.strerror or error}. Make room or permission there, or "
+            "name another folder with TSM_RUN_DIR."
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _make(folder: Path) -> None:
+    """Make a folder and those above it, so that they outlive a power cut."""
+    if not folder.is_dir():
+        _make(folder.parent)
+        folder.mkdir(exist_ok=True)
+        _sync(folder.parent)
+
+
+def _sync(folder: Path) -> None:
+    if os.name == "nt":  # Windows opens no folders
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OverflowError, PermissionError):
+        pass
+    return True
+
+
+@contextlib.contextmanager
+def only_writer(folder: PathLike, purpose: str) -> Iterator[None]:
+    """Hold ``folder``, made if need be, against other writers; the lock goes when this process does.
+
+    Raises StoreError naming the holder: process, machine, purpose and since when.
+    """
+    try:
+        import fcntl
+    except ImportError:  # no such locks on Windows
+        yield
+        return
+    try:
+        _make(Path(folder))
+        lock = open(Path(folder) / ".lock", "a+")  # noqa: SIM115 - closed below
+    except OSError as error:
+        raise StoreError(
+            f"cannot write in {folder}: {error.strerror or error}. Make room or permission there, or name another "
+            "folder with TSM_RUN_DIR."
+        ) from error
+    with lock:
+        for attempt in range(20):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                lock.seek(0)
+                if (holder := lock.read().strip()) or attempt == 19:  # it may be about to write its name
+                    raise StoreError(
+                        f"{folder} is being written by another process ({holder or 'unknown'}). Wait for it or end "
+                        "it, or take another seed, or another folder with TSM_RUN_DIR."
+                    ) from None
+                time.sleep(0.05)
+        lock.truncate(0)
+        lock.write(f"pid {os.getpid()} on {socket.gethostname()}, {purpose}, since {time.strftime('%F %T%z')}")
+        lock.flush()
+        try:
+            yield
+        finally:
+            lock.truncate(0)

@@ -1,0 +1,154 @@
+"""The parameters of the notebooks: which there are, of which type, within which range. One schema for every way in.
+
+``python -m tsmlib run`` checks the text that was typed, and a notebook's first cell checks the values that arrived
+there (papermill only warns of unknown names, and executes every name as code). Both happen before any file exists.
+A notebook's ``parameters`` cell holds the defaults; a name in it that stands here too obeys the rule here.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+SCALES = ("smoke", "laptop", "paper")
+ENVS = tuple(f"tsm/{arm}-v0" for arm in ("Reacher", "ReacherObstacle", "ReacherPush",
+                                         "PymunkReacher", "PymunkObstacle", "PymunkPush"))  # fmt: skip
+MODELS = (
+    *("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "prior"),
+    *("onestep", "multistep", "lstm", "ensemble", "ensemble+mse"),
+)
+LONGEST = 1000  # characters
+
+
+class ParameterError(ValueError):
+    """A parameter that is unknown, of the wrong type or out of range. Raised before any file exists."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a parameter may be: its type, whether a value is allowed, and both in words."""
+
+    type: type
+    words: str
+    allows: Callable[[Any], bool]
+
+
+def _whole(low: int, high: int) -> Rule:
+    return Rule(int, f"a whole number from {low} to {high}", lambda value: low <= value <= high)
+
+
+def _one_of(*known: str) -> Rule:
+    return Rule(str, f"one of {', '.join(known)}, or ''", lambda value: value in ("", *known))
+
+
+def _some_of(*known: str) -> Rule:
+    def allows(value: str) -> bool:
+        return value == "all" or all(word.strip(" ") in known for word in value.split(","))
+
+    return Rule(str, f"some of {', '.join(known)}, with commas between; or all", allows)
+
+
+def _is_folder(value: str) -> bool:
+    path = Path(value)
+    reserved = any(re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", part) for part in path.parts)  # on Windows
+    return not value.startswith("~") and ".." not in path.parts and value.strip() == value and not reserved
+
+
+SCHEMA: dict[str, Rule] = {
+    "scale": _one_of(*SCALES),
+    "seed": _whole(0, 2**31 - 1),
+    "run_dir": Rule(
+        str, "an absolute path, or one inside the repository, without '..', a leading '~', control characters or names "
+        "that Windows reserves", _is_folder,
+    ),
+    "env": _some_of(*ENVS),
+    "envs": _some_of(*ENVS),
+    "models": _some_of(*MODELS),
+    "n_targets": _whole(0, 100),
+}  # fmt: skip
+PLAIN = {  # for a parameter without a rule, by the type of its default
+    bool: Rule(bool, "true or false", lambda value: True),
+    int: Rule(int, "a whole number of at most 18 digits", lambda value: abs(value) < 10**18),
+    float: Rule(float, "a finite number", math.isfinite),
+    str: Rule(str, "text on one line", lambda value: True),
+}
+
+
+def check(name: str, value: Any, *, default: Any = None, origin: str = "") -> Any:
+    """``value`` if parameter ``name`` may have it; else ParameterError naming ``origin``, the value and the range."""
+    rule = SCHEMA.get(name) or PLAIN.get(type(default))
+    if rule is None:
+        raise ParameterError(f"{origin or name} cannot be given from outside: edit the notebook to change it.")
+    good = type(value) is rule.type
+    if good and rule.type is str:
+        good = len(value) <= LONGEST and value.isprintable()
+    if not good or not rule.allows(value):
+        raise ParameterError(f"{origin or name} is {_shown(value)}, expected {rule.words}.")
+    return value
+
+
+def convert(name: str, text: str, *, default: Any = None, origin: str = "") -> Any:
+    """The value of parameter ``name`` from ``text``; ParameterError where it is none or not allowed."""
+    rule = SCHEMA.get(name) or PLAIN.get(type(default))
+    value: Any = text
+    if rule and rule.type is bool and text.lower() in ("true", "false"):
+        value = text.lower() == "true"
+    elif rule and rule.type is int and re.fullmatch(r"[+-]?[0-9]{1,18}", text, re.ASCII):
+        value = int(text)
+    elif (
+        rule
+        and rule.type is float
+        and re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", text, re.ASCII)
+    ):
+        value = float(text)
+    return check(name, value, default=default, origin=origin)
+
+
+def _shown(value: Any) -> str:
+    shown = ascii(value)
+    return shown if len(shown) <= 80 else f"{shown[:77]}..."
+
+
+def declared(notebook: Path) -> dict[str, Any]:
+    """Name -> default of every parameter: the literals in the cell tagged ``parameters``."""
+    try:
+        cells = json.loads(notebook.read_text())["cells"]
+        tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
+        sources = ["".join(cell["source"]) for cell in tagged]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ParameterError(
+            f"{notebook} is not a notebook: {error!r:.200}. Restore it: git checkout -- notebooks"
+        ) from error
+    if len(sources) != 1:
+        raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one.")
+    found: dict[str, Any] = {}
+    try:
+        for statement in ast.parse(sources[0]).body:
+            match statement:
+                case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                    found[name] = ast.literal_eval(value)
+                case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
+                    found[name] = ast.literal_eval(value)
+                case _:
+                    raise ValueError(f"line {statement.lineno} is not 'name = literal'")
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        raise ParameterError(f"{notebook.name}, parameters cell: {error}; expected 'name = literal' only.") from error
+    return found
+
+
+def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Any]:
+    """Values for a notebook's parameters from their text. Unknown names are refused."""
+    defaults = declared(notebook)
+    for name in given:
+        if name not in defaults:
+            raise ParameterError(f"{notebook.stem} has no parameter {_shown(name)}; it has {', '.join(defaults)}.")
+    return {
+        name: convert(name, text, default=defaults[name], origin=f"{notebook.stem}: {name}")
+        for name, text in given.items()
+    }
