@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.envs.base import BLOCK_DECAY, DT, closest_gap, task_of
+from tsmlib.envs.base import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, closest_gap, task_of
 
 NEAR = 0.005  # metres: closer than this the arm may be touching the object; deeper than this it is inside it
 SUBSTEPS = 8  # between two states, along the straight line in state space, so that a fast touch is not missed
@@ -21,8 +21,8 @@ SUBSTEPS = 8  # between two states, along the straight line in state space, so t
 def broken(states: np.ndarray, env: str) -> dict[str, np.ndarray]:
     """Which steps of trajectories (..., T + 1, dx), from their true start on, break an invariant: (..., T) bool each.
 
-    ``moves_untouched``: since some earlier state the arm has kept 5 mm away from the object, and yet the object is
-    more than 5 mm further from where it was then than its speed at that time can carry it.
+    ``moves_untouched``: since some earlier state arm and walls have kept 5 mm away from the object, and yet the
+    object is more than 5 mm further from where it was then than its speed at that time can carry it.
     ``penetrates``: the arm is more than 5 mm inside the object. ``either``: one or both.
 
     An object that was pushed slides on: "moves by 5 mm in a step while the arm is away" is also true of the real
@@ -61,7 +61,7 @@ def rates(start: np.ndarray, states: np.ndarray, env: str, error: np.ndarray) ->
 
 
 def _gap_during_steps(states: np.ndarray, env: str) -> np.ndarray:
-    """The arm's smallest gap to the object within each step (..., T).
+    """The object's smallest gap to arm or walls within each step (..., T).
 
     The arm moves evenly from state to state; the object does too, or stays until it is hit.
     """
@@ -69,7 +69,8 @@ def _gap_during_steps(states: np.ndarray, env: str) -> np.ndarray:
     between = before + np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS * change  # (..., T, SUBSTEPS, dx)
     waiting = between.copy()
     waiting[..., 6:8] = before[..., 6:8]
-    return np.minimum(closest_gap(between, env), closest_gap(waiting, env)).min(axis=-1)
+    to_walls = WALL - BLOCK_RADIUS - np.abs(between[..., 6:8]).max(axis=-1)
+    return np.minimum.reduce([closest_gap(between, env), closest_gap(waiting, env), to_walls]).min(axis=-1)
 
 
 # Actions -------------------------------------------------------------------------------------------------------------
