@@ -295,9 +295,9 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
 )  # fmt: skip
 def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
     torch.manual_seed(0)
-    task, model = some_task(PUSH, n=2), build(10, 2).requires_grad_(False)
+    task, model = some_task(PUSH, n=2), build(10, 2)
     model.features.step_std.fill_(0.01)
-    prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2)).requires_grad_(False)
+    prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
     planner = partial(adam, iterations=1, lr=0.1) if over == "codes" else partial(mppi, iterations=1, candidates=4)
     trial = replan(task, model, space, planner, every=7)  # no multiple of the prior's segment

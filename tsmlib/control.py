@@ -66,7 +66,9 @@ class Task:
     @property
     def reward(self) -> Reward:
         """The task's reward, one target per instance."""
-        return self.own or (rewards.reach if self.name == "reach" else rewards.push)(self.target)
+        if self.own is not None:
+            return self.own
+        return (rewards.reach if self.name == "reach" else rewards.push)(self.target)
 
     @property
     def position(self) -> slice:

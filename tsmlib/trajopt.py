@@ -99,6 +99,7 @@ class LatentActions:
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
         return torch.randn(n, n_targets, *self.shape, generator=generator)
 
+    @torch.no_grad()
     def after(self, parameters: Tensor, steps: int) -> tuple[LatentActions, Tensor]:
         """Codes that begin with a segment stay as they are. Otherwise the rest of the plan is cut into new segments,
         and its codes are those that the prior's encoder gives them: nearly the same actions."""
