@@ -200,13 +200,26 @@ def test_a_large_evaluation_is_that_of_its_parts() -> None:
     torch.testing.assert_close(whole, parts)
 
 
-def test_a_return_that_is_not_finite_stops_the_planner() -> None:
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_model_that_diverges_on_everything_stops_the_planner(planner: str) -> None:
     def diverging(actions: Tensor) -> Tensor:
         return predictor()(actions) / 0.0
 
-    for planner in PLANNERS:
-        with pytest.raises(FloatingPointError, match=r"candidates have a predicted return .* the model diverges"):
-            plan_by(planner, diverging, reward, 2)
+    with pytest.raises(FloatingPointError, match=r"no candidate for target 0 has a predicted return that is finite"):
+        plan_by(planner, diverging, reward, 2)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        """Any force above 0.4 ends the world."""
+        return predictor()(actions) / (actions.amax((2, 3)) < 0.4)[None, ..., None, None]
+
+    plan = plan_by(planner, fragile, reward, 30)
+    assert torch.isfinite(plan.curve).all()
+    assert (plan.predicted > plan.curve[0]).all()
+    assert plan.actions.max() < 0.4
+    assert plan.actions[0].max() > 0.2  # the first target needs force
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

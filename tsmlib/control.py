@@ -31,7 +31,7 @@ class Task:
     """B instances of one task in one environment. start (B, dx), target (B, 2) in metres, horizon in steps.
 
     own: a reward of one's own, for a task of any other name; see ``with_reward``. ValueError where a target is out of
-    reach, or the reward is not one finite number per step.
+    reach, or the reward is not one number per step; FloatingPointError where it is NaN.
     """
 
     name: str  # reach or push; with a reward of one's own, any word
@@ -55,10 +55,9 @@ class Task:
         self._check_reach()
         if self.own is not None:  # standing still, in the shape in which planners ask
             states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
-            try:
-                rewarded(self.own, states, states.new_zeros(1, len(self), self.horizon, 2))
-            except FloatingPointError as error:
-                raise ValueError(f"task {self.name!r}, standing still: {error}") from error
+            found = rewarded(self.own, states, states.new_zeros(1, len(self), self.horizon, 2))
+            if not torch.isfinite(found).all():
+                raise ValueError(f"the reward of task {self.name!r} is infinite for an arm that stands still")
 
     def __len__(self) -> int:
         return len(self.start)

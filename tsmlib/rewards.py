@@ -43,9 +43,9 @@ def final_distance(states: Tensor, target: Tensor, position: slice) -> Tensor:
 
 
 def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
-    """``reward(states, actions)``, checked: one finite number per step, (..., B, T) for states (..., B, T, dx).
+    """``reward(states, actions)``, checked: one number per step, (..., B, T) for states (..., B, T, dx).
 
-    ValueError where it is something else; FloatingPointError where it is not finite although the states are.
+    ValueError where it is something else; FloatingPointError where it is NaN although the states are finite.
     """
     given = f"states {tuple(states.shape)} and actions {tuple(actions.shape)}"
     try:
@@ -58,11 +58,11 @@ def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
     if not isinstance(found, Tensor) or found.shape != expected:
         what = f"a tensor {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
         raise ValueError(f"the reward of {given} is {what}; expected a tensor {tuple(expected)}, one number per step")
-    unexplained = ~torch.isfinite(found) & torch.isfinite(states).all(-1)
+    unexplained = found.isnan() & torch.isfinite(states).all(-1)
     if unexplained.any():
         where = unexplained.nonzero()[0].tolist()
         raise FloatingPointError(
-            f"the reward is {found[tuple(where)].item()} for target {where[-2]} at step {where[-1]}, although the "
-            "state there is finite; look for a division, a logarithm or a root of zero in it"
+            f"the reward is nan for target {where[-2]} at step {where[-1]}, although the state there is finite; look "
+            "for a division, a logarithm or a root in it"
         )
     return found

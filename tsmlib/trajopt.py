@@ -220,11 +220,14 @@ def adam(
         best.update(parameters.detach(), returns.detach())
         optimizer.zero_grad()
         (-returns.sum()).backward()
-        if parameters.grad is None or not torch.isfinite(parameters.grad).all():
+        assert parameters.grad is not None
+        sound = torch.isfinite(parameters.grad)
+        if not iteration and not sound.all():
             raise FloatingPointError(
-                f"the gradient of the return is not finite at iteration {iteration} although the return is; look for a "
-                "root or a norm at zero in the reward, and add a tiny constant under it"
+                "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
+                "reward, and add a tiny constant under it"
             )
+        parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
         optimizer.step()
     with torch.no_grad():
         best.update(parameters.detach(), evaluate(predict, reward, space, parameters))
@@ -330,6 +333,9 @@ def _sample(
         if iteration:
             parameters[0] = best.parameters
         returns = evaluate(predict, reward, space, parameters)
+        finite = torch.isfinite(returns)  # a candidate on which the model diverges is as bad as the worst
+        worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
+        returns = returns.where(finite, worst)
         mean, deviation = refit(parameters, returns, mean, deviation)
         both = torch.cat([returns, evaluate(predict, reward, space, mean[None])])
         best.update(torch.cat([parameters, mean[None]]), both)
@@ -425,12 +431,13 @@ class _Best:
         self.trace: list[Tensor] = []
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:
-        if not torch.isfinite(returns).all():
+        value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)
+        hopeless = torch.isinf(torch.maximum(value, self.returns))
+        if hopeless.any():
             raise FloatingPointError(
-                f"{(~torch.isfinite(returns)).sum().item()} of {returns.numel()} candidates have a predicted return "
-                "that is not finite; the model diverges on them"
+                f"no candidate for target {int(hopeless.nonzero()[0])} has a predicted return that is finite; the "
+                "model diverges on all of them, or the reward is infinite"
             )
-        value, index = returns.max(0)
         better = value > self.returns
         chosen = parameters[index, torch.arange(len(index))]
         self.parameters = torch.where(better.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, self.parameters)
