@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,15 @@ import torch
 from torch import Tensor
 
 from tsmlib import control, report, rewards, runs, study
+from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task, execute, random_torques, zero_torques
+from tsmlib.control import Task, execute, random_torques, replan, zero_torques
 from tsmlib.envs import ENV_IDS
-from tsmlib.trajectory import Segment
-from tsmlib.trajopt import Plan
+from tsmlib.nets import Noise
+from tsmlib.prior import ActionPrior
+from tsmlib.trajectory import Segment, Trajectories
+from tsmlib.trajopt import DirectActions, LatentActions, Plan, adam, cem, mppi
+from tsmlib.tsm import TSM
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 
@@ -197,6 +202,118 @@ def test_a_table_holds_what_the_trials_measured() -> None:
     np.testing.assert_allclose(returns, trial.true, rtol=1e-6)
 
 
+# Closed loop ---------------------------------------------------------------------------------------------------------
+
+as_it_is = partial(adam, iterations=0)  # the planner that leaves a plan as it is
+
+
+def test_a_plan_that_is_never_made_again_is_executed_open_loop() -> None:
+    task, space = some_task(PUSH), DirectActions(20, rms=0.3)
+    planner = partial(cem, candidates=12, elites=3, iterations=2)
+    trial = replan(task, None, space, planner, every=20)
+    assert trial.plan is not None
+    open_loop = execute(task, trial.actions)
+    assert torch.equal(trial.states, open_loop.states)
+    torch.testing.assert_close(trial.true, open_loop.true)
+    torch.testing.assert_close(trial.plan.predicted, trial.true)  # the simulator keeps its word
+    torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:])
+
+
+@pytest.mark.parametrize(("over", "every"), [("actions", 1), ("actions", 7), ("codes", 10), ("codes", 20)])
+def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int) -> None:
+    torch.manual_seed(0)
+    task, prior = some_task(horizon=30), ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
+    space = LatentActions(prior.requires_grad_(False), 30) if over == "codes" else DirectActions(30, rms=0.3)
+    plan = cem(control.through_simulator(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
+               iterations=2)  # fmt: skip
+    trial = replan(task, None, space, as_it_is, every=every, plan=plan)
+    assert trial.plan is not None
+    torch.testing.assert_close(trial.actions, plan.actions, rtol=1e-4, atol=1e-6)
+    assert trial.plan.curve.shape == (math.ceil(30 / every), 4)
+    torch.testing.assert_close(trial.plan.curve, trial.true.expand_as(trial.plan.curve), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(trial.gap, torch.zeros(4), rtol=0, atol=1e-3)
+    torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:], rtol=1e-3, atol=1e-3)
+
+
+def test_planning_again_through_the_true_simulator_never_makes_a_plan_worse() -> None:
+    task = some_task()
+    planner = partial(mppi, candidates=12, iterations=2)
+    trial = replan(task, None, DirectActions(20, rms=0.3), planner, every=5)
+    assert trial.plan is not None
+    assert (trial.plan.curve.diff(dim=0) > -1e-4).all()
+    assert (trial.plan.curve[-1] > trial.plan.curve[0]).any()
+    torch.testing.assert_close(trial.plan.curve[-1], trial.true, rtol=1e-4, atol=1e-4)
+
+
+@dataclasses.dataclass
+class Wrong:
+    """A model in which every step adds to the angles, and that remembers which past it was asked about."""
+
+    segment_len: int = 5
+    past_len: int = 3
+    asked: list[Segment] = dataclasses.field(default_factory=list)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        self.asked.append(past)
+        return past.states[:, -1:] + actions.cumsum(1).sum(-1, keepdim=True)
+
+
+def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
+    def push_on(predict: Any, reward: Any, space: Any, start: Any) -> Plan:
+        return adam(predict, reward, space, torch.full((1, 4, *space.shape), 0.2), iterations=0)
+
+    task, model = some_task(horizon=20), Wrong()
+    trial = replan(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
+    whole = Trajectories(
+        trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
+    ).padded(3)  # fmt: skip
+    observed = {past.states[:4].numpy().tobytes() + past.actions[:4].numpy().tobytes() for past in model.asked}
+    for now in (0, 8, 16):
+        expected = whole.states[:, now : now + 3].contiguous(), whole.actions[:, now : now + 3].contiguous()
+        assert expected[0].numpy().tobytes() + expected[1].numpy().tobytes() in observed
+
+
+def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
+    height = torch.linspace(0, 0.1, 20)
+
+    def rise(states: Tensor, actions: Tensor) -> Tensor:
+        return -(states[..., 5] - height).abs()  # fails on any other horizon
+
+    task = some_task().with_reward("rise", rise)
+    trial = replan(task, None, DirectActions(20, rms=0.3), partial(cem, candidates=24, elites=4, iterations=3), every=6)
+    assert trial.plan is not None
+    torch.testing.assert_close(trial.plan.curve[-1], trial.true, rtol=1e-3, atol=1e-4)
+    assert (trial.true > 0.7 * execute(task, zero_torques(task)).true).all()
+
+
+@pytest.mark.parametrize("over", ["actions", "codes"])
+@pytest.mark.parametrize(
+    "build",
+    [partial(TSM, channels=8), partial(OneStep, hidden=16), partial(LSTM, hidden=16), partial(Ensemble, hidden=16),
+     partial(Ensemble, hidden=16, gaussian=False)],
+    ids=["tsm", "onestep", "lstm", "ensemble", "ensemble+mse"],
+)  # fmt: skip
+def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
+    torch.manual_seed(0)
+    task, model = some_task(PUSH, n=2), build(10, 2)
+    model.features.step_std.fill_(0.01)
+    prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
+    space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
+    planner = partial(adam, iterations=1, lr=0.1) if over == "codes" else partial(mppi, iterations=1, candidates=4)
+    trial = replan(task, model, space, planner, every=7)  # no multiple of the prior's segment
+    assert trial.plan is not None
+    assert trial.actions.shape == (2, 20, 2)
+    assert trial.actions.abs().max() <= 1
+    assert trial.plan.curve.shape == (3, 2)
+    assert trial.plan.states.shape == (1, 2, 20, 10)
+    torch.testing.assert_close(execute(task, trial.actions).states, trial.states, rtol=1e-4, atol=1e-5)
+
+
+def test_a_closed_loop_without_steps_is_refused() -> None:
+    with pytest.raises(ValueError, match="every is 0, expected a positive number of steps"):
+        replan(some_task(), None, DirectActions(20), as_it_is, every=0)
+
+
 # Tasks ---------------------------------------------------------------------------------------------------------------
 
 
@@ -235,11 +352,6 @@ def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> 
     assert report.means(oracle, among)["gain_share"][0] == pytest.approx(1)
     assert report.means(nothing, among)["cost_over_oracle"][0] == pytest.approx(2)
     assert report.means(nothing, among)["gain_share"][0] == pytest.approx(0)
-
-
-def test_a_task_of_another_name_is_refused() -> None:
-    with pytest.raises(ValueError, match="task is 'dance', expected 'reach' or 'push'"):
-        dataclasses.replace(some_task(), name="dance")
 
 
 def test_pushing_without_an_object_is_refused() -> None:

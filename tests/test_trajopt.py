@@ -14,6 +14,8 @@ from torch import Tensor
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
+from tsmlib.baselines import LSTM, Ensemble, OneStep
+from tsmlib.collect import smooth_torques
 from tsmlib.nets import Noise, standard_normal
 from tsmlib.prior import ActionPrior
 from tsmlib.rewards import Reward
@@ -27,13 +29,16 @@ from tsmlib.trajopt import (
     cem,
     evaluate,
     expected_return,
+    mppi,
     sampled_starts,
+    stopped,
     through_model,
     through_simulator,
 )
 from tsmlib.tsm import TSM
 
 T, B, DT = 10, 3, 0.5
+PLANNERS = ("adam", "cem", "mppi")
 
 
 @dataclass
@@ -96,11 +101,10 @@ class Rough(DirectActions):
 
 
 def plan_by(planner: str, predict: Predict, reward: Reward, iterations: int, **settings: Any) -> Plan:
-    space = settings.pop("space", DirectActions(T, 1, rms=0.5))
-    if planner == "cem":
-        settings = {"candidates": 64, "elites": 8, **settings}
-        return cem(predict, reward, space, B, iterations=iterations, **settings)
-    return adam(predict, reward, space, torch.zeros(1, B, T, 1), iterations=iterations, **{"lr": 0.05, **settings})
+    space, start = settings.pop("space", DirectActions(T, 1, rms=0.5)), settings.pop("start", B)
+    plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner]
+    usual = {"adam": {"lr": 0.05}, "cem": {"candidates": 64, "elites": 8}, "mppi": {"candidates": 64}}[planner]
+    return plan(predict, reward, space, start, iterations=iterations, **{**usual, **settings})  # type: ignore[operator]
 
 
 # Optima --------------------------------------------------------------------------------------------------------------
@@ -112,8 +116,10 @@ def plan_by(planner: str, predict: Predict, reward: Reward, iterations: int, **s
         ("adam", {"iterations": 100, "lr": 0.1}, 0.01),
         ("cem", {"iterations": 20, "space": Rough(T, 1, rms=0.5)}, 0.01),
         ("cem", {"iterations": 10, "candidates": 256, "elites": 24}, 0.1),  # smooth noise finds no abrupt start
+        ("mppi", {"iterations": 40, "candidates": 128, "shrink": 0.9, "space": Rough(T, 1, rms=0.5)}, 0.01),
+        ("mppi", {"iterations": 20, "candidates": 256}, 0.1),
     ],
-    ids=["adam", "cem", "cem, smooth"],
+    ids=["adam", "cem", "cem, smooth", "mppi", "mppi, smooth"],
 )
 def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, Any], missed: float) -> None:
     forces, value = optimum()
@@ -125,7 +131,7 @@ def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, A
         assert (plan.actions[..., 0] - forces).abs().max() < 0.3
 
 
-@pytest.mark.parametrize("planner", ["adam", "cem"])
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_more_iterations_never_make_the_predicted_return_worse(planner: str) -> None:
     plans = [plan_by(planner, predictor(0.1, 3), reward, n) for n in (1, 4, 12)]
     for fewer, more in itertools.pairwise(plans):
@@ -134,7 +140,7 @@ def test_more_iterations_never_make_the_predicted_return_worse(planner: str) -> 
     assert (plans[-1].predicted > plans[0].predicted).all()
 
 
-@pytest.mark.parametrize("planner", ["adam", "cem"])
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_a_plan_keeps_its_promises(planner: str) -> None:
     predict, space = predictor(0.1, 5), DirectActions(T, 1, rms=0.5)
     plan = plan_by(planner, predict, reward, 5)
@@ -148,7 +154,7 @@ def test_a_plan_keeps_its_promises(planner: str) -> None:
     torch.testing.assert_close(reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted)
 
 
-@pytest.mark.parametrize("planner", ["adam", "cem"])
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_targets_are_planned_for_independently(planner: str) -> None:
     def greedy(states: Tensor, actions: Tensor) -> Tensor:
         """The first target's reward is as before; the others' is huge and means nothing."""
@@ -162,7 +168,7 @@ def test_the_bounds_hold_however_much_is_to_gain() -> None:
     def forwards(states: Tensor, actions: Tensor) -> Tensor:
         return 100 * states[..., 0]
 
-    for planner, settings in (("adam", {"lr": 1.0}), ("cem", {})):
+    for planner, settings in (("adam", {"lr": 1.0}), ("cem", {}), ("mppi", {"shrink": 1.0})):
         plan = plan_by(planner, predictor(), forwards, 30, **settings)
         assert plan.actions.abs().max() <= 1
         assert plan.actions.max() > 0.9
@@ -194,13 +200,92 @@ def test_a_large_evaluation_is_that_of_its_parts() -> None:
     torch.testing.assert_close(whole, parts)
 
 
-def test_a_return_that_is_not_finite_stops_the_planner() -> None:
-    def broken(states: Tensor, actions: Tensor) -> Tensor:
-        return reward(states, actions) / 0.0 * 0.0
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_model_that_diverges_on_everything_stops_the_planner(planner: str) -> None:
+    def diverging(actions: Tensor) -> Tensor:
+        return predictor()(actions) / 0.0
 
-    for planner in ("adam", "cem"):
-        with pytest.raises(FloatingPointError, match="candidates have a predicted return that is not finite"):
-            plan_by(planner, predictor(), broken, 2)
+    with pytest.raises(FloatingPointError, match=r"no candidate for target 0 has a predicted return that is finite"):
+        plan_by(planner, diverging, reward, 2)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        """Any force above 0.4 ends the world."""
+        return predictor()(actions) / (actions.amax((2, 3)) < 0.4)[None, ..., None, None]
+
+    plan = plan_by(planner, fragile, reward, 30)
+    assert torch.isfinite(plan.curve).all()
+    assert (plan.predicted > plan.curve[0]).all()
+    assert plan.actions.max() < 0.4
+    assert plan.actions[0].max() > 0.2  # the first target needs force
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_plan_is_a_function_of_its_arguments_and_seed(planner: str) -> None:
+    seeds = [{}, {}, {"seed": 7}] if planner != "adam" else [{}, {}]
+    plans = [plan_by(planner, predictor(0.2, 2), reward, 3, **seed) for seed in seeds]
+    assert torch.equal(plans[0].actions, plans[1].actions)
+    assert torch.equal(plans[0].predicted, plans[1].predicted)
+    assert planner == "adam" or not torch.equal(plans[0].actions, plans[2].actions)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_plan_is_never_worse_than_the_best_of_its_starts(planner: str) -> None:
+    forces, value = optimum()
+    start = torch.zeros(2, B, T, 1)
+    start[1] = torch.atanh(forces)[..., None]  # nothing is better
+    plan = plan_by(planner, predictor(), reward, 2, start=start)
+    torch.testing.assert_close(plan.predicted, value)
+    assert plan.curve.shape == (3, B)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_starts_of_another_shape_are_refused(planner: str) -> None:
+    with pytest.raises(ValueError, match=r"start is \(1, 3, 9, 1\), expected \(C, B, 10, 1\)"):
+        plan_by(planner, predictor(), reward, 2, start=torch.zeros(1, B, T - 1, 1))
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_plan_can_be_had_as_it_was_along_the_way(planner: str) -> None:
+    predict, space = predictor(0.1, 2), DirectActions(T, 1, rms=0.5)
+    plan = plan_by(planner, predict, reward, 6)
+    nothing = torch.zeros(1, B, T, 1)
+    torch.testing.assert_close(stopped(plan, 0, predict, reward, space).actions, nothing[0])
+    torch.testing.assert_close(plan.curve[0], expected_return(predict(nothing), nothing, reward)[0])
+    early, shorter = stopped(plan, 2, predict, reward, space), plan_by(planner, predict, reward, 2)
+    torch.testing.assert_close(early.actions, shorter.actions)
+    torch.testing.assert_close(early.predicted, shorter.predicted)
+    torch.testing.assert_close(early.curve, shorter.curve)
+    torch.testing.assert_close(stopped(plan, 6, predict, reward, space).actions, plan.actions)
+    with pytest.raises(ValueError, match="took 6 iterations; there is no plan as of iteration 7"):
+        stopped(plan, 7, predict, reward, space)
+
+
+def test_mppi_at_a_low_temperature_takes_the_best_candidate_and_at_a_high_one_their_mean() -> None:
+    space, seen = Rough(T, 1, rms=0.5), []
+
+    def watched(actions: Tensor) -> Tensor:
+        seen.append(actions)
+        return predictor()(actions)
+
+    for temperature in (1e-4, 1e4):
+        seen.clear()
+        mppi(watched, reward, space, B, candidates=32, iterations=1, temperature=temperature)
+        _, candidates, mean, _ = seen  # the start, the candidates, their weighted mean, the plan
+        best = expected_return(predictor()(candidates), candidates, reward).argmax(0)
+        drawn = torch.atanh(candidates)
+        expected = drawn[best, torch.arange(B)] if temperature < 1 else drawn.mean(0)
+        torch.testing.assert_close(torch.atanh(mean[0]), expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"candidates": 1}, {"iterations": 0}, {"temperature": 0.0}, {"shrink": 0.0}, {"shrink": 1.1}]
+)
+def test_settings_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="expected 2 or more, 1 or more, above 0, and above 0 to 1"):
+        mppi(predictor(), reward, DirectActions(T, 1), B, **wrong)
 
 
 # Common random numbers -----------------------------------------------------------------------------------------------
@@ -266,7 +351,7 @@ def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(prior: ActionP
         LatentActions(prior, horizon)
 
 
-@pytest.mark.parametrize("planner", ["adam", "cem"])
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, planner: str) -> None:
     torch.manual_seed(0)
     model, space = TSM(6, 2, channels=8).requires_grad_(False), LatentActions(prior, 20)
@@ -275,11 +360,73 @@ def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, pla
     start = torch.zeros(1, B, *space.shape)
     if planner == "adam":
         plan = adam(predict, task, space, start, iterations=5, lr=0.1)
-    else:
+    elif planner == "cem":
         plan = cem(predict, task, space, B, candidates=16, elites=4, iterations=4)
+    else:
+        plan = mppi(predict, task, space, B, candidates=16, iterations=4)
     assert (plan.predicted > evaluate(predict, task, space, start)[0]).all()
     assert plan.actions.abs().max() <= 1
     torch.testing.assert_close(plan.actions, prior.plan(torch.zeros(B, 10, 2), plan.parameters))
+
+
+def test_what_is_left_of_a_plan_over_codes_is_the_same_actions(prior: ActionPrior) -> None:
+    space, codes = LatentActions(prior, 30), torch.randn(B, 3, 8, generator=torch.Generator().manual_seed(0))
+    actions = space.decode(codes[None])[0]
+    for steps in (10, 20):
+        rest, left = space.after(codes, steps)
+        torch.testing.assert_close(rest.decode(left[None])[0], actions[:, steps:], rtol=1e-4, atol=1e-6)
+    rest, left = rest.after(left, 4)  # not where a segment ends: the codes are those of the encoder
+    assert left.shape == (B, *rest.shape)
+    assert rest.decode(left[None]).shape == (1, B, 6, 2)
+    padded = torch.cat([actions[:, 24:], actions[:, -1:].expand(-1, 4, -1)], 1)
+    torch.testing.assert_close(left[:, 0], prior.encode(padded)[0], rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(rest.past, actions[:, 14:24], rtol=1e-4, atol=1e-6)
+
+
+def test_what_is_left_of_a_plan_over_actions_is_the_rest() -> None:
+    parameters = torch.randn(B, T, 2)
+    rest, left = DirectActions(T, 2, rms=0.3).after(parameters, 4)
+    assert (rest.shape, rest.scale) == ((T - 4, 2), 0.3)
+    torch.testing.assert_close(rest.decode(left[None])[0], parameters[:, 4:].tanh())
+
+
+# Every model ---------------------------------------------------------------------------------------------------------
+
+MODELS = {
+    "tsm": partial(TSM, channels=8), "tsm, with contacts": partial(TSM, channels=8, head_channels=8),
+    "onestep": partial(OneStep, hidden=16), "lstm": partial(LSTM, hidden=16),
+    "ensemble": partial(Ensemble, hidden=16), "ensemble+mse": partial(Ensemble, hidden=16, gaussian=False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("over", ["actions", "codes"])
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("name", MODELS)
+def test_every_planner_plans_through_every_model(prior: ActionPrior, name: str, planner: str, over: str) -> None:
+    torch.manual_seed(0)
+    model = MODELS[name](6, 2).requires_grad_(False)
+    model.features.step_std.fill_(0.05)  # a tame world
+    space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
+    predict = through_model(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=2)
+    task = rewards.reach(torch.tensor([[5.0, 0.0], [0.0, 5.0], [-5.0, 0.0]]), torque_weight=0)
+    settings = {"adam": {"iterations": 5, "lr": 0.1}, "cem": {"iterations": 3, "candidates": 12, "elites": 3},
+                "mppi": {"iterations": 3, "candidates": 12}}[planner]  # fmt: skip
+    plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner](predict, task, space, B, **settings)  # type: ignore[operator]
+    assert plan.states.shape == (2, B, 20, 6)
+    assert plan.actions.abs().max() <= 1
+    assert (plan.predicted > plan.curve[0]).all()
+
+
+def test_a_rollout_keeps_one_member_of_the_ensemble_and_candidates_share_it() -> None:
+    torch.manual_seed(0)
+    model, n = Ensemble(6, 2, hidden=16, gaussian=False).requires_grad_(False), 40
+    past = initial_past(torch.zeros(n, 6), 1, 2)
+    actions = torch.full((3, n, 12, 2), 0.5)
+    states = through_model(model, past, samples=2)(actions)  # (2, 3, n, 12, 6)
+    torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 2, -1, -1, -1))
+    apart = (states[:, 0].flatten(0, 1)[:, None] - states[:, 0].flatten(0, 1)[None]).abs().amax((2, 3)) > 1e-3
+    futures = {tuple(row) for row in (~apart).tolist()}
+    assert len(futures) == 5  # as many as there are members: none is mixed with another along the way
 
 
 # Through the true simulator ------------------------------------------------------------------------------------------
@@ -308,6 +455,17 @@ def test_candidates_in_the_simulator_do_not_mix() -> None:
     assert states.shape == (1, 3, 2, 12, 10)
     for c in range(3):
         assert torch.equal(predict(actions[c : c + 1])[0, 0], states[0, c])
+
+
+@pytest.mark.parametrize(("env_id", "off"), [("tsm/ReacherPush-v0", 1e-3), ("tsm/PymunkPush-v0", 5e-2)])
+def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float) -> None:
+    env: Any = gymnasium.make_vec(env_id, num_envs=30).unwrapped
+    env.reset(seed=0)
+    actions = smooth_torques(30, 40, generator=torch.Generator().manual_seed(0))
+    observed = env.rollout(actions[:, :20].numpy()).astype("float32")[:, -1]
+    follows = torch.from_numpy(env.rollout(actions[:, 20:].numpy())).float()
+    states = through_simulator(env_id, observed)(actions[None, :, 20:])[0, 0]
+    assert (states - follows)[..., 4:8].abs().max() < off  # metres
 
 
 @pytest.mark.parametrize("make", [partial(DirectActions, 0), partial(DirectActions, -3)])

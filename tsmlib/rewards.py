@@ -1,13 +1,15 @@
 """Tasks of section 5.3.2: one pure torch function per task, (states, actions) -> reward per step.
 
 The same function scores model rollouts and true trajectories. Time is the last but one dimension; any leading
-dimensions broadcast against the targets', so a batch of B targets is the last dimension before time.
+dimensions broadcast against the targets', so a batch of B targets is the last dimension before time. A person's own
+task is another such function; ``rewarded`` says what is wrong with one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 Reward = Callable[[Tensor, Tensor], Tensor]  # states (..., B, T, dx), actions (..., B, T, du) -> (..., B, T)
@@ -38,3 +40,29 @@ def _approach(position: slice, target: Tensor, torque_weight: float) -> Reward:
 def final_distance(states: Tensor, target: Tensor, position: slice) -> Tensor:
     """Metres between ``position`` (TIP or BLOCK) and ``target`` (B, 2) in the last state of (..., B, T, dx)."""
     return (states[..., -1, position] - target).norm(dim=-1)
+
+
+def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
+    """``reward(states, actions)``, checked: one number per step, (..., B, T) for states (..., B, T, dx).
+
+    ValueError where it is something else; FloatingPointError where it is NaN although the states are finite.
+    """
+    given = f"states {tuple(states.shape)} and actions {tuple(actions.shape)}"
+    try:
+        found = reward(states, actions)
+    except (RuntimeError, IndexError) as error:
+        raise ValueError(
+            f"the reward fails on {given}: {error}. Count dimensions from the right: time is -2, targets are -3"
+        ) from error
+    expected = torch.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
+    if not isinstance(found, Tensor) or found.shape != expected:
+        what = f"a tensor {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+        raise ValueError(f"the reward of {given} is {what}; expected a tensor {tuple(expected)}, one number per step")
+    unexplained = found.isnan() & torch.isfinite(states).all(-1)
+    if unexplained.any():
+        where = unexplained.nonzero()[0].tolist()
+        raise FloatingPointError(
+            f"the reward is nan for target {where[-2]} at step {where[-1]}, although the state there is finite; look "
+            "for a division, a logarithm or a root in it"
+        )
+    return found

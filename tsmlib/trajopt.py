@@ -3,8 +3,9 @@
     max over p of E[ sum_t r(x_t, u_t) ],   u = space.decode(p),   x ~ predict(u)
 
 What is optimised over is a ``Space``: DirectActions (Eq. 2) or LatentActions (Eq. 3). What predicts is a function
-from actions to states: ``through_model`` or ``through_simulator``. Adam, as the paper plans, needs a differentiable
-one; CEM takes both, so that the oracle is the same planner with the true simulator as its model.
+from actions to states: ``through_model`` or ``through_simulator``. A ``Planner`` is ``adam``, as the paper plans,
+which needs a differentiable prediction, or ``cem`` or ``mppi``, which sample and take any prediction, so that the
+oracle is the same planner with the true simulator as its model. All three have one signature.
 
 Letters in shapes: B targets planned at once, C candidates for each, S model samples, T horizon, K segments.
 """
@@ -27,7 +28,7 @@ from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.dynamics import DynamicsModel, rollout
 from tsmlib.nets import SharedNoise
 from tsmlib.prior import ActionPrior
-from tsmlib.rewards import Reward
+from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment
 
 Predict = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
@@ -45,6 +46,10 @@ class Space(Protocol):
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
         """Perturbations (n, n_targets, *shape) of unit variance."""
+        ...
+
+    def after(self, parameters: Tensor, steps: int) -> tuple[Space, Tensor]:
+        """What is left when ``steps`` actions of a plan (B, *shape) are done: the space, and the plan in it."""
         ...
 
 
@@ -65,28 +70,62 @@ class DirectActions:
         torques = smooth_torques(n * n_targets, settle + horizon, generator=generator, action_dim=action_dim, rms=0.1)
         return torques[:, settle:].unflatten(0, (n, n_targets)) / 0.1
 
+    def after(self, parameters: Tensor, steps: int) -> tuple[DirectActions, Tensor]:
+        return DirectActions(self.shape[0] - steps, self.shape[1], rms=self.scale), parameters[:, steps:]
+
 
 class LatentActions:
-    """Eq. 3: one latent code per segment, decoded by the action prior from U_0 = 0. T must be a multiple of H."""
+    """Eq. 3: one latent code per segment, decoded by the action prior. T must be a multiple of H.
+
+    past: the actions before the plan (B, L, du), U_0 = 0 without. whole: refuse a horizon that is no multiple of H;
+    if not, the end of the last segment is cut off.
+    """
 
     scale = 1.0
 
-    def __init__(self, prior: ActionPrior, horizon: int) -> None:
-        if horizon < 1 or horizon % prior.segment_len:
+    def __init__(self, prior: ActionPrior, horizon: int, *, past: Tensor | None = None, whole: bool = True) -> None:
+        n_segments = -(-horizon // prior.segment_len)
+        if horizon < 1 or (whole and n_segments * prior.segment_len != horizon):
             raise ValueError(
                 f"a horizon of {horizon} steps is not a whole number of segments of {prior.segment_len}; "
                 f"choose {max(1, horizon // prior.segment_len) * prior.segment_len}"
             )
-        self.prior = prior
-        self.shape: tuple[int, ...] = (horizon // prior.segment_len, prior.latent_dim)
+        self.prior, self.horizon, self.past = prior, horizon, past
+        self.shape: tuple[int, ...] = (n_segments, prior.latent_dim)
 
     def decode(self, parameters: Tensor) -> Tensor:
-        codes = parameters.flatten(0, 1)
-        start = codes.new_zeros(len(codes), self.prior.past_len, len(self.prior.std))
-        return self.prior.plan(start, codes).unflatten(0, parameters.shape[:2])
+        return self._whole(parameters)[:, :, : self.horizon]
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
         return torch.randn(n, n_targets, *self.shape, generator=generator)
+
+    @torch.no_grad()
+    def after(self, parameters: Tensor, steps: int) -> tuple[LatentActions, Tensor]:
+        """Codes that begin with a segment stay as they are. Otherwise the rest of the plan is cut into new segments,
+        and its codes are those that the prior's encoder gives them: nearly the same actions."""
+        prior, left = self.prior, self.horizon - steps
+        actions = self._whole(parameters[None])[0]  # (B, K H, du)
+        past = torch.cat([self._before(len(actions)), actions[:, :steps]], dim=1)[:, -prior.past_len :]
+        space = LatentActions(prior, left, past=past, whole=False)
+        done, within = divmod(steps, prior.segment_len)
+        if not within:
+            return space, parameters[:, done:]
+        rest = actions[:, steps : steps + space.shape[0] * prior.segment_len]
+        missing = space.shape[0] * prior.segment_len - rest.shape[1]
+        rest = torch.cat([rest, rest[:, -1:].expand(-1, missing, -1)], dim=1)
+        codes, _ = prior.encode(rest.reshape(-1, prior.segment_len, rest.shape[2]))
+        return space, codes.unflatten(0, (len(rest), -1))
+
+    def _whole(self, parameters: Tensor) -> Tensor:
+        """Actions (C, B, K H, du)."""
+        n, n_targets = parameters.shape[:2]
+        start = self._before(n_targets).repeat(n, 1, 1)
+        return self.prior.plan(start, parameters.flatten(0, 1)).unflatten(0, (n, n_targets))
+
+    def _before(self, n_targets: int) -> Tensor:
+        if self.past is not None:
+            return self.past
+        return self.prior.std.new_zeros(n_targets, self.prior.past_len, len(self.prior.std))
 
 
 @dataclass(frozen=True)
@@ -94,7 +133,8 @@ class Plan:
     """The best actions found for each of B targets.
 
     actions (B, T, du); parameters (B, *shape) they decode from; states (S, B, T, dx) predicted for them;
-    predicted (B,): expected undiscounted return; curve (iterations, B): predicted return along the way; seconds.
+    predicted (B,): expected undiscounted return; curve (iterations + 1, B): predicted return of the best so far, from
+    the start on; seconds; trace (iterations + 1, B, *shape): the parameters of the best so far, see ``stopped``.
     """
 
     actions: Tensor
@@ -103,6 +143,15 @@ class Plan:
     predicted: Tensor
     curve: Tensor
     seconds: float
+    trace: Tensor | None = None
+
+
+class Planner(Protocol):
+    """``adam``, ``cem`` or ``mppi``, with its settings bound by ``functools.partial``."""
+
+    def __call__(self, predict: Predict, reward: Reward, space: Space, start: Tensor | int, /) -> Plan:
+        """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero. Never worse than it."""
+        ...
 
 
 def through_model(model: DynamicsModel, past: Segment, *, samples: int = 1, seed: int = 0) -> Predict:
@@ -124,7 +173,11 @@ def through_model(model: DynamicsModel, past: Segment, *, samples: int = 1, seed
 
 
 def through_simulator(env_id: str, start: np.ndarray) -> Predict:
-    """Predict by executing in the true simulator, in bulk, from ``start`` (B, dx): S = 1. Not differentiable."""
+    """Predict by executing in the true simulator, in bulk, from ``start`` (B, dx): S = 1. Not differentiable.
+
+    Any state can be a start, also one in the middle of an episode. In MuJoCo what follows is what would have followed,
+    up to rounding; in pymunk, contacts that last forget the force with which they press.
+    """
     make = cache(partial(gymnasium.make_vec, env_id))
 
     def predict(actions: Tensor) -> Tensor:
@@ -140,40 +193,66 @@ def adam(
     predict: Predict,
     reward: Reward,
     space: Space,
-    start: Tensor,
+    start: Tensor | int,
     *,
     iterations: int = 100,  # section 4.2
     lr: float = 0.01,  # section 4.2
     progress: str = "",
 ) -> Plan:
-    """Gradient ascent on the expected return, as the paper plans, from ``start`` (C, B, *shape).
+    """Gradient ascent on the expected return, as the paper plans, from ``start`` (C, B, *shape) or zero.
 
     C restarts run side by side; each target keeps the parameters with the best predicted return it ever had.
+    ValueError where the return has no gradient with respect to the states or the actions.
     """
     if iterations < 0:
         raise ValueError(f"iterations is {iterations}, expected 0 or more")
     began = time.perf_counter()
+    start = _parameters(start, space)
     parameters = start.clone().requires_grad_()
     optimizer = torch.optim.Adam([parameters], lr=lr)
     best = _Best(start)
-    for _ in tqdm(range(iterations), desc=progress, disable=not progress):
+    for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
         actions = space.decode(parameters)
-        returns = expected_return(predict(actions), actions, reward)
+        states = predict(actions)
+        returns = expected_return(states, actions, reward)
+        if not iteration:
+            _check_gradient(states, returns)
         best.update(parameters.detach(), returns.detach())
         optimizer.zero_grad()
         (-returns.sum()).backward()
+        assert parameters.grad is not None
+        sound = torch.isfinite(parameters.grad)
+        if not iteration and not sound.all():
+            raise FloatingPointError(
+                "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
+                "reward, and add a tiny constant under it"
+            )
+        parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
         optimizer.step()
     with torch.no_grad():
         best.update(parameters.detach(), evaluate(predict, reward, space, parameters))
     return best.plan(predict, reward, space, time.perf_counter() - began)
 
 
-@torch.no_grad()
+def _check_gradient(states: Tensor, returns: Tensor) -> None:
+    instead = "plan with cem or mppi instead, which need no gradient"
+    if not states.requires_grad:
+        raise ValueError(f"what predicts the states is not differentiable, as the true simulator is not; {instead}")
+    slope = None
+    if returns.requires_grad:
+        (slope,) = torch.autograd.grad(returns.sum(), states, retain_graph=True, allow_unused=True)
+    if slope is None:
+        raise ValueError(
+            "the reward is not a differentiable function of the states: a comparison, a rounding, NumPy or detach() "
+            f"cuts the gradient off. Write it with smooth torch functions, or {instead}"
+        )
+
+
 def cem(
     predict: Predict,
     reward: Reward,
     space: Space,
-    n_targets: int,
+    start: Tensor | int,
     *,
     candidates: int = 256,
     elites: int = 24,
@@ -182,30 +261,99 @@ def cem(
     seed: int = 0,
     progress: str = "",
 ) -> Plan:
-    """Cross-entropy method: sample around a mean, refit mean and deviation to the elites, keep the best ever seen."""
+    """Cross-entropy method: sample around a mean, refit mean and deviation to the elites, keep the best ever seen.
+
+    The mean begins at the best of ``start`` (C, B, *shape), or at zero for as many targets.
+    """
     if not 2 <= elites <= candidates or iterations < 1:
         raise ValueError(
             f"candidates is {candidates}, elites {elites}, iterations {iterations}; expected 2 <= elites <= candidates "
             "and at least one iteration"
         )
+
+    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        chosen = returns.topk(elites, dim=0).indices  # (elites, B)
+        elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
+        return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
+
+    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+
+
+def mppi(
+    predict: Predict,
+    reward: Reward,
+    space: Space,
+    start: Tensor | int,
+    *,
+    candidates: int = 256,
+    iterations: int = 10,
+    temperature: float = 0.3,  # in standard deviations of the candidates' returns
+    shrink: float = 0.8,  # of the noise, from one iteration to the next
+    seed: int = 0,
+    progress: str = "",
+) -> Plan:
+    """Model predictive path integral control (Williams et al., 2017): the mean moves to a weighted mean of candidates.
+
+        w_c ~ exp(R_c / (temperature * std(R)))        mean <- sum_c w_c parameters_c
+
+    Beyond the original, the noise shrinks from one iteration to the next, so that many iterations converge.
+    """
+    if candidates < 2 or iterations < 1 or not temperature > 0 or not 0 < shrink <= 1:
+        raise ValueError(
+            f"candidates is {candidates}, iterations {iterations}, temperature {temperature}, shrink {shrink}; "
+            "expected 2 or more, 1 or more, above 0, and above 0 to 1"
+        )
+
+    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        spread = returns.std(0).clamp(min=1e-9)
+        weights = ((returns - returns.max(0).values) / (temperature * spread)).softmax(0)
+        return (_like(weights, parameters) * parameters).sum(0), shrink * deviation
+
+    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+
+
+Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@torch.no_grad()
+def _sample(
+    predict: Predict, reward: Reward, space: Space, start: Tensor | int, refit: Refit,
+    candidates: int, iterations: int, seed: int, progress: str,
+) -> Plan:  # fmt: skip
+    """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
     began = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
-    mean = torch.zeros(n_targets, *space.shape)
+    start = _parameters(start, space)
+    best = _Best(start)
+    best.update(start, evaluate(predict, reward, space, start))
+    mean = best.parameters
     deviation = torch.full_like(mean, space.scale)
-    best = _Best(mean[None])
     for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
-        parameters = mean + deviation * space.noise(candidates, n_targets, generator)
+        parameters = mean + deviation * space.noise(candidates, len(mean), generator)
         if iteration:
-            parameters[0], parameters[1] = mean, best.parameters
+            parameters[0] = best.parameters
         returns = evaluate(predict, reward, space, parameters)
-        best.update(parameters, returns)
-        chosen = returns.topk(elites, dim=0).indices  # (elites, B)
-        elite = parameters.gather(
-            0, chosen.reshape(*chosen.shape, *[1] * len(space.shape)).expand(-1, -1, *space.shape)
-        )
-        mean = keep * mean + (1 - keep) * elite.mean(0)
-        deviation = keep * deviation + (1 - keep) * elite.std(0)
+        finite = torch.isfinite(returns)  # a candidate on which the model diverges is as bad as the worst
+        worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
+        returns = returns.where(finite, worst)
+        mean, deviation = refit(parameters, returns, mean, deviation)
+        both = torch.cat([returns, evaluate(predict, reward, space, mean[None])])
+        best.update(torch.cat([parameters, mean[None]]), both)
     return best.plan(predict, reward, space, time.perf_counter() - began)
+
+
+def _parameters(start: Tensor | int, space: Space) -> Tensor:
+    """``start`` as parameters (C, B, *shape)."""
+    if isinstance(start, int):
+        return torch.zeros(1, start, *space.shape)
+    if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
+        raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
+    return start
+
+
+def _like(values: Tensor, parameters: Tensor) -> Tensor:
+    """(C, B) with as many dimensions as ``parameters``."""
+    return values.reshape(*values.shape, *[1] * (parameters.ndim - 2))
 
 
 @torch.no_grad()
@@ -217,6 +365,23 @@ def reassess(plan: Plan, predict: Predict, reward: Reward) -> Plan:
     """
     states = predict(plan.actions[None])
     return replace(plan, states=states[:, 0], predicted=expected_return(states, plan.actions[None], reward)[0])
+
+
+@torch.no_grad()
+def stopped(plan: Plan, iteration: int, predict: Predict, reward: Reward, space: Space) -> Plan:
+    """The plan as it was after ``iteration`` steps of its planner (0: its start), to see what more of them earned.
+
+    ``predicted`` and ``states`` come from ``predict``: as in ``reassess``, give it samples of its own.
+    """
+    if plan.trace is None or not 0 <= iteration < len(plan.trace):
+        steps = "kept no trace" if plan.trace is None else f"took {len(plan.trace) - 1} iterations"
+        raise ValueError(f"the planner {steps}; there is no plan as of iteration {iteration}")
+    parameters = plan.trace[iteration]
+    found = replace(
+        plan, parameters=parameters, actions=space.decode(parameters[None])[0],
+        curve=plan.curve[: iteration + 1], trace=plan.trace[: iteration + 1],
+    )  # fmt: skip
+    return reassess(found, predict, reward)
 
 
 @torch.no_grad()
@@ -238,12 +403,12 @@ def sampled_starts(
         raise ValueError(f"keep is {keep} of {candidates} candidates, expected 1 to {candidates}")
     parameters = space.scale * space.noise(candidates, n_targets, torch.Generator().manual_seed(seed))
     chosen = evaluate(predict, reward, space, parameters).topk(keep, dim=0).indices
-    return parameters.gather(0, chosen.reshape(*chosen.shape, *[1] * len(space.shape)).expand(-1, -1, *space.shape))
+    return parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
 
 
 def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
-    """Undiscounted return (C, B), mean over the S samples of states (S, C, B, T, dx)."""
-    return reward(states, actions).sum(-1).mean(0)
+    """Undiscounted return (C, B), mean over the S samples of states (S, C, B, T, dx). Checks what the reward gives."""
+    return rewarded(reward, states, actions).sum(-1).mean(0)
 
 
 @torch.no_grad()
@@ -263,19 +428,22 @@ class _Best:
         self.parameters = start[0].clone()
         self.returns = start.new_full((start.shape[1],), -torch.inf)
         self.curve: list[Tensor] = []
+        self.trace: list[Tensor] = []
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:
-        if not torch.isfinite(returns).all():
+        value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)
+        hopeless = torch.isinf(torch.maximum(value, self.returns))
+        if hopeless.any():
             raise FloatingPointError(
-                f"{(~torch.isfinite(returns)).sum().item()} of {returns.numel()} candidates have a predicted return "
-                "that is not finite; the model or the reward diverges on them"
+                f"no candidate for target {int(hopeless.nonzero()[0])} has a predicted return that is finite; the "
+                "model diverges on all of them, or the reward is infinite"
             )
-        value, index = returns.max(0)
         better = value > self.returns
         chosen = parameters[index, torch.arange(len(index))]
         self.parameters = torch.where(better.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, self.parameters)
         self.returns = torch.where(better, value, self.returns)
         self.curve.append(self.returns)
+        self.trace.append(self.parameters)
 
     @torch.no_grad()
     def plan(self, predict: Predict, reward: Reward, space: Space, seconds: float) -> Plan:
@@ -288,4 +456,5 @@ class _Best:
             predicted=expected_return(states, actions, reward)[0],
             curve=torch.stack(self.curve),
             seconds=seconds,
+            trace=torch.stack(self.trace),
         )
