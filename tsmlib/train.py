@@ -114,9 +114,10 @@ def fit(
 class Progress:
     """All that a run needs to continue: weights, Adam's moments, the step, the best weights and the curve so far."""
 
-    def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+    def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer, curve: Any = None) -> None:
         self.model, self.optimizer = model, optimizer
-        self.step, self.seconds, self.curve = 0, 0.0, Curve()
+        self.step, self.seconds = 0, 0.0
+        self.curve: Any = Curve() if curve is None else curve  # a dataclass of lists
         self.best, self.best_step, self.best_loss = _copy(model.state_dict()), 0, math.inf
 
     def record(self, train: float, validation: float) -> None:
@@ -181,7 +182,7 @@ class Progress:
             index, _, moment = name.partition(".")
             moments.setdefault(int(index), {})[moment] = tensor
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
-        self.step, self.seconds, self.curve = header["step"], header["seconds"], Curve(**header["curve"])
+        self.step, self.seconds, self.curve = header["step"], header["seconds"], type(self.curve)(**header["curve"])
         self.best_step, self.best_loss = header["best_step"], header["best_loss"]
 
 
