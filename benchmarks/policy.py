@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import resource
 import sys
-import time
 from collections import defaultdict
 from typing import Any
 
@@ -61,7 +60,6 @@ def main() -> None:
         return improve(learner, model, reward, draw, iterations=n, record_every=n).seconds[-1] / n
 
     totals: dict[tuple[str, int], list[float]] = defaultdict(list)
-    began = time.perf_counter()
     for _ in tqdm(range(arguments.rounds), desc="rounds"):
         for kind in ("codes", "actions"):
             for copies in (1, arguments.copies):
@@ -69,9 +67,8 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
     print(
-        f"{arguments.env}, {origin} models, {task.horizon} steps, 20 episodes an update, "
-        f"{arguments.iterations} updates, {torch.get_num_threads()} threads, {arguments.rounds} rounds in {time.perf_counter() - began:.0f} s: "
-        "median (lowest to highest)"
+        f"{arguments.env}, {origin} models, {task.horizon} steps, 20 episodes and {torch.get_num_threads()} threads, "
+        f"{arguments.iterations} updates in each of {arguments.rounds} rounds: median (lowest to highest)"
     )
     rows = []
     common = dict(env=arguments.env, sim="mujoco", task=task.name, model="tsm", planner="policy", horizon=task.horizon)

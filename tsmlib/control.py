@@ -11,7 +11,7 @@ from torch import Tensor
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
-from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.collect import Controller, collect, once, smooth_torques
 from tsmlib.rewards import Reward
 from tsmlib.trajectory import Segment, initial_past
 from tsmlib.trajopt import Plan
@@ -60,10 +60,14 @@ class Task:
             raise ValueError(f"{n} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
         return Task(self.name, self.env, self.start[:n], self.target[:n], self.horizon)
 
+    def times(self, n: int) -> Task:
+        """All instances n times over, for as many copies of a policy."""
+        return Task(self.name, self.env, np.tile(self.start, (n, 1)), self.target.repeat(n, 1), self.horizon)
+
 
 @dataclass(frozen=True)
 class Trial:
-    """Actions executed open loop in the true simulator.
+    """Actions executed in the true simulator.
 
     actions (B, T, du); states (B, T + 1, dx) from the start on; true (B,): undiscounted return executed;
     final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan.
@@ -83,11 +87,15 @@ class Trial:
         return self.plan.predicted - self.true
 
 
-def execute(task: Task, plan: Plan | Tensor) -> Trial:
-    """Run a plan, or plain actions (B, T, du), open loop from the task's starts."""
+def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
+    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say."""
     actions = plan.actions if isinstance(plan, Plan) else plan
     env = gymnasium.make_vec(task.env, num_envs=len(task))
-    seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+    if isinstance(actions, Tensor):
+        seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+    else:
+        seen = collect(env, actions, horizon=task.horizon, states=task.start)
+        actions = torch.from_numpy(seen.actions)
     env.close()
     states = torch.from_numpy(seen.states)
     return Trial(
