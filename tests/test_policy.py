@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import tsmlib.envs  # noqa: F401 - registers the environments
-from tsmlib import store
+from tsmlib import runs, store, study
 from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect
 from tsmlib.dynamics import rollout, stepper
@@ -241,16 +241,15 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
 
 @KINDS
 def test_a_policy_learned_through_the_true_model_arrives(kind: str) -> None:
-    actor = policy(kind)
-    start, target = around()(50, torch.Generator().manual_seed(9))
-    distance = []
-    for _ in range(2):
-        end = imagine(actor, Sled(), start, target, horizon=12).states[:, -1]
-        distance.append((end[:, :2] - target).norm(dim=1).mean().item())
-        if len(distance) == 1:
-            curve = learn(actor, Sled(0.01), horizon=12, episodes=20, iterations=120, record_every=60)
-    assert distance[1] < 0.15 * distance[0]
-    assert curve.iteration == [0, 60, 120]
+    def distance(learner: Any) -> dict[str, Tensor]:
+        end = imagine(learner, Sled(), start, target, horizon=10).states[:, -1]
+        return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
+
+    actor, (start, target) = policy(kind), around()(50, torch.Generator().manual_seed(9))
+    curve = learn(actor, Sled(0.01), horizon=10, episodes=20, iterations=90, record_every=45, measure=distance)
+    (before,), _, (after,) = curve.measured["distance"]
+    assert after < 0.2 * before
+    assert curve.iteration == [0, 45, 90]
     assert curve.predicted[2][0] > curve.predicted[1][0] > curve.predicted[0][0]
 
 
@@ -374,6 +373,46 @@ def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
     assert torch.equal(controller(again, target)(past), controller(actor, target)(past))
     with pytest.raises(store.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
         store.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v0"})
+
+
+@pytest.mark.parametrize("prior", ["codes", "actions"])
+def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
+    prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    net = study.fresh(run, "tsm", study.dataset(run, "tsm/Reacher-v0", "train"))
+    codes = study.fresh(run, "prior", study.dataset(run, "tsm/Reacher-v0", "train"))
+    monkeypatch.setattr(study, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {}))
+    task = study.task("tsm/Reacher-v0", "validation").take(3)
+    actor, header = study.learn(run, task, "tsm", prior, copies=2)
+    assert header["curve"]["iteration"] == [0, 1, 2, 3, 4]
+    for metric in ("return_true", "return_predicted", "final_distance", "success"):
+        assert torch.tensor(header["curve"]["measured"][metric]).shape == (5, 2)
+    found = study.assess(actor, net, task, seed=2)
+    last = {metric: torch.tensor(values[-1]) for metric, values in header["curve"]["measured"].items()}
+    for metric, values in found.items():
+        torch.testing.assert_close(values, last[metric])
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "improve", None)
+        again, _ = study.learn(run, task, "tsm", prior, copies=2)
+        assert same(weights(again), weights(actor))
+        with pytest.raises(TypeError):
+            study.learn(run, task, "tsm", prior, copies=1)
+        with torch.no_grad():
+            next(net.parameters()).add_(1)
+        with pytest.raises(TypeError):
+            study.learn(run, task, "tsm", prior, copies=2)
+    assert [path.name for path in (run.models / "Reacher").iterdir()] == [f"policy-tsm-{prior}.safetensors"]
+
+
+@pytest.mark.parametrize("bad", [("code", 0, 1), ("codes", -1, 1), ("codes", 0, 0)])
+def test_an_unknown_way_to_learn_is_refused_before_anything_is_trained(
+    bad: tuple[str, int, int], tmp_path: Path
+) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    with pytest.raises(ValueError, match="expected codes or actions, 0"):
+        study.learn(run, study.task("tsm/Reacher-v0"), "tsm", bad[0], iterations=bad[1], copies=bad[2])
+    assert not run.dir.exists() or not any(run.models.rglob("*.safetensors"))
 
 
 # What goes wrong -----------------------------------------------------------------------------------------------------
