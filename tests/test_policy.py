@@ -80,8 +80,13 @@ def model(name: str) -> Any:
 
 
 def prior() -> ActionPrior:
+    """An action prior of new weights, whose actions do not drift to their bounds."""
     torch.manual_seed(2)
-    return ActionPrior(DU, latent_dim=3, **SMALL).double()
+    made = ActionPrior(DU, latent_dim=3, **SMALL).double()
+    with torch.no_grad():
+        made.std.fill_(0.5)
+        made.decoder.head[-1].bias.zero_()
+    return made
 
 
 def policy(kind: str, state_dim: int = 4, *, copies: int = 1, seed: int = 0, **options: Any) -> Any:

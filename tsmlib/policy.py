@@ -315,7 +315,7 @@ def improve(
     optimizer = torch.optim.Adam(trained, lr=lr)
     state = Progress(policy, optimizer, LearningCurve())
     identity = dict(
-        policy=type(policy).__name__, model=_digest(model), reward=getattr(reward, "__name__", "reward"),
+        policy=type(policy).__name__, copies=policy.copies, model=_digest(model), reward=getattr(reward, "__name__", "reward"),
         horizon=horizon, gamma=gamma, noise=noise, episodes=episodes, iterations=iterations, lr=lr, lr_decay=lr_decay,
         lr_final=lr_final, clip=clip, seed=seed, record_every=record_every,
     )  # fmt: skip

@@ -428,10 +428,10 @@ def learn(
     prior: codes (a SegmentPolicy, acting through the action prior) or actions (a OneStepPolicy). copies: learned side
     by side from different seeds. iterations: 0 means smoke 4, laptop 300, paper 2,200. Episodes start as those of the
     training data, so the environment is not asked. What the policy truly earns on ``task`` is measured at ten points
-    along the way, beside what the model promises there; neither has a part in learning.
+    along the way, beside what the model promises there (``assess``); neither has a part in learning.
 
-    From the run's folder; else, at scale laptop with seed 0, from the shipped ones; else learned now, from checkpoints
-    if it was stopped.
+    From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its copies and iterations; else
+    learned now, going on from its checkpoint if it was stopped.
     """
     if prior not in ("codes", "actions") or iterations < 0 or copies < 1:
         raise ValueError(
@@ -442,18 +442,13 @@ def learn(
     nets = {"model": net} | ({"prior": load_or_train(run, task.env, "prior")[0]} if prior == "codes" else {})
     name, cls = f"policy-{model}-{prior}.safetensors", SegmentPolicy if prior == "codes" else OneStepPolicy
     own, shipped = run.folder(f"models/{short(task.env)}") / name, run.shipped / short(task.env) / name
-    made_from = {
-        "task": task.name,
-        "seed": run.seed,
-        "weights": {k: store.digest(n.state_dict()) for k, n in nets.items()},
-    }
+    weights = {word: store.digest(net.state_dict()) for word, net in nets.items()}
+    made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
     budget = {"copies": copies, "iterations": iterations or run.pick(smoke=4, laptop=300, paper=2200)}
-    for path, budgets in (
-        [(own, [budget]), (shipped, None)] if run.scale == "laptop" and run.seed == 0 else [(own, [budget])]
-    ):
+    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
             header = store.read_header(path)
-            if header.get("made_from") == made_from and (budgets is None or header.get("budget") in budgets):
+            if header.get("made_from") == made_from and (path == shipped or header.get("budget") == budget):
                 return store.load_model(path, cls, expect=fingerprint(task.env)), header
     print(f"{task.env}: no policy learned in {model} through {prior} at scale {run.scale}; learning it now")
     data = dataset(run, task.env, "train")
