@@ -317,7 +317,8 @@ def improve(
     identity = dict(
         policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
         reward=getattr(reward, "__name__", "reward"), horizon=horizon, gamma=gamma, noise=noise,
-        episodes=episodes, iterations=iterations, lr=lr, lr_decay=lr_decay, lr_final=lr_final, clip=clip, seed=seed, record_every=record_every,
+        episodes=episodes, iterations=iterations, lr=lr, lr_decay=lr_decay, lr_final=lr_final, clip=clip,
+        seed=seed, record_every=record_every,
     )  # fmt: skip
     if checkpoint is not None and checkpoint.exists():
         state.load(checkpoint, identity)
