@@ -15,6 +15,7 @@ from tsmlib.__main__ import main
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2", "--rounds", "2"],
     "plan": ["--targets", "2", "--iterations", "1", "--samples", "1", "--rounds", "2"],
+    "policy": ["--copies", "2", "--iterations", "1", "--rounds", "2"],
 }
 RATIOS = {"ratio_lowest", "ratio_median", "ratio_highest"}
 SPEEDS = {"steps_per_second", "steps_per_core_second", *RATIOS}
@@ -27,6 +28,7 @@ ROWS = {  # condition -> metrics
             for part in ("simulate", "codes to torques", "torques to states", "gradients and the rest")
         },
     },
+    "policy": {"extrapolated": {"seconds"}, "copies": {"peak_bytes", *RATIOS}},
 }
 
 
@@ -50,4 +52,4 @@ def test_a_benchmark_states_ratios_with_their_spread(
 
 def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "there are collect, plan, or all" in capsys.readouterr().err
+    assert "there are collect, plan, policy, or all" in capsys.readouterr().err
