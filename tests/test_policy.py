@@ -39,6 +39,7 @@ DX, DU, H, DT = 6, 2, 4, 0.5
 SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
 MODELS: dict[str, Callable[[], Any]] = {
     "tsm": lambda: TSM(DX, DU, **SMALL),
+    "tsm+direct": lambda: TSM(DX, DU, direct_channels=8, **SMALL),
     "onestep": lambda: OneStep(DX, DU, hidden=8, layers=1),
     "lstm": lambda: LSTM(DX, DU, hidden=8, past_len=H, segment_len=8),
     "ensemble": lambda: Ensemble(DX, DU, members=3, hidden=8, layers=1, segment_len=8),
@@ -168,9 +169,10 @@ def test_noise_of_each_copy_is_its_own() -> None:
 
 @pytest.mark.parametrize("positions", [1, 3, 10])
 @pytest.mark.parametrize("dilations", [(1, 2, 4, 8, 4), (2, 1), (3,)])
-def test_the_last_position_alone_is_the_last_of_all(positions: int, dilations: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("direct", [0, 8])
+def test_the_last_position_alone_is_the_last_of_all(positions: int, dilations: tuple[int, ...], direct: int) -> None:
     torch.manual_seed(0)
-    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=dilations).double()
+    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=dilations, direct_channels=direct).double()
     inputs, z = normal(5, positions, 3), normal(5, 4, seed=1)
     torch.testing.assert_close(decoder.last(inputs, z), decoder(inputs, z)[:, -1])
 

@@ -138,7 +138,7 @@ class CausalDecoder(nn.Module):
             s, skip = layer(earlier, now, code)
             total = skip[:, 0] if total is None else total + skip[:, 0]
             held = positions
-        return self.head(total)
+        return self._out(total, inputs[:, -1])
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
