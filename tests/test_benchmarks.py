@@ -16,6 +16,7 @@ TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2", "--rounds", "2"],
     "plan": ["--targets", "2", "--iterations", "1", "--samples", "1", "--rounds", "2"],
     "trust": ["--steps", "2", "--loads", "1", "--rounds", "2"],
+    "policy": ["--copies", "2", "--iterations", "1", "--rounds", "2"],
 }
 
 RATIOS = {"ratio_lowest", "ratio_median", "ratio_highest"}
@@ -30,6 +31,7 @@ ROWS = {  # condition -> metrics
             for part in ("simulate", "codes to torques", "torques to states", "gradients and the rest")
         },
     },
+    "policy": {"extrapolated": {"seconds"}, "copies": {"peak_bytes", *RATIOS}},
 }
 
 
@@ -53,4 +55,4 @@ def test_a_benchmark_states_ratios_with_their_spread(
 
 def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "there are collect, plan, trust, or all" in capsys.readouterr().err
+    assert "there are collect, plan, policy, trust, or all" in capsys.readouterr().err

@@ -10,6 +10,7 @@ the physical state in units of its standard deviation, as TSM does. The ensemble
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -51,11 +52,19 @@ class OneStep(nn.Module):
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """(B, L, .), (B, K, du) -> states (B, K, dx), for any K. There is nothing to draw."""
-        x, states = past.states[:, -1], []
-        for u in actions.unbind(1):
+        step = self.stepper(past)
+        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
+
+    def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
+        """``predict_segment`` one action at a time; see ``dynamics.stepper``."""
+        x = past.states[:, -1]
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal x
             x = self.step(x, u)
-            states.append(x)
-        return torch.stack(states, dim=1)
+            return x
+
+        return step
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """(i) Squared error of one-step increments on every tuple (x_t, u_t, x_{t+1}) of the window's future."""
@@ -106,15 +115,23 @@ class LSTM(nn.Module):
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx). There is nothing to draw."""
-        h = c = actions.new_zeros(len(actions), self.hidden)
+        step = self.stepper(past)
+        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
+
+    def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
+        """``predict_segment`` one action at a time, the hidden state carried; see ``dynamics.stepper``."""
+        h = c = past.states.new_zeros(len(past.states), self.hidden)
         for x, u in zip(past.states[:, :-1].unbind(1), past.actions[:, 1:].unbind(1), strict=True):
             h, c = self.recur(x, u, h, c)
-        x, states = past.states[:, -1], []
-        for u in actions.unbind(1):
+        x = past.states[:, -1]
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal x, h, c
             h, c = self.recur(x, u, h, c)
             x = x + self.features.step_std * self.out(h)
-            states.append(x)
-        return torch.stack(states, dim=1)
+            return x
+
+        return step
 
     def recur(self, x: Tensor, u: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """The next hidden state h and cell c, (B, hidden) each."""
@@ -197,8 +214,7 @@ class Ensemble(nn.Module):
                 states.append(x)
             return torch.stack(states, dim=1)
         (rows, steps, _), dx = actions.shape, past.states.shape[2]
-        uniform = torch.special.ndtr(standard_normal((rows,), generator, actions))
-        member = (self.members * uniform).long().clamp(max=self.members - 1)
+        member = self._drawn(past, generator)
         noise = standard_normal((rows, steps if self.gaussian else 0, dx), generator, actions)
         predicted = actions.new_empty(rows, steps, dx)
         for m in range(self.members):
@@ -206,6 +222,44 @@ class Ensemble(nn.Module):
             own = self._by_member(m, past.states[mine, -1], actions[mine], noise[mine])
             predicted = predicted.index_put((mine,), own)
         return predicted
+
+    def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
+        """``predict_segment`` one action at a time, each row with the same member throughout; see ``dynamics.stepper``.
+
+        Rows are sorted into one block per member, filled up to equal size, so that a step is one batched product.
+        """
+        x, rows = past.states[:, -1], len(past.states)
+        if generator is None:
+            every = torch.arange(rows, device=x.device).expand(self.members, -1)
+            place, noise = every.flatten(), None
+        else:
+            member = self._drawn(past, generator)
+            shape = (rows, self.segment_len if self.gaussian else 0, x.shape[1])
+            noise = standard_normal(shape, generator, x)
+            counts = member.bincount(minlength=self.members)
+            order, block = member.argsort(stable=True), int(counts.max())
+            rank = torch.arange(rows, device=x.device) - (counts.cumsum(0) - counts)[member[order]]
+            slot = torch.empty_like(member).index_copy(0, order, member[order] * block + rank)  # of each row
+            place = torch.zeros(self.members * block, dtype=torch.long, device=x.device).index_copy(
+                0, slot[order], order
+            )
+        taken = 0
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal x, taken
+            blocks = (part.index_select(0, place).unflatten(0, (self.members, -1)) for part in (x, u))
+            mean, log_variance = self.increments(*blocks)  # (M, block, dx)
+            if generator is None:
+                change = mean.mean(0)
+            else:
+                change = mean.flatten(0, 1).index_select(0, slot)
+                if log_variance is not None:
+                    stated = (0.5 * log_variance.flatten(0, 1).index_select(0, slot)).exp()
+                    change = change + stated * noise[:, taken]
+            x, taken = x + self.features.step_std * change, taken + 1
+            return x
+
+        return step
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
         """Mean over members of the negative log-likelihood, or squared error, of one-step increments.
@@ -225,6 +279,11 @@ class Ensemble(nn.Module):
         log_variance = log_variance[..., moving]
         likelihood = 0.5 * (error * (-log_variance).exp() + log_variance).sum(-1).mean()
         return likelihood + 0.01 * (self.log_variance_max - self.log_variance_min)[moving].sum()
+
+    def _drawn(self, past: Segment, generator: Noise) -> Tensor:
+        """The member that each row keeps, uniform over all of them: (B,)."""
+        uniform = torch.special.ndtr(standard_normal((len(past.states),), generator, past.states))
+        return (self.members * uniform).long().clamp(max=self.members - 1)
 
     def _by_member(self, m: int, x: Tensor, actions: Tensor, noise: Tensor) -> Tensor:
         states = []

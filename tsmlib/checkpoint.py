@@ -46,9 +46,10 @@ class Curve:
 class Progress:
     """All that a run needs to continue: weights, Adam's moments, the step, the best weights and the curve so far."""
 
-    def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> None:
+    def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer, curve: Any = None) -> None:
         self.model, self.optimizer = model, optimizer
-        self.step, self.seconds, self.curve = 0, 0.0, Curve()
+        self.step, self.seconds = 0, 0.0
+        self.curve: Any = Curve() if curve is None else curve  # a dataclass of lists, with resumed
         self.best, self.best_step, self.best_loss = _copy(model.state_dict()), 0, math.inf
 
     def record(self, train: float, validation: float) -> None:
@@ -111,7 +112,7 @@ class Progress:
             for name, tensor in groups["adam"].items():
                 index, _, moment = name.partition(".")
                 moments.setdefault(int(index), {})[moment] = tensor
-            curve, before, now = Curve(**header["curve"]), {**header["made_by"]}, provenance()
+            curve, before, now = type(self.curve)(**header["curve"]), {**header["made_by"]}, provenance()
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:

@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
-from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.collect import Controller, collect, once, smooth_torques
 from tsmlib.dynamics import DynamicsModel
 from tsmlib.envs.base import BLOCK_RADIUS, LINK_LENGTHS, WALL
 from tsmlib.rewards import Reward, rewarded
@@ -113,6 +113,10 @@ class Task:
             raise ValueError(f"{n} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
         return replace(self, start=self.start[:n], target=self.target[:n])
 
+    def times(self, n: int) -> Task:
+        """All instances n times over, for as many copies of a policy."""
+        return replace(self, start=np.tile(self.start, (n, 1)), target=self.target.repeat(n, 1))
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -136,11 +140,15 @@ class Trial:
         return self.plan.predicted - self.true
 
 
-def execute(task: Task, plan: Plan | Tensor) -> Trial:
-    """Run a plan, or plain actions (B, T, du), open loop from the task's starts."""
+def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
+    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say."""
     actions = plan.actions if isinstance(plan, Plan) else plan
     env = gymnasium.make_vec(task.env, num_envs=len(task))
-    seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+    if isinstance(actions, Tensor):
+        seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+    else:
+        seen = collect(env, actions, horizon=task.horizon, states=task.start)
+        actions = torch.from_numpy(seen.actions)
     env.close()
     return _measured(task, torch.from_numpy(seen.states), actions, plan if isinstance(plan, Plan) else None)
 

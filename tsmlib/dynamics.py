@@ -6,6 +6,8 @@ H = 1. Everything else in the package (plan, learn a policy, score, draw) is wri
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
 from typing import Protocol
 
 import torch
@@ -13,6 +15,8 @@ from torch import Tensor
 
 from tsmlib.nets import Noise
 from tsmlib.trajectory import Segment, Window
+
+Step = Callable[[Tensor], Tensor]  # an action (B, du) -> the state (B, dx) that it leads to
 
 
 class DynamicsModel(Protocol):
@@ -35,14 +39,49 @@ def rollout(model: DynamicsModel, past: Segment, actions: Tensor, *, generator: 
 
     Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps.
     """
-    if past.states.shape[1] < model.past_len:
-        raise ValueError(
-            f"the past holds {past.states.shape[1]} steps, {type(model).__name__} needs {model.past_len}; "
-            "at the start of an episode use tsmlib.trajectory.initial_past"
-        )
+    _require_past(model, past)
     predicted = []
     for segment_actions in actions.split(model.segment_len, dim=1):
         states = model.predict_segment(past.last(model.past_len), segment_actions, generator=generator)
         predicted.append(states)
         past = past.last(model.past_len).then(Segment(states, segment_actions))
     return torch.cat(predicted, dim=1)
+
+
+def stepper(model: DynamicsModel, past: Segment, *, generator: Noise | None = None) -> Step:
+    """Roll out one action at a time, each chosen after the state before it was seen, as a policy acts (section 4.3).
+
+    The states are those of ``rollout`` under the actions that were taken: a code, or a member of an ensemble, is held
+    for a segment of H steps, with activations and hidden states carried from step to step; then a new segment begins on
+    the last steps. A model that cannot do this (it has no ``stepper`` of its own) predicts segments of one action, each
+    on the last ``past_len`` steps and with noise of its own. The two agree where H = 1.
+    """
+    _require_past(model, past)
+    begin = getattr(model, "stepper", None)
+    states, actions = (deque(part.unbind(1), maxlen=model.past_len) for part in past)
+    running, taken = None, 0
+
+    def step(u: Tensor) -> Tensor:
+        nonlocal running, taken
+        if begin is None or taken % model.segment_len == 0:
+            recent = Segment(torch.stack(tuple(states), dim=1), torch.stack(tuple(actions), dim=1))
+            if begin is not None:
+                running = begin(recent, generator=generator)
+        if running is not None:
+            x = running(u)
+        else:
+            x = model.predict_segment(recent, u[:, None], generator=generator)[:, 0]
+        states.append(x)
+        actions.append(u)
+        taken += 1
+        return x
+
+    return step
+
+
+def _require_past(model: DynamicsModel, past: Segment) -> None:
+    if past.states.shape[1] < model.past_len:
+        raise ValueError(
+            f"the past holds {past.states.shape[1]} steps, {type(model).__name__} needs {model.past_len}; "
+            "at the start of an episode use tsmlib.trajectory.initial_past"
+        )

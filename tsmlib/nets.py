@@ -26,11 +26,21 @@ class SharedNoise:
     period: int
 
 
-Noise = torch.Generator | SharedNoise
+@dataclass(frozen=True)
+class SeparateNoise:
+    """Independent copies: rows are laid out copy by copy, (M, B), and each copy draws from a generator of its own."""
+
+    generators: tuple[torch.Generator, ...]
+
+
+Noise = torch.Generator | SharedNoise | SeparateNoise
 
 
 def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
     """Draw N(0, 1) of ``shape`` with the device and type of ``like``."""
+    if isinstance(noise, SeparateNoise):
+        share = (shape[0] // len(noise.generators), *shape[1:])
+        return torch.cat([standard_normal(share, generator, like) for generator in noise.generators])
     if isinstance(noise, SharedNoise):
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
@@ -108,6 +118,28 @@ class CausalDecoder(nn.Module):
         """(B, P, input_dim), (B, dz) -> (B, P, output_dim)."""
         _, total = self._parallel(inputs, z, len(self.layers))
         return self._out(total, inputs)
+
+    def last(self, inputs: Tensor, z: Tensor) -> Tensor:
+        """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, output_dim).
+
+        Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed.
+        """
+        n_positions, owed = inputs.shape[1], [[0]]
+        for dilation in reversed(self.dilations[1:]):
+            seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
+            owed.insert(0, sorted(seen))
+        s, held = self.inlet(inputs), list(reversed(range(n_positions)))
+        total = None
+        codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
+        for layer, dilation, code, positions in zip(self.layers, self.dilations, codes, owed, strict=True):
+            at = {p: i for i, p in enumerate(held)}
+            s = F.pad(s, (0, 0, 0, 1))  # zeros stand for what lies before the first position
+            taken = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
+            earlier, now = s.index_select(1, torch.tensor(taken, device=s.device)).chunk(2, dim=1)
+            s, skip = layer(earlier, now, code)
+            total = skip[:, 0] if total is None else total + skip[:, 0]
+            held = positions
+        return self._out(total, inputs[:, -1])
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""

@@ -72,6 +72,11 @@ class ActionPrior(nn.Module):
             actions.append(u)
         return torch.stack(actions, dim=1)  # (B, H, du)
 
+    def first(self, past_actions: Tensor, z: Tensor) -> Tensor:
+        """The first action of ``decode`` alone, by which a segment policy acts: (B, L, du), (B, dz) -> (B, du)."""
+        step = self.decoder.last(past_actions / self.std, z)
+        return (past_actions[:, -1] + self.std * step).clamp(-1, 1)
+
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
         """P(U+ | U-, z) with the true actions as inputs, all positions at once: (B, H, du)."""
         past, future = window.past.actions, window.future.actions

@@ -10,6 +10,7 @@ of the angles, standardised velocities and positions, and predicts the increment
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -72,22 +73,16 @@ class TSM(nn.Module):
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """(B, L, .), (B, K <= H, du) -> states (B, K, dx). No generator: z = 0; with one: z ~ N(0, I)."""
-        shape = (len(actions), self.latent_dim)
-        if generator is None:
-            z = actions.new_zeros(shape)
-        else:
-            z = standard_normal(shape, generator, actions)
-        return self.decode(past, actions, z)
+        return self.decode(past, actions, self._code(past, generator))
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z), free-running: each state is computed from the predicted one before it."""
-        x, codes = past.states[:, -1], self.decoder.codes(z)
-        cache = self.decoder.begin(self._inputs(past.states[:, :-1], past.actions[:, 1:]), z)
-        states = []
-        for u in actions.unbind(1):
-            x = x + self.features.step_std * self.decoder.step(self._inputs(x, u), codes, cache)
-            states.append(x)
-        return torch.stack(states, dim=1)  # (B, K, dx)
+        step = self._begin(past, z)
+        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
+
+    def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
+        """``predict_segment`` one action at a time, with one code for the segment; see ``dynamics.stepper``."""
+        return self._begin(past, self._code(past, generator))
 
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z) with the true states as inputs, all positions at once: (B, K, dx)."""
@@ -147,6 +142,21 @@ class TSM(nn.Module):
             distances = [_norm(a - x), _norm(b - x), _norm(a - b)]
             loss = loss + ((distances[0] + distances[1] - distances[2]) / 2).mean()
         return loss
+
+    def _code(self, past: Segment, generator: Noise | None) -> Tensor:
+        shape = (len(past.states), self.latent_dim)
+        return past.states.new_zeros(shape) if generator is None else standard_normal(shape, generator, past.states)
+
+    def _begin(self, past: Segment, z: Tensor) -> Callable[[Tensor], Tensor]:
+        x, codes = past.states[:, -1], self.decoder.codes(z)
+        cache = self.decoder.begin(self._inputs(past.states[:, :-1], past.actions[:, 1:]), z)
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal x
+            x = x + self.features.step_std * self.decoder.step(self._inputs(x, u), codes, cache)
+            return x
+
+        return step
 
     def _inputs(self, states: Tensor, actions: Tensor) -> Tensor:
         return torch.cat([self.features(states), actions], dim=-1)

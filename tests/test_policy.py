@@ -1,0 +1,500 @@
+"""Policies: what they see, what they may do, and that they learn what the model they learn in rewards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+import torch
+from torch import Tensor
+
+import tsmlib.envs  # noqa: F401 - registers the environments
+from tsmlib import runs, store, study
+from tsmlib.baselines import LSTM, Ensemble, OneStep
+from tsmlib.collect import collect
+from tsmlib.dynamics import rollout, stepper
+from tsmlib.nets import CausalDecoder, Noise, SeparateNoise, standard_normal
+from tsmlib.policy import (
+    LearningCurve,
+    OneStepPolicy,
+    SegmentPolicy,
+    controller,
+    discounted,
+    episodes_from,
+    imagine,
+    improve,
+    learning_rate,
+)
+from tsmlib.prior import ActionPrior
+from tsmlib.rewards import Reward
+from tsmlib.train import TrainingStopped
+from tsmlib.trajectory import Segment
+from tsmlib.tsm import TSM
+
+DX, DU, H, DT = 6, 2, 4, 0.5
+SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
+MODELS: dict[str, Callable[[], Any]] = {
+    "tsm": lambda: TSM(DX, DU, **SMALL),
+    "tsm+direct": lambda: TSM(DX, DU, direct_channels=8, **SMALL),
+    "onestep": lambda: OneStep(DX, DU, hidden=8, layers=1),
+    "lstm": lambda: LSTM(DX, DU, hidden=8, past_len=H, segment_len=8),
+    "ensemble": lambda: Ensemble(DX, DU, members=3, hidden=8, layers=1, segment_len=8),
+    "ensemble+mse": lambda: Ensemble(DX, DU, members=3, hidden=8, layers=1, segment_len=8, gaussian=False),
+}
+
+
+class Sled:
+    """Position and velocity in a plane, pushed by the action: x'' = u with friction. Known, and linear."""
+
+    segment_len = past_len = 1
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise = noise
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        x, states = past.states[:, -1], []
+        for u in actions.unbind(1):
+            velocity = 0.8 * x[:, 2:] + DT * u
+            if generator is not None:
+                velocity = velocity + self.noise * standard_normal(velocity.shape, generator, velocity)
+            x = torch.cat([x[:, :2] + DT * velocity, velocity], dim=1)
+            states.append(x)
+        return torch.stack(states, dim=1)
+
+
+def arrive(target: Tensor) -> Reward:
+    """Minus the squared distance of the first two dimensions from the target, minus a little for the action."""
+    return lambda states, actions: (
+        -(states[..., :2] - target[:, None]).square().sum(-1) - 0.01 * actions.square().sum(-1)
+    )
+
+
+def model(name: str) -> Any:
+    torch.manual_seed(1)
+    made = MODELS[name]().double()
+    made.features.step_std.fill_(0.1)
+    return made
+
+
+def prior() -> ActionPrior:
+    """An action prior of new weights, whose actions do not drift to their bounds."""
+    torch.manual_seed(2)
+    made = ActionPrior(DU, latent_dim=3, **SMALL).double()
+    with torch.no_grad():
+        made.std.fill_(0.5)
+        made.decoder.head[-1].bias.zero_()
+    return made
+
+
+def policy(kind: str, state_dim: int = 4, *, copies: int = 1, seed: int = 0, **options: Any) -> Any:
+    options = dict(angles=(), target_std=1.0, copies=copies, seed=seed) | options
+    if kind == "onestep":
+        return OneStepPolicy(state_dim, DU, hidden=16, **options).double()
+    return SegmentPolicy(state_dim, prior(), channels=8, dilations=(1, 2), **options).double()
+
+
+KINDS = pytest.mark.parametrize("kind", ["onestep", "segment"])
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def some_past(rows: int, dx: int = DX, steps: int = H) -> Segment:
+    return Segment(normal(rows, steps, dx), normal(rows, steps, DU, seed=1).tanh())
+
+
+def around(scale: float = 0.5) -> Callable[[int, torch.Generator], tuple[Tensor, Tensor]]:
+    """Episodes of the sled at rest, a target anywhere in a disc."""
+    return episodes_from(torch.zeros(1, 4, dtype=torch.float64), radius=scale)
+
+
+def learn(learner: Any, world: Any = None, reward: Any = arrive, **settings: Any) -> LearningCurve:
+    settings = dict(horizon=5, episodes=4, iterations=4, record_every=2, lr=1e-2) | settings
+    return improve(learner, world or Sled(), reward, around(), **settings)
+
+
+def weights(learner: Any) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in learner.state_dict().items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+# Rolling out one action at a time ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampled", [False, True], ids=["mode", "sample"])
+@pytest.mark.parametrize("name", MODELS)
+def test_states_met_one_by_one_are_those_of_a_rollout(name: str, sampled: bool) -> None:
+    world, past, actions = model(name), some_past(7), normal(7, 16, DU, seed=2).tanh()
+    draw = [torch.Generator().manual_seed(3) if sampled else None for _ in range(2)]
+    step = stepper(world, past, generator=draw[0])
+    seen = torch.stack([step(u) for u in actions.unbind(1)], dim=1)
+    torch.testing.assert_close(seen, rollout(world, past, actions, generator=draw[1]))
+
+
+def test_a_model_that_cannot_step_predicts_segments_of_one_action() -> None:
+    whole, actions = model("tsm"), normal(3, 6, DU, seed=2).tanh()
+
+    class Plain:
+        segment_len, past_len, predict_segment = whole.segment_len, whole.past_len, whole.predict_segment
+
+    past = some_past(3)
+    step, seen = stepper(Plain(), past), []  # type: ignore[arg-type]
+    for u in actions.unbind(1):
+        slow = whole.predict_segment(past.last(H), u[:, None])
+        seen.append(step(u))
+        torch.testing.assert_close(seen[-1], slow[:, 0], rtol=0, atol=0)
+        past = past.then(Segment(slow, u[:, None]))
+
+
+def test_a_short_past_is_refused() -> None:
+    with pytest.raises(ValueError, match="the past holds 2 steps, TSM needs 4"):
+        stepper(model("tsm"), some_past(2, steps=2))
+
+
+def test_noise_of_each_copy_is_its_own() -> None:
+    both = SeparateNoise(tuple(torch.Generator().manual_seed(seed) for seed in (4, 5)))
+    like = torch.zeros(())
+    drawn = standard_normal((6, 2), both, like)
+    for rows, seed in ((drawn[:3], 4), (drawn[3:], 5)):
+        assert torch.equal(rows, torch.randn(3, 2, generator=torch.Generator().manual_seed(seed)))
+
+
+@pytest.mark.parametrize("positions", [1, 3, 10])
+@pytest.mark.parametrize("dilations", [(1, 2, 4, 8, 4), (2, 1), (3,)])
+@pytest.mark.parametrize("direct", [0, 8])
+def test_the_last_position_alone_is_the_last_of_all(positions: int, dilations: tuple[int, ...], direct: int) -> None:
+    torch.manual_seed(0)
+    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=dilations, direct_channels=direct).double()
+    inputs, z = normal(5, positions, 3), normal(5, 4, seed=1)
+    torch.testing.assert_close(decoder.last(inputs, z), decoder(inputs, z)[:, -1])
+
+
+def test_the_first_action_of_a_decoded_segment_needs_no_other() -> None:
+    past, z = some_past(5).actions, normal(5, 3)
+    torch.testing.assert_close(prior().first(past, z), prior().decode(past, z)[:, 0])
+
+
+# Acting --------------------------------------------------------------------------------------------------------------
+
+
+@KINDS
+def test_acting_on_is_acting_anew_on_the_last_steps(kind: str) -> None:
+    actor, past, target = policy(kind, copies=2), some_past(6, 4), normal(6, 2, seed=3)
+    act, recent = actor.begin(past, target), past
+    for k in range(7):
+        x, u = recent.states[:, -1], recent.actions[:, -1]
+        anew = actor.begin(recent.last(actor.past_len), target)(x, u, None)
+        torch.testing.assert_close(act(x, u, None), anew)
+        torch.testing.assert_close(controller(actor, target)(recent), anew[:, None])
+        recent = recent.then(Segment(normal(6, 1, 4, seed=10 + k), anew[:, None].detach()))
+
+
+@KINDS
+def test_an_action_depends_on_the_target_and_on_the_states_of_its_own_episode(kind: str) -> None:
+    actor, past, target = policy(kind), some_past(3, 4), normal(3, 2, seed=3)
+    before = controller(actor, target)(past)
+    other = target.clone()
+    other[0] += 1
+    moved = Segment(past.states.clone(), past.actions)
+    moved.states[1] += 1
+    assert (controller(actor, other)(past) != before).any(-1).flatten().tolist() == [True, False, False]
+    assert (controller(actor, target)(moved) != before).any(-1).flatten().tolist() == [False, True, False]
+
+
+@KINDS
+def test_actions_stay_within_their_bounds(kind: str) -> None:
+    actor = policy(kind)
+    with torch.no_grad():
+        for p in actor.parameters():
+            p *= 100
+    start, target = 10 * normal(20, 4), 10 * normal(20, 2, seed=1)
+    seen = imagine(actor, Sled(), start, target, horizon=10, noise=3.0, generator=torch.Generator().manual_seed(0))
+    assert seen.actions.abs().max() <= 1
+    assert seen.actions.abs().max() > 0.9
+
+
+@KINDS
+def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
+    class World:
+        """The simulator, as a model without gradients."""
+
+        segment_len = past_len = 1
+
+        def __init__(self, env: Any) -> None:
+            self.env = env.unwrapped
+
+        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+            return torch.from_numpy(self.env.rollout(actions.detach().numpy())).float()
+
+    actor, target = policy(kind, 6, angles=(0, 1), target_std=0.1, copies=2).float(), 0.1 * normal(4, 2).float()
+    env = gymnasium.make_vec("tsm/Reacher-v0", num_envs=4)
+    seen = collect(env, controller(actor, target), horizon=5, seed=0)
+    start, _ = env.reset(seed=0)
+    dreamt = imagine(actor, World(env), torch.from_numpy(start).float(), target, horizon=5)  # type: ignore[arg-type]
+    torch.testing.assert_close(dreamt.actions, torch.from_numpy(seen.actions), rtol=1e-4, atol=1e-4)
+    env.close()
+
+
+# Learning ------------------------------------------------------------------------------------------------------------
+
+
+@KINDS
+def test_a_policy_learned_through_the_true_model_arrives(kind: str) -> None:
+    def distance(learner: Any) -> dict[str, Tensor]:
+        end = imagine(learner, Sled(), start, target, horizon=10).states[:, -1]
+        return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
+
+    actor, (start, target) = policy(kind), around()(50, torch.Generator().manual_seed(9))
+    curve = learn(actor, Sled(0.01), horizon=10, episodes=20, iterations=90, record_every=45, measure=distance)
+    (before,), _, (after,) = curve.measured["distance"]
+    assert after < 0.2 * before
+    assert curve.iteration == [0, 45, 90]
+    assert curve.predicted[2][0] > curve.predicted[1][0] > curve.predicted[0][0]
+
+
+@pytest.mark.parametrize("name", ["tsm", "lstm", "ensemble"])
+@KINDS
+def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, name: str) -> None:
+    actor, world = policy(kind, DX, copies=2), model(name)
+    start, target = 0.1 * normal(4, DX), normal(4, 2, seed=1)
+
+    def value() -> Tensor:
+        seen = imagine(actor, world, start, target, horizon=9, generator=torch.Generator().manual_seed(5))
+        return discounted(arrive(target)(*seen), 0.9).sum()
+
+    trained = [p for p in actor.parameters() if p.requires_grad]
+    gradient = torch.autograd.grad(value(), trained)
+    direction = [normal(*p.shape, seed=i) for i, p in enumerate(trained)]
+    slope = sum((g * d).sum() for g, d in zip(gradient, direction, strict=True))
+    ends, size = [], 1e-6
+    with torch.no_grad():
+        for sign in (1, -1):
+            for p, d in zip(trained, direction, strict=True):
+                p += sign * size * d
+            ends.append(value())
+            for p, d in zip(trained, direction, strict=True):
+                p -= sign * size * d
+    torch.testing.assert_close(slope, (ends[0] - ends[1]) / (2 * size), rtol=1e-5, atol=1e-8)
+    assert abs(slope) > 1e-4
+
+
+@pytest.mark.parametrize("name", ["tsm", "ensemble"])
+@KINDS
+def test_copies_learn_as_they_would_alone(kind: str, name: str) -> None:
+    world, settings = model(name), dict(iterations=3, record_every=3, clip=0.5, seed=7)
+
+    def starts(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        return torch.zeros(n, DX, dtype=torch.float64), torch.rand(n, 2, generator=generator, dtype=torch.float64)
+
+    def learned(copies: int, seed: int) -> tuple[Any, LearningCurve]:
+        actor = policy(kind, DX, copies=copies, seed=seed)
+        curve = improve(actor, world, arrive, starts, horizon=5, episodes=4, **{**settings, "seed": 7 + seed})
+        return actor, curve
+
+    together, curve = learned(3, 0)
+    for m in range(3):
+        alone, own = learned(1, m)
+        for (name, p), q in zip(together.named_parameters(), alone.parameters(), strict=True):
+            torch.testing.assert_close(
+                p[m : m + 1] if p.requires_grad else p, q, msg=lambda text, name=name: name + text
+            )
+        torch.testing.assert_close(torch.tensor(curve.predicted)[:, m : m + 1], torch.tensor(own.predicted))
+    first = next(together.parameters() if kind == "onestep" else together.head.parameters())
+    assert not torch.equal(first[0], first[1])
+
+
+def test_what_is_learned_is_the_policy_alone_and_not_the_model_or_the_prior() -> None:
+    world, actor = model("tsm"), policy("segment", DX)
+    before, decoder, state = weights(world), weights(actor.prior), torch.get_rng_state()
+    untouched = weights(actor)
+    starts = episodes_from(torch.zeros(1, DX, dtype=torch.float64))
+    improve(actor, world, arrive, starts, horizon=5, episodes=2, iterations=2)
+    assert same(weights(world), before)
+    assert same(weights(actor.prior), decoder)
+    assert all(p.requires_grad and p.grad is None for p in world.parameters())
+    assert not torch.equal(weights(actor)["head.weight"], untouched["head.weight"])
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@KINDS
+def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_path: Path) -> None:
+    def stop_late(actor: Any) -> dict[str, Tensor]:
+        asked.append(weights(actor))
+        if len(asked) == 4:  # at iterations 0, 2, 4 and 6
+            raise KeyboardInterrupt
+        return {"asked": torch.tensor([float(len(asked))])}
+
+    asked: list[dict[str, Tensor]] = []
+    whole, stopped = policy(kind), policy(kind)
+    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy.safetensors")
+    curve = learn(whole, measure=lambda _: {"asked": torch.ones(1)}, iterations=8)
+    with pytest.raises(KeyboardInterrupt):
+        learn(stopped, measure=stop_late, **settings)
+    anew = policy(kind, seed=3)
+    again = learn(anew, measure=lambda _: {"asked": torch.ones(1)}, **settings)
+    assert same(weights(anew), weights(whole))
+    assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
+    assert again.predicted == curve.predicted
+    assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
+    with pytest.raises(store.StoreError, match="checkpoint of another run: horizon is 5, now 6. Delete it"):
+        learn(anew, horizon=6, **settings)
+
+
+def test_the_rate_decays_to_a_tenth_in_2200_iterations() -> None:
+    rates = [learning_rate(i) for i in (0, 99, 100, 2199, 2200, 5000)]
+    assert rates == pytest.approx([1e-3, 1e-3, 9e-4, 1e-3 * 0.9**21, 1e-4, 1e-4])
+
+
+def test_later_rewards_count_less() -> None:
+    assert discounted(torch.tensor([[1.0, 1.0, 1.0]]), 0.5).item() == 1.75
+
+
+def test_targets_fill_the_disc_evenly_and_starts_are_among_those_given() -> None:
+    given = torch.arange(12.0).reshape(3, 4)
+    start, target = episodes_from(given, radius=0.2)(4000, torch.Generator().manual_seed(0))
+    radius = target.norm(dim=1)
+    assert radius.max() <= 0.2
+    assert (radius < 0.1).float().mean() == pytest.approx(0.25, abs=0.03)
+    torch.testing.assert_close(target.mean(0), torch.zeros(2), rtol=0, atol=0.01)
+    assert torch.equal(start.unique(dim=0), given)
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+
+@KINDS
+def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
+    actor, path = policy(kind, copies=2), tmp_path / "policy.safetensors"
+    actor.features.fit(normal(5, 8, 4))
+    store.save_model(path, actor.float(), {"fingerprint": {"env": "tsm/Reacher-v0"}})
+    again = store.load_model(path, type(actor), expect={"env": "tsm/Reacher-v0"})
+    past, target = Segment(*(part.float() for part in some_past(4, 4))), torch.ones(4, 2)
+    assert torch.equal(controller(again, target)(past), controller(actor, target)(past))
+    with pytest.raises(store.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
+        store.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v0"})
+
+
+@pytest.mark.parametrize("prior", ["codes", "actions"])
+def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
+    prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    net = study.fresh(run, "tsm", study.dataset(run, "tsm/Reacher-v0", "train"))
+    codes = study.fresh(run, "prior", study.dataset(run, "tsm/Reacher-v0", "train"))
+    monkeypatch.setattr(study, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {}))
+    task = study.task("tsm/Reacher-v0", "validation").take(3)
+    actor, header = study.learn(run, task, "tsm", prior, copies=2)
+    assert header["curve"]["iteration"] == [0, 1, 2, 3, 4]
+    for metric in ("return_true", "return_predicted", "final_distance", "success"):
+        assert torch.tensor(header["curve"]["measured"][metric]).shape == (5, 2)
+    found = study.assess(actor, net, task, seed=2)
+    last = {metric: torch.tensor(values[-1]) for metric, values in header["curve"]["measured"].items()}
+    for metric, values in found.items():
+        torch.testing.assert_close(values, last[metric])
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "improve", None)
+        again, _ = study.learn(run, task, "tsm", prior, copies=2)
+        assert same(weights(again), weights(actor))
+        with pytest.raises(TypeError):
+            study.learn(run, task, "tsm", prior, copies=1)
+        with torch.no_grad():
+            next(net.parameters()).add_(1)
+        with pytest.raises(TypeError):
+            study.learn(run, task, "tsm", prior, copies=2)
+    assert [path.name for path in (run.models / "Reacher").iterdir()] == [f"policy-tsm-{prior}.safetensors"]
+
+
+@pytest.mark.parametrize("bad", [("code", 0, 1), ("codes", -1, 1), ("codes", 0, 0)])
+def test_an_unknown_way_to_learn_is_refused_before_anything_is_trained(
+    bad: tuple[str, int, int], tmp_path: Path
+) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    with pytest.raises(ValueError, match="expected codes or actions, 0"):
+        study.learn(run, study.task("tsm/Reacher-v0"), "tsm", bad[0], iterations=bad[1], copies=bad[2])
+    assert not run.dir.exists() or not any(run.models.rglob("*.safetensors"))
+
+
+# What goes wrong -----------------------------------------------------------------------------------------------------
+
+
+BAD: dict[str, tuple[Callable[[Tensor, Tensor], Any], str]] = {
+    "per episode": (lambda x, u: -x.square().sum((1, 2)), r"is \(50,\); expected one number per episode and step"),
+    "per dimension": (lambda x, u: -x.square(), r"is \(50, 5, 4\); expected one number"),
+    "a number": (lambda x, u: 1.0, "is float; expected one number"),
+    "nan": (lambda x, u: (x.sum(-1) - x.sum(-1)) / 0, "rewards are not finite, the first in episode 0, step 0: nan"),
+    "no gradient": (lambda x, u: (x[..., 0] > 0).double(), "the reward has no gradient"),
+}
+
+
+@pytest.mark.parametrize(("reward", "message"), BAD.values(), ids=BAD.keys())
+def test_a_reward_that_cannot_be_learned_from_is_refused(reward: Any, message: str) -> None:
+    actor = policy("onestep")
+    before = weights(actor)
+    with pytest.raises(ValueError, match=message):
+        learn(actor, reward=lambda target: reward, episodes=4)
+    assert same(weights(actor), before)
+
+
+@pytest.mark.parametrize("name", ["horizon", "episodes", "iterations", "record_every"])
+def test_numbers_that_are_not_positive_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} 0.*expected positive"):
+        learn(policy("onestep"), **{name: 0})
+    if name == "horizon":
+        with pytest.raises(ValueError, match="horizon is 0, expected a positive number"):
+            imagine(policy("onestep"), Sled(), torch.zeros(1, 4), torch.zeros(1, 2), horizon=0)  # type: ignore[arg-type]
+
+
+@KINDS
+def test_a_policy_of_another_environment_is_refused(kind: str) -> None:
+    with pytest.raises(ValueError, match=r"states have 6 dimensions, this \w+ was made for 4: it belongs to another"):
+        controller(policy(kind), torch.zeros(3, 2).double())(some_past(3))
+
+
+def test_pasts_and_targets_that_do_not_fit_are_refused() -> None:
+    past = some_past(4, 4)
+    for actor, target, message in (
+        (policy("onestep", copies=3), torch.zeros(4, 2), "4 episodes do not divide among 3 copies"),
+        (policy("onestep"), torch.zeros(3, 2), r"targets are \(3, 2\), expected one per episode, \(4, 2\)"),
+        (policy("segment"), torch.zeros(4, 3), r"targets are \(4, 3\), expected one per episode, \(4, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            actor.begin(past, target)
+    with pytest.raises(ValueError, match="the past holds 2 steps, SegmentPolicy needs 4; collect with past_len=4"):
+        policy("segment").begin(past.last(2), torch.zeros(4, 2))
+    with pytest.raises(ValueError, match="copies is 0"):
+        policy("onestep", copies=0)
+
+
+@pytest.mark.parametrize("fault", ["states", "gradient"])
+def test_what_is_not_finite_stops_learning_with_the_weights_of_the_last_record(fault: str) -> None:
+    class Breaking(Sled):
+        calls = 0
+
+        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+            states = super().predict_segment(past, actions, generator=generator)
+            if not torch.is_grad_enabled():
+                return states
+            self.calls += 1
+            if self.calls <= 15:  # three iterations of five steps
+                return states
+            return states * math.nan if fault == "states" else states + (states - states.detach()).abs().sqrt()
+
+    actor, kept = policy("onestep"), []
+
+    def keep(learner: Any) -> dict[str, Tensor]:
+        kept.append(weights(learner))
+        return {}
+
+    message = "the model predicts states that are not" if fault == "states" else "the gradient of the return is not"
+    with pytest.raises(TrainingStopped, match=f"{message} finite at iteration 3 of 4; the weights of iteration 2 are"):
+        learn(actor, Breaking(), measure=keep)
+    assert same(weights(actor), kept[-1])
+    assert len(kept) == 2
