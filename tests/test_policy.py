@@ -334,7 +334,7 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
 
     asked: list[dict[str, Tensor]] = []
     whole, stopped = policy(kind), policy(kind)
-    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy.safetensors")
+    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy")
     curve = learn(whole, measure=lambda _: {"asked": torch.ones(1)}, iterations=8)
     with pytest.raises(KeyboardInterrupt):
         learn(stopped, measure=stop_late, **settings)
@@ -344,7 +344,7 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
     assert again.predicted == curve.predicted
     assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
-    with pytest.raises(store.StoreError, match="checkpoint of another run: horizon is 5, now 6. Delete it"):
+    with pytest.raises(store.StoreError, match="checkpoint of another run: horizon is 5 in the file, expected 6. Delete"):
         learn(anew, horizon=6, **settings)
 
 

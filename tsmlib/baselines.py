@@ -253,7 +253,7 @@ class Ensemble(nn.Module):
                 change = mean.mean(0)
             else:
                 change = mean.flatten(0, 1).index_select(0, slot)
-                if log_variance is not None:
+                if log_variance is not None and noise is not None:
                     stated = (0.5 * log_variance.flatten(0, 1).index_select(0, slot)).exp()
                     change = change + stated * noise[:, taken]
             x, taken = x + self.features.step_std * change, taken + 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
 from typing import Any
 
@@ -129,7 +130,7 @@ class CausalDecoder(nn.Module):
             seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
             owed.insert(0, sorted(seen))
         s, held = self.inlet(inputs), list(reversed(range(n_positions)))
-        total = None
+        skips = []
         codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
         for layer, dilation, code, positions in zip(self.layers, self.dilations, codes, owed, strict=True):
             at = {p: i for i, p in enumerate(held)}
@@ -137,9 +138,9 @@ class CausalDecoder(nn.Module):
             taken = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
             earlier, now = s.index_select(1, torch.tensor(taken, device=s.device)).chunk(2, dim=1)
             s, skip = layer(earlier, now, code)
-            total = skip[:, 0] if total is None else total + skip[:, 0]
+            skips.append(skip[:, 0])
             held = positions
-        return self._out(total, inputs[:, -1])
+        return self._out(reduce(torch.add, skips), inputs[:, -1])
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -116,7 +117,7 @@ class OneStepPolicy(nn.Module):
         self.net = nn.ModuleList(Stacked(i, o, generators) for i, o in pairwise(widths))
         with torch.no_grad():
             for parameter in self.net[-1].parameters():
-                parameter *= 0.1
+                parameter.mul_(0.1)
 
     def config(self) -> dict[str, Any]:
         """The constructor's arguments, as they travel with the weights."""
@@ -206,14 +207,14 @@ class SegmentPolicy(nn.Module):
     def _read(self, x: Tensor, u: Tensor, goals: Sequence[Tensor], carried: list[deque[Tensor]]) -> Tensor:
         """One position through all layers: the sum of their skips (M, B, C). Moves ``carried`` one position on."""
         s = self.inlet(_by_copy(self, torch.cat([self.features(x), u / self.prior.std], dim=-1)))
-        total = None
+        skips = []
         for taps, out, goal, inputs in zip(self.taps, self.outs, goals, carried, strict=True):
             inputs.append(s)
             filtered, gate = (taps(torch.cat([inputs.popleft(), s], dim=-1)) + goal).chunk(2, dim=-1)
             residual, skip = out(gated(filtered, gate)).chunk(2, dim=-1)
             s = s + residual
-            total = skip if total is None else total + skip
-        return total
+            skips.append(skip)
+        return reduce(torch.add, skips)
 
 
 def controller(policy: Policy, target: Tensor, *, noise: float = 0.0, generator: Noise | None = None) -> Controller:
