@@ -344,7 +344,7 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
     assert again.predicted == curve.predicted
     assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
-    with pytest.raises(store.StoreError, match="checkpoint of another run: horizon is 5 in the file, expected 6. Delete"):
+    with pytest.raises(store.StoreError, match="another run: horizon is 5 in the file, expected 6. Delete"):
         learn(anew, horizon=6, **settings)
 
 
@@ -389,7 +389,9 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     net = study.fresh(run, "tsm", study.dataset(run, "tsm/Reacher-v0", "train"))
     codes = study.fresh(run, "prior", study.dataset(run, "tsm/Reacher-v0", "train"))
-    monkeypatch.setattr(study, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {}))
+    monkeypatch.setattr(
+        study.policies, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {})
+    )
     task = study.task("tsm/Reacher-v0", "validation").take(3)
     actor, header = study.learn(run, task, "tsm", prior, copies=2)
     assert header["curve"]["iteration"] == [0, 1, 2, 3, 4]
@@ -400,7 +402,7 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     for metric, values in found.items():
         torch.testing.assert_close(values, last[metric])
     with monkeypatch.context() as patch:
-        patch.setattr(study, "improve", None)
+        patch.setattr(study.policies, "improve", None)
         again, _ = study.learn(run, task, "tsm", prior, copies=2)
         assert same(weights(again), weights(actor))
         with pytest.raises(TypeError):

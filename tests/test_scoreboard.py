@@ -143,7 +143,7 @@ def test_scores_of_another_version_are_not_taken(run: Run, monkeypatch) -> None:
 
 
 def test_at_scale_laptop_an_environment_that_is_not_published_shows_its_own_rows(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(study, "RESULTS", tmp_path)
+    monkeypatch.setattr(study.predictions, "RESULTS", tmp_path)
     row = dict(sim="mujoco", model="tsm", metric="nrmse", condition="clean", value=1.0, n=1, seed=0, scale="paper")
     store.save_table(tmp_path / "03_predict.csv", [dict(row, env="tsm/Reacher-v0")])
     own = [dict(row, env=env, value=2.0) for env in ("tsm/Reacher-v0", "tsm/PymunkPush-v0")]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import runs, study
+from tsmlib import control, runs, study
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ParameterError, Run
 from tsmlib.store import StoreError
@@ -50,7 +50,7 @@ def no_training(*_: Any, **__: Any) -> Any:
 
 
 def test_data_are_collected_once(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "random_data", no_training)
+    monkeypatch.setattr(study.data, "random_data", no_training)
     data = study.dataset(made, REACHER, "train")
     assert (len(data), data.horizon, data.env) == (20, 100, REACHER)
 
@@ -78,7 +78,7 @@ def test_the_papers_sizes() -> None:
 
 
 def test_a_trained_model_is_found_again_with_the_same_weights(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "fit", no_training)
+    monkeypatch.setattr(study.models, "fit", no_training)
     (model, header), (again, _) = (study.load_or_train(made, REACHER, "tsm") for _ in range(2))
     assert isinstance(model, TSM)
     assert all(torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True))
@@ -112,17 +112,17 @@ def test_models_with_contacts_are_wider(env: str) -> None:
 def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     path = run.models / "Reacher" / "prior.safetensors"
     path.unlink()
-    fit = study.fit
+    fit = study.models.fit
 
     def stopped(*args: Any, **settings: Any) -> Any:
         fit(*args, **settings)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(study, "fit", stopped)
+    monkeypatch.setattr(study.models, "fit", stopped)
     with pytest.raises(KeyboardInterrupt):
         study.load_or_train(run, REACHER, "prior")
     assert [p.name for p in path.parent.glob("prior*")] == ["prior-loss.checkpoint"]
-    monkeypatch.setattr(study, "fit", fit)
+    monkeypatch.setattr(study.models, "fit", fit)
     again, _ = study.load_or_train(run, REACHER, "prior")
     whole, _ = study.load_or_train(made, REACHER, "prior")
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), whole.parameters(), strict=True))
@@ -132,7 +132,7 @@ def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pyt
 # Plans ---------------------------------------------------------------------------------------------------------------
 
 
-def some_task(n: int = 2) -> study.Task:
+def some_task(n: int = 2) -> control.Task:
     return study.task(REACHER, "validation").take(n)
 
 
@@ -154,7 +154,7 @@ def test_the_oracle_earns_what_it_promises(run: Run) -> None:
 def test_a_plan_is_kept_for_its_task_and_models_alone(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     first = study.plan(made, some_task(), "tsm", "cem", "codes")
     with monkeypatch.context() as patch:
-        patch.setattr(study, "_search", no_training)
+        patch.setattr(study.plans, "_search", no_training)
         assert torch.equal(study.plan(made, some_task(), "tsm", "cem", "codes").actions, first.actions)
         with pytest.raises(AssertionError):
             study.plan(made, some_task(3), "tsm", "cem", "codes")  # other targets
@@ -232,8 +232,8 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(
     run = new_run(tmp_path)
     (run.folder() / "data").write_text("in the way")
     (run.folder() / "models").write_text("in the way")
-    monkeypatch.setattr(study, "random_data", no_training)
-    monkeypatch.setattr(study, "fit", no_training)
+    monkeypatch.setattr(study.data, "random_data", no_training)
+    monkeypatch.setattr(study.models, "fit", no_training)
     with pytest.raises(ParameterError, match=r"cannot make the folder .*data/Reacher.*TSM_RUN_DIR"):
         study.dataset(run, REACHER, "train")
     with pytest.raises(ParameterError, match=r"cannot make the folder .*models/Reacher.*TSM_RUN_DIR"):

@@ -1,0 +1,68 @@
+"""Data sets at a run's scale, collected where they are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import torch
+
+import tsmlib.envs
+from tsmlib import store
+from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.envs import has_block
+from tsmlib.runs import ParameterError, Run
+from tsmlib.trajectory import Trajectories
+
+SPLITS = ("train", "validation", "test")
+HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
+
+
+def short(env: str) -> str:
+    """Folder name of an environment: ReacherPush for tsm/ReacherPush-v0."""
+    return env.partition("/")[2].partition("-")[0]
+
+
+def chosen(parameter: str, text: str, known: Sequence[str]) -> list[str]:
+    """The value of a notebook parameter that names one of ``known``, several with commas between, or all."""
+    names = list(known) if text == "all" else [word.strip() for word in text.split(",")]
+    if unknown := [word for word in names if word not in known]:
+        raise ParameterError(f"{parameter} names {unknown[0]!r:.80}, expected some of {', '.join(known)}; or all.")
+    return list(dict.fromkeys(names))
+
+
+def sizes(run: Run, env: str) -> dict[str, int]:
+    """Episodes per split: the paper's 500 on the basic arm and 5,000 elsewhere, 200 for validation, 1,000 for test."""
+    full = {"train": 5000 if has_block(env) else 500, "validation": 200, "test": 1000}
+    return run.pick(smoke={"train": 20, "validation": 8, "test": 8}, laptop=full, paper=full)
+
+
+def dataset(run: Run, env: str, split: str) -> Trajectories:
+    """One split of an environment's data, collected at the first call. Training data depend on the run's seed."""
+    n = sizes(run, env)[split]
+    path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
+    if path.exists():
+        return store.load_trajectories(path, env=env, expect=fingerprint(env))
+    if run.seed in HELD_OUT_SEED.values():
+        raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
+    seed = HELD_OUT_SEED.get(split, run.seed)
+    data = random_data(env, n, seed=seed)
+    store.save_trajectories(
+        path, data, {"split": split, "seed": seed, "scale": run.scale, "fingerprint": fingerprint(env)}
+    )
+    return data
+
+
+def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajectories:
+    """``n`` episodes of smooth random torques, a function of (env, n, seed) alone."""
+    copies = gymnasium.make_vec(env, num_envs=n)
+    torques = smooth_torques(n, horizon, generator=torch.Generator().manual_seed(seed))
+    data = collect(copies, once(torques), horizon=horizon, seed=seed)
+    copies.close()
+    return data
+
+
+def fingerprint(env: str) -> dict[str, Any]:
+    """What a model of this environment was made for; a file that says otherwise is refused."""
+    return tsmlib.envs.fingerprint(env)

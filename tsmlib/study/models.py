@@ -1,0 +1,155 @@
+"""Trained models at a run's scale: their words, training schedules and files; trained where they are missing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tsmlib import store
+from tsmlib.baselines import LSTM, Ensemble, OneStep
+from tsmlib.envs import has_block
+from tsmlib.prior import ActionPrior
+from tsmlib.runs import Run
+from tsmlib.study.data import dataset, fingerprint, short
+from tsmlib.train import fit
+from tsmlib.trajectory import Trajectories
+from tsmlib.tsm import TSM
+
+CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows a + is an option of the class
+    "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
+}  # fmt: skip
+DYNAMICS = ("tsm", "tsm+energy", "tsm+energy+direct", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
+MODELS = (*DYNAMICS, "tsm+teacher", "prior")
+OURS = tuple(word for word in MODELS if word.startswith(("tsm", "prior")))  # what 02 trains and looks at
+BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
+    "Reacher": 80, "ReacherObstacle": 120, "ReacherPush": 290,
+    "PymunkReacher": 40, "PymunkObstacle": 40, "PymunkPush": 60,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of a training schedule: which loss of the model, for how many updates, over how long a future."""
+
+    loss: str
+    steps: int
+    future_len: int = 20  # 2 H
+    lr: float = 4e-3  # the best of 1e-3, 2e-3 and 4e-3 for every baseline, on validation
+    batch: int = 256
+
+
+def schedule(run: Run, env: str, model: str) -> list[Stage]:
+    """How a model is trained: every dynamics model of an environment for about the same time on one core.
+
+    tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
+    error and KL, or by the energy score. tsm+energy+direct: more teacher forcing, and a head that sees the state itself
+    over a narrower stack. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step ahead.
+    multistep, lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
+    """
+    if model == "prior":
+        return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
+    seconds = BUDGET[short(env)] * run.pick(smoke=0.0, laptop=0.5, paper=1.0)
+    wide = has_block(env)
+
+    def stage(loss: str, rate: float, share: float = 1.0, **options: Any) -> Stage:
+        """rate: updates per second on one core of the machine that the published models were trained on."""
+        return Stage(loss, max(30, 10 * round(seconds * share * rate / 10)), **options)
+
+    teacher = stage("teacher_forced_loss", 20 if wide else 30, 0.25, future_len=10)
+    free: dict[str, Any] = dict(share=0.75, lr=2e-3, batch=128)
+    return {
+        "tsm": [teacher, stage("loss", 10.5 if wide else 16, **free)],
+        "tsm+energy": [teacher, stage("energy_loss", 6.9 if wide else 11, **free)],
+        "tsm+energy+direct": [
+            stage("teacher_forced_loss", 26, 0.4, future_len=10),
+            stage("energy_loss", 8, 0.6, lr=2e-3, batch=128),
+        ],
+        "tsm+teacher": [stage("teacher_forced_loss", 20 if wide else 30, future_len=10)],
+        "onestep": [stage("loss", 36)],
+        "multistep": [stage("multi_step_loss", 21)],
+        "lstm": [stage("loss", 14.5)],
+        "ensemble": [stage("loss", 33.3)],
+        "ensemble+mse": [stage("loss", 33.3)],
+    }[model]
+
+
+def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
+    """A trained model, any of MODELS, and the header of its file (curves, seconds, seed, scale).
+
+    From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now.
+    """
+    if model == "prior":  # equally many episodes hold the same torques, whatever the environment
+        env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
+    own = run.folder(f"models/{short(env)}") / f"{model}.safetensors"
+    shipped = run.shipped / short(env) / f"{model}.safetensors"
+    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
+        if path.exists():
+            header = store.read_header(path)
+            if header.get("model") != model:
+                raise store.StoreError(
+                    f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it"
+                )
+            return store.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
+    return train(run, env, model, own)
+
+
+def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, Any]]:
+    """Train ``model`` by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
+    print(f"{env}: no trained {model} at scale {run.scale}; training it now")
+    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
+    net = fresh(run, model, data)
+    curves = {}
+    for stage in schedule(run, env, model):
+        checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint")
+        curve = fit(
+            net, getattr(net, stage.loss), data, held_out,
+            past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr,
+            batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
+            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=True,
+            checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
+        )  # fmt: skip
+        curves[stage.loss] = asdict(curve)
+    header = {
+        "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
+        "seconds": sum(c["seconds"][-1] for c in curves.values()), "torch": torch.__version__,
+        "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+        "inputs": _inputs(run, env, path),
+    }  # fmt: skip
+    store.save_model(path, net, header)
+    for stage in schedule(run, env, model):
+        shutil.rmtree(path.with_name(f"{model}-{stage.loss}.checkpoint"))
+    return net, store.read_header(path)
+
+
+def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
+    """The data that a model in ``path`` was trained on: file, relative to the model, and SHA-256."""
+    files = [run.data / short(env) / f"{split}.safetensors" for split in ("train", "validation")]
+    return {Path(os.path.relpath(file, path.parent)).as_posix(): store.sha256(file) for file in files}
+
+
+def fresh(run: Run, model: str, data: Trajectories) -> Any:
+    """The model as training starts: new weights, and the statistics of the training data."""
+    with torch.random.fork_rng(devices=[]):  # torch layers draw their weights from the global generator
+        torch.manual_seed(run.seed)
+        return _new(model, data)
+
+
+def _new(model: str, data: Trajectories) -> Any:
+    states, actions = data.states, data.actions
+    if model == "prior":
+        return ActionPrior(actions.shape[2]).fit_scale(torch.from_numpy(actions))
+    kind, _, option = model.partition("+")
+    options: dict[str, Any] = {"gaussian": option != "mse"} if kind == "ensemble" else {}
+    if kind == "tsm" and option.endswith("direct"):
+        options = dict(channels=32, direct_channels=200)
+    elif kind == "tsm" and has_block(data.env):
+        options = dict(channels=64, head_channels=128)  # appendix A.1
+    net = CLASSES[kind](states.shape[2], actions.shape[2], angles=data.angles, **options)
+    net.features.fit(torch.from_numpy(states))
+    return net

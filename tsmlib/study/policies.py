@@ -1,0 +1,87 @@
+"""Policies learned inside trained models."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from tsmlib import rewards, store
+from tsmlib.control import TOLERANCE, Task, execute
+from tsmlib.policy import OneStepPolicy, SegmentPolicy, controller, episodes_from, imagine, improve
+from tsmlib.runs import Run
+from tsmlib.study.data import dataset, fingerprint, short
+from tsmlib.study.models import load_or_train
+
+
+def learn(
+    run: Run, task: Task, model: str, prior: str, *, copies: int = 1, iterations: int = 0
+) -> tuple[Any, dict[str, Any]]:
+    """A policy learned inside a trained model, and the header of its file (learning curve, seconds, seed, scale).
+
+    prior: codes (a SegmentPolicy, acting through the action prior) or actions (a OneStepPolicy). copies: learned side
+    by side from different seeds. iterations: 0 means smoke 4, laptop 300, paper 2,200. Episodes start as those of the
+    training data, so the environment is not asked. What the policy truly earns on ``task`` is measured at ten points
+    along the way, beside what the model promises there (``assess``); neither has a part in learning.
+
+    From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its copies and iterations; else
+    learned now, going on from its checkpoint if it was stopped.
+    """
+    if prior not in ("codes", "actions") or iterations < 0 or copies < 1:
+        raise ValueError(
+            f"prior is {prior!r}, iterations {iterations}, copies {copies}; expected codes or actions, 0 (the scale's "
+            "default) or more iterations, and at least one copy"
+        )
+    net, _ = load_or_train(run, task.env, model)
+    nets = {"model": net} | ({"prior": load_or_train(run, task.env, "prior")[0]} if prior == "codes" else {})
+    name, cls = f"policy-{model}-{prior}.safetensors", SegmentPolicy if prior == "codes" else OneStepPolicy
+    own, shipped = run.folder(f"models/{short(task.env)}") / name, run.shipped / short(task.env) / name
+    weights = {word: store.digest(net.state_dict()) for word, net in nets.items()}
+    made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
+    budget = {"copies": copies, "iterations": iterations or run.pick(smoke=4, laptop=300, paper=2200)}
+    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
+        if path.exists():
+            header = store.read_header(path)
+            if header.get("made_from") == made_from and (path == shipped or header.get("budget") == budget):
+                return store.load_model(path, cls, expect=fingerprint(task.env)), header
+    print(f"{task.env}: no policy learned in {model} through {prior} at scale {run.scale}; learning it now")
+    data = dataset(run, task.env, "train")
+    options: dict[str, Any] = dict(angles=data.angles, copies=copies, seed=1000 * run.seed)
+    if prior == "codes":
+        policy: Any = SegmentPolicy(data.states.shape[2], nets["prior"], **options)
+    else:
+        policy = OneStepPolicy(data.states.shape[2], data.actions.shape[2], **options)
+    policy.features.fit(torch.from_numpy(data.states))
+    checkpoint = own.with_name(f"policy-{model}-{prior}.checkpoint")
+    curve = improve(
+        policy, net, rewards.reach if task.name == "reach" else rewards.push,
+        episodes_from(torch.from_numpy(data.states[:, 0])), horizon=task.horizon, iterations=budget["iterations"],
+        episodes=run.pick(smoke=4, laptop=20, paper=20), seed=1000 * run.seed,
+        record_every=max(1, budget["iterations"] // 10), measure=lambda p: assess(p, net, task, seed=run.seed + 1),
+        checkpoint=checkpoint, progress=f"{short(task.env)} policy in {model} through {prior}",
+    )  # fmt: skip
+    header = {
+        "fingerprint": fingerprint(task.env), "made_from": made_from, "budget": budget, "model": model, "prior": prior,
+        "seed": run.seed, "scale": run.scale, "curve": asdict(curve), "seconds": curve.seconds[-1],
+        "torch": torch.__version__, "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+    }  # fmt: skip
+    store.save_model(own, policy, header)
+    shutil.rmtree(checkpoint)
+    return policy, store.read_header(own)
+
+
+@torch.no_grad()
+def assess(policy: Any, model: Any, task: Task, *, seed: int) -> dict[str, torch.Tensor]:
+    """What a policy earns on a task and what the model promises there, without action noise: means, one per copy."""
+    many = task.times(policy.copies)
+    done = execute(many, controller(policy, many.target))
+    start, draw = torch.from_numpy(many.start).float(), torch.Generator().manual_seed(seed)
+    promised = many.reward(*imagine(policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw))
+    found = {
+        "return_true": done.true, "return_predicted": promised.sum(-1), "final_distance": done.final_distance,
+        "success": (done.final_distance < TOLERANCE).float(),
+    }  # fmt: skip
+    return {name: values.unflatten(0, (policy.copies, -1)).mean(1) for name, values in found.items()}

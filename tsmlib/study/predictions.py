@@ -1,0 +1,75 @@
+"""Scores of trained models on test episodes, kept in the run's folder."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from tsmlib import evaluate, scoreboard, store
+from tsmlib.runs import ROOT, Run
+from tsmlib.study.data import dataset, short
+from tsmlib.study.models import load_or_train
+
+RESULTS = ROOT / "data" / "results"
+
+
+def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluate.Scores:
+    """``evaluate.score`` of a trained model on test episodes: open loop, or ``segments`` from the true past.
+
+    Smoke 8 episodes and samples, laptop 200 episodes and 16 samples, paper 1,000 and 32. Scores are kept in the run's
+    folder and found again as long as weights, data and sizes are the same.
+    """
+    net, _ = load_or_train(run, env, model)
+    test, held_out = (dataset(run, env, split) for split in ("test", "validation"))
+    test, held_out = (
+        data.take(slice(run.pick(smoke=8, laptop=200, paper=n))) for data, n in ((test, 1000), (held_out, 200))
+    )
+    samples = run.pick(smoke=8, laptop=16, paper=32)  # of a model without samples: noisy copies
+    options: dict[str, Any] = {"horizon": 90}
+    if segments:
+        options = {"horizon": 10, "starts": list(scoreboard.SEGMENTS)}
+    path = run.folder(f"scores/{short(env)}") / f"{model}{'-segments' * segments}.safetensors"
+    made_from = {
+        "version": evaluate.VERSION, "rows": evaluate.ROWS, "samples": samples, "seed": run.seed, **options,
+        "model": net.config(), "weights": store.digest(net.state_dict()),
+        **{split: store.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})
+           for split, data in (("test", test), ("validation", held_out))},
+    }  # fmt: skip
+    if path.exists() and store.read_header(path)["made_from"] == made_from:
+        tensors, _ = store.load(path, kind="scores")
+        return _unpacked(tensors)
+    found = evaluate.score(
+        net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
+        progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
+    )  # fmt: skip
+    tensors = {f"values.{metric}": value for metric, value in found.values.items()}
+    tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
+    tensors |= {"pit": found.pit, "outside": found.outside}
+    store.save(path, tensors, kind="scores", header={"made_from": made_from})
+    return found
+
+
+def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
+
+    Scale paper: the given rows and those of the other seeds beside this run. Laptop: the published ones, and the given
+    rows of environments that are not among them. Smoke: the given rows.
+    """
+    name = f"{run.notebook}.csv"
+    if run.scale == "laptop" and (RESULTS / name).exists():
+        published = store.load_table(RESULTS / name)
+        known = {row["env"] for row in published}
+        return [*published, *(row for row in rows if row["env"] not in known)]
+    if run.scale != "paper":
+        return rows
+    others = [path for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.dir not in path.parents]
+    return [*rows, *(row for path in others for row in store.load_table(path))]
+
+
+def _unpacked(tensors: dict[str, torch.Tensor]) -> evaluate.Scores:
+    values = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("values.")}
+    fitted = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("fitted.")}
+    numbers: dict[str, Any] = {name: tensor if tensor.ndim else float(tensor) for name, tensor in fitted.items()}
+    return evaluate.Scores(values, tensors["pit"], tensors["outside"], evaluate.Fitted(**numbers))
