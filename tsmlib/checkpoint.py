@@ -30,7 +30,8 @@ class TrainingStopped(RuntimeError):
 
 @dataclass
 class Curve:
-    """What a fit recorded at each validation: optimiser step, seconds, training and validation loss.
+    """What a fit recorded at each validation: optimiser step, processor seconds, training and validation
+    loss.
 
     resumed: for each time that the fit went on elsewhere, what differed from before, so that the result may differ in
     its last bits from an uninterrupted one.

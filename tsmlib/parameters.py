@@ -20,7 +20,7 @@ SCALES = ("smoke", "laptop", "paper")
 ENVS = tuple(f"tsm/{arm}-v0" for arm in ("Reacher", "ReacherObstacle", "ReacherPush",
                                          "PymunkReacher", "PymunkObstacle", "PymunkPush"))  # fmt: skip
 MODELS = (
-    *("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "prior"),
+    *("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "tsm+direct", "prior"),
     *("onestep", "multistep", "lstm", "ensemble", "ensemble+mse"),
 )
 LONGEST = 1000  # characters

@@ -265,7 +265,7 @@ def imagine(
 
 @dataclass
 class LearningCurve:
-    """What ``improve`` recorded: updates done, seconds of learning, and one number per copy for each of the rest.
+    """What ``improve`` recorded: updates done, processor seconds, and one number per copy for each of the rest.
 
     predicted: undiscounted return that the model promises, mean over 50 episodes that are the same at every record;
     measured: whatever ``measure`` returned, such as the true return in the environment. resumed: as in a Curve.
@@ -360,7 +360,7 @@ def improve(
         if not state.step:
             record()
         for iteration in range(state.step, iterations):
-            began = time.perf_counter()
+            began = time.process_time()
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(iteration, lr, lr_decay, lr_final)
             value = discounted(earned(iteration, episodes), gamma).mean(1)  # Eq. 4, (M,)
@@ -369,7 +369,7 @@ def improve(
             if not torch.isfinite(_clip(trained, clip)).all():
                 raise _stopped(state, "the gradient of the return is", iteration, iterations)
             optimizer.step()
-            state.step, state.seconds = iteration + 1, state.seconds + time.perf_counter() - began
+            state.step, state.seconds = iteration + 1, state.seconds + time.process_time() - began
             bar.update()
             if state.step % record_every == 0 or state.step == iterations:
                 record()

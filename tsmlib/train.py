@@ -70,7 +70,7 @@ def fit(
         if checkpoint is not None:
             stack.enter_context(only_writer(checkpoint, f"training, seed {seed}"))
             state.load(checkpoint, identity)
-        began, total, counted = time.perf_counter() - state.seconds, 0.0, 0
+        began, total, counted = time.process_time() - state.seconds, 0.0, 0
         bar = stack.enter_context(
             tqdm(total=steps, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
         )
@@ -93,7 +93,7 @@ def fit(
             total, counted = total + value.item(), counted + 1
             bar.update()
             if (step + 1) % validate_every == 0 or step + 1 == steps:
-                state.step, state.seconds = step + 1, time.perf_counter() - began
+                state.step, state.seconds = step + 1, time.process_time() - began
                 held_out_loss = validate(loss, held_out, seed)
                 if not math.isfinite(held_out_loss):
                     raise state.stopped("validation loss", held_out_loss, f"{step + 1} of {steps}", lr)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows
     "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
 }  # fmt: skip
 DYNAMICS = ("tsm", "tsm+energy", "tsm+energy+direct", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
-MODELS = (*DYNAMICS, "tsm+teacher", "prior")
+MODELS = (*DYNAMICS, "tsm+teacher", "tsm+direct", "prior")  # the two in the middle are ablations
 OURS = tuple(word for word in MODELS if word.startswith(("tsm", "prior")))  # what 02 trains and looks at
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80, "ReacherObstacle": 120, "ReacherPush": 290,
@@ -49,8 +49,9 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
 
     tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
     error and KL, or by the energy score. tsm+energy+direct: more teacher forcing, and a head that sees the state itself
-    over a narrower stack. tsm+teacher: teacher forcing alone, the ablation. onestep, ensemble: one step ahead.
-    multistep, lstm: free-running over 2 H steps. prior: free-running over two segments, its own budget.
+    over a narrower stack. tsm+teacher, tsm+direct: ablations, teacher forcing alone, and that head with the paper's
+    loss. onestep, ensemble: one step ahead. multistep, lstm: free-running over 2 H steps. prior: free-running over two
+    segments, its own budget.
     """
     if model == "prior":
         return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
@@ -62,14 +63,13 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
         return Stage(loss, max(30, 10 * round(seconds * share * rate / 10)), **options)
 
     teacher = stage("teacher_forced_loss", 20 if wide else 30, 0.25, future_len=10)
+    longer = stage("teacher_forced_loss", 26, 0.4, future_len=10)
     free: dict[str, Any] = dict(share=0.75, lr=2e-3, batch=128)
     return {
         "tsm": [teacher, stage("loss", 10.5 if wide else 16, **free)],
         "tsm+energy": [teacher, stage("energy_loss", 6.9 if wide else 11, **free)],
-        "tsm+energy+direct": [
-            stage("teacher_forced_loss", 26, 0.4, future_len=10),
-            stage("energy_loss", 8, 0.6, lr=2e-3, batch=128),
-        ],
+        "tsm+direct": [longer, stage("loss", 11, **{**free, "share": 0.6})],
+        "tsm+energy+direct": [longer, stage("energy_loss", 8, **{**free, "share": 0.6})],
         "tsm+teacher": [stage("teacher_forced_loss", 20 if wide else 30, future_len=10)],
         "onestep": [stage("loss", 36)],
         "multistep": [stage("multi_step_loss", 21)],
@@ -82,7 +82,8 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
 def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     """A trained model, any of MODELS, and the header of its file (curves, seconds, seed, scale).
 
-    From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now.
+    From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now. Raises
+    store.StoreError for a file of another environment, word, class or schedule.
     """
     if model == "prior":  # equally many episodes hold the same torques, whatever the environment
         env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
@@ -94,6 +95,11 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
             if header.get("model") != model:
                 raise store.StoreError(
                     f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it"
+                )
+            planned = _plain(schedule(replace(run, scale=header.get("scale", run.scale)), env, model))
+            if (found := header.get("schedule", planned)) != planned:
+                raise store.StoreError(
+                    f"{path} was trained by another schedule: {found}, expected {planned}. Restore or delete it"
                 )
             return store.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
     return train(run, env, model, own)
@@ -117,14 +123,20 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
         curves[stage.loss] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "seconds": sum(c["seconds"][-1] for c in curves.values()), "torch": torch.__version__,
+        "schedule": _plain(schedule(run, env, model)), "torch": torch.__version__,
         "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+        "seconds": sum(c["seconds"][-1] for c in curves.values()),  # of processor time
         "inputs": _inputs(run, env, path),
     }  # fmt: skip
     store.save_model(path, net, header)
     for stage in schedule(run, env, model):
         shutil.rmtree(path.with_name(f"{model}-{stage.loss}.checkpoint"))
     return net, store.read_header(path)
+
+
+def _plain(stages: list[Stage]) -> list[dict[str, Any]]:
+    """A schedule as it stands in a model's header."""
+    return [asdict(stage) for stage in stages]
 
 
 def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
