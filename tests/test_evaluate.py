@@ -167,6 +167,25 @@ def test_a_horizon_that_does_not_fit_is_refused(options: dict[str, Any]) -> None
         evaluate.predict(Linear(), FEATURES, episodes(3), samples=1, **options)
 
 
+@pytest.mark.parametrize(
+    ("features", "validation", "samples", "message"),
+    [
+        (FEATURES, {}, 0, "samples is 0, expected at least 1"),
+        (FEATURES, dict(env="tsm/Other-v0"), 2, "test data have env 'tsm/Linear-v0', validation data 'tsm/Other-v0'"),
+        (FEATURES, dict(dt=0.01), 2, "test data have dt 0.02, validation data 0.01"),
+        (Features(3, ()), {}, 2, "the model's states have 3 dimensions with angles \\[\\], those of tsm/Linear-v0 2"),
+        (Features(2, (0,)), {}, 2, "with angles \\[0\\], those of tsm/Linear-v0 2 with angles \\[\\]"),
+    ],
+)
+def test_what_does_not_belong_together_is_not_scored(
+    features: Features, validation: dict[str, Any], samples: int, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate.score(
+            Linear(), features, episodes(3), replace(episodes(3, seed=1), **validation), samples=samples, **OPEN
+        )
+
+
 def test_scores_are_in_units_of_the_training_data_without_what_never_moves() -> None:
     data = episodes(50)
     still = np.full_like(data.states[..., :1], 3.0)

@@ -103,7 +103,9 @@ def score(
     H steps from the true past, and N counts segments, those of one trajectory after each other.
 
     Memory: the validation samples (S, N, T, D), 0.4 GiB at the paper's sizes; test samples are never held together.
+    Raises ValueError where model, test and validation data are not of one kind, naming both sides.
     """
+    _require_fit(features, test, validation, samples)
     rollouts = partial(_rollouts, model, samples=samples, horizon=horizon, starts=starts, progress=progress)
     low, high = physical_range(test, validation)
     held = list(rollouts(validation, key=(1, seed)))
@@ -118,6 +120,24 @@ def score(
         parts.append((values, pit, outside))
     values = {metric: torch.cat([part[0][metric] for part in parts]) for metric in parts[0][0]}
     return Scores(values, torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts]), fitted)
+
+
+def _require_fit(features: Features, test: Trajectories, validation: Trajectories, samples: int) -> None:
+    """ValueError unless all of it belongs together."""
+    if samples < 1:
+        raise ValueError(f"samples is {samples}, expected at least 1")
+    for field in ("env", "dt", "names", "angles"):
+        ours, theirs = getattr(test, field), getattr(validation, field)
+        if ours != theirs:
+            raise ValueError(
+                f"test data have {field} {ours!r}, validation data {theirs!r}; score with two splits of one data set"
+            )
+    expected, found = len(features.step_std), test.states.shape[-1]
+    if expected != found or features.angles != list(test.angles):
+        raise ValueError(
+            f"the model's states have {expected} dimensions with angles {features.angles}, those of {test.env} {found} "
+            f"with angles {list(test.angles)}; score a model that was trained on {test.env}"
+        )
 
 
 # Samples -------------------------------------------------------------------------------------------------------------

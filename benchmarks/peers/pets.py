@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
-from tsmlib import evaluate, runs, scoreboard, store, study
+from tsmlib import evaluate, parameters, runs, scoreboard, store, study
 from tsmlib.envs import ENV_IDS
 from tsmlib.nets import Features, Noise, standard_normal
 from tsmlib.trajectory import Segment, Trajectories
@@ -228,7 +228,7 @@ def table(path: Path, rows: list[dict[str, Any]]) -> None:
 def run_of(folder: Path) -> runs.Run:
     """The run whose folder this is, ``.../<scale>/seed<k>``."""
     scale, seed = folder.parent.name, folder.name.removeprefix("seed")
-    if scale not in runs.SCALES or not seed.isdecimal():
+    if scale not in parameters.SCALES or not seed.isdecimal():
         raise SystemExit(f"--run-dir is {folder}, expected the folder of a run, such as runs/paper/seed0")
     return runs.Run("peers_pets", scale, int(seed), folder)
 
