@@ -9,12 +9,12 @@ from tsmlib.study.data import HELD_OUT_SEED, SPLITS, chosen, dataset, fingerprin
 from tsmlib.study.models import BUDGET, CLASSES, DYNAMICS, MODELS, OURS, Stage, fresh, load_or_train, schedule, train
 from tsmlib.study.plans import plan, trial
 from tsmlib.study.policies import assess, learn
-from tsmlib.study.predictions import RESULTS, evidence, scores
+from tsmlib.study.predictions import RESULTS, evidence, scores, table
 from tsmlib.study.tasks import FROZEN, TASK_SEED, draw_task, freeze_tasks, task
 
 __all__ = [
     "BUDGET", "CLASSES", "DYNAMICS", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS", "SPLITS", "TASK_SEED",
     "Stage", "assess", "chosen", "dataset", "draw_task", "evidence", "fingerprint", "freeze_tasks", "fresh",
-    "has_block", "learn", "load_or_train", "plan", "random_data", "schedule", "scores", "short", "sizes", "task",
-    "train", "trial",
+    "has_block", "learn", "load_or_train", "plan", "random_data", "schedule", "scores", "short", "sizes", "table",
+    "task", "train", "trial",
 ]  # fmt: skip

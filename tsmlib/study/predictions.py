@@ -68,6 +68,14 @@ def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [*rows, *(row for path in others for row in store.load_table(path))]
 
 
+def table(run: Run, name: str) -> list[dict[str, Any]]:
+    """The rows of a run's table, else of the published one; none where neither is there."""
+    for path in (run.metrics / name, RESULTS / name):
+        if path.exists():
+            return store.load_table(path)
+    return []
+
+
 def _unpacked(tensors: dict[str, torch.Tensor]) -> evaluate.Scores:
     values = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("values.")}
     fitted = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("fitted.")}
