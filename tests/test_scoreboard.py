@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tsmlib import evaluate, scoreboard, store, study
-from tsmlib.runs import Run
+from tsmlib.runs import Run, RunError
 
 ENV = "tsm/ReacherPush-v0"
 N, T, D = 6, 90, 4
@@ -152,8 +152,11 @@ def test_at_scale_laptop_an_environment_that_is_not_published_shows_its_own_rows
     assert study.evidence(Run("03_predict", "smoke", 0, tmp_path / "seed0"), own) == own
 
 
-def test_at_scale_paper_the_other_seeds_are_drawn_too(tmp_path) -> None:
+def test_at_scale_paper_the_other_seeds_are_drawn_too_once_they_are_complete(tmp_path) -> None:
     row = dict(env=ENV, sim="mujoco", model="tsm", metric="nrmse", condition="clean", value=1.0, n=1, scale="paper")
     store.save_table(tmp_path / "seed1" / "metrics" / "03_predict.csv", [dict(row, seed=1)])
-    drawn = study.evidence(Run("03_predict", "paper", 0, tmp_path / "seed0"), [dict(row, seed=0)])
-    assert [r["seed"] for r in drawn] == [0, 1]
+    run, own = Run("03_predict", "paper", 0, tmp_path / "seed0"), [dict(row, seed=0)]
+    with pytest.raises(RunError, match="03_predict in .*seed1 is not run, expected complete. Run it: .* --seed 1"):
+        study.evidence(run, own)
+    store.write_json(tmp_path / "seed1" / "status.json", {"03_predict": {"state": "complete"}})
+    assert [r["seed"] for r in study.evidence(run, own)] == [0, 1]

@@ -60,6 +60,8 @@ def readme_results() -> str:
         for sim in ("mujoco", "pymunk")
     )
     predict = store.load_table(RESULTS / "03_predict.csv")
+    if (peers := RESULTS / "peers_pets.csv").exists():
+        predict += store.load_table(peers)
     envs = list(dict.fromkeys(row["env"] for row in predict))
     seeds = {env: len({row["seed"] for row in predict if row["env"] == env}) for env in envs}
     boards = "\n\n".join(
@@ -73,7 +75,8 @@ def readme_results() -> str:
 **Prediction.** {n:,} test episodes, open loop with the true torques for 90 steps after ten observed ones; means over
 steps, in standardised units, with half the 95 % t interval where there are several training seeds. Higher is better for
 the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models of an
-environment got as many updates as fit into the same time on one idle core (`study.BUDGET`).
+environment got as many updates as fit into the same time on one idle core (`study.BUDGET`). `pets` is the same kind of
+model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
 
 {boards}
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 
 from tsmlib import evaluate, scoreboard, store
-from tsmlib.runs import ROOT, Run
+from tsmlib.runs import ROOT, Run, require
 from tsmlib.study.data import dataset, short
 from tsmlib.study.models import load_or_train
 
@@ -54,8 +54,9 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
 def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
-    Scale paper: the given rows and those of the other seeds beside this run. Laptop: the published ones, and the given
-    rows of environments that are not among them. Smoke: the given rows.
+    Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come to
+    its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
+    rows.
     """
     name = f"{run.notebook}.csv"
     if run.scale == "laptop" and (RESULTS / name).exists():
@@ -64,8 +65,12 @@ def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return [*published, *(row for row in rows if row["env"] not in known)]
     if run.scale != "paper":
         return rows
-    others = [path for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.dir not in path.parents]
-    return [*rows, *(row for path in others for row in store.load_table(path))]
+    for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")):
+        if run.dir not in path.parents:
+            folder = path.parents[1]
+            require(replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder), run.notebook)
+            rows = [*rows, *store.load_table(path)]
+    return rows
 
 
 def table(run: Run, name: str) -> list[dict[str, Any]]:
