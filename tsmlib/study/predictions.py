@@ -54,8 +54,8 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
 def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
-    Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come to
-    its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
+    Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come
+    to its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
     rows.
     """
     name = f"{run.notebook}.csv"
