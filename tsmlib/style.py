@@ -40,6 +40,8 @@ COLOURS = {
     "ensemble": "#CC79A7",
     "ensemble+mse": "#6A2BD9",
     "prior": "#882255",
+    "ppo": "#999933",
+    "trpo": "#7B4B2A",
     "oracle": "#111111",
     "random": "#7A7A7A",
     "zero": "#B0B0B0",
@@ -56,6 +58,8 @@ NAMES = {
     "ensemble": "ensemble (Gaussian)",
     "ensemble+mse": "ensemble (squared error)",
     "prior": "action prior",
+    "ppo": "PPO",
+    "trpo": "TRPO",
     "random": "random torques",
     "zero": "zero torque",
 }
