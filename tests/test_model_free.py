@@ -93,11 +93,11 @@ def test_doing_nothing_earns_what_zero_torque_earns() -> None:
     assert found["final_distance"] == pytest.approx(float(trial.final_distance.mean()), abs=1e-6)
 
 
-def test_each_algorithm_tries_each_pair_of_values_once() -> None:
+def test_the_first_configurations_try_each_pair_of_values_once() -> None:
     for settings in model_free.SETTINGS.values():
-        assert len(settings) == 4
+        assert len({model_free.named(setting) for setting in settings}) == len(settings) == 6
         for pair in (list(settings[0])[:2], list(settings[0])[1:], list(settings[0])[::2]):
-            assert len({tuple(setting[name] for name in pair) for setting in settings}) == 4
+            assert len({tuple(setting[name] for name in pair) for setting in settings[:4]}) == 4
         for setting in settings:
             assert setting["episodes"] * model_free.HORIZON % model_free.MINIBATCH == 0
 
@@ -145,7 +145,7 @@ def test_numbers_that_make_no_run_are_refused(tmp_path: Path, arguments: list[st
 def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) -> None:
     setting = dict(model_free.SETTINGS[algorithm][0], episodes=5)
     task = study.task("tsm/Reacher-v0", "validation").take(5)
-    runs = [model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0) for _ in range(2)]
+    runs = [list(model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0)) for _ in range(2)]
     assert [record["steps"] for record in runs[0]] == [0, 250, 500]
     earned = [[record["return_true"] for record in found] for found in runs]
     assert earned[0] == earned[1]
@@ -179,7 +179,7 @@ def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureF
     assert first == second
     rows = store.load_table(path)
     assert {row["seed"] for row in rows if row["condition"] == "learning"} == {0, 1}
-    assert len({row["configuration"] for row in rows if row["condition"] == "search"}) == 4
+    assert len({row["configuration"] for row in rows if row["condition"] == "search"}) == 6
     assert len({row["configuration"] for row in rows if row["condition"] == "learning"}) == 1
 
 
@@ -207,7 +207,7 @@ def test_the_readme_states_what_is_run() -> None:
     assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v0']:,} pushing" in readme
     for name in ("learning_rate", "target_kl", "episodes", "std"):
         values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
-        assert ", ".join(f"{value:g}" for value in values) in readme, name
+        assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name
     assert f"minibatches of {model_free.MINIBATCH} steps" in readme
     assert f"gamma {model_free.GAMMA}" in readme
     assert f"{model_free.RECORDS} times along the way" in readme
