@@ -29,6 +29,7 @@ from torture.world import (
     folder,
     forged,
     in_child,
+    learn,
     new_model,
     reference,
     rng,
@@ -41,24 +42,24 @@ from tsmlib.trajectory import Window
 
 
 def killed_at_random_moments(trials: int) -> Outcome:
-    """R1: SIGKILL 1 to 4 times at random moments, resume, compare with a training that nobody disturbed."""
-    found, (expected, seconds) = Outcome(), reference()
-    kills = 0
+    """R1: SIGKILL 1 to 4 times at random moments of a training, of a model or a policy: the bits of one left alone."""
+    found, kills = Outcome(), 0
+    works = [(work, *reference(work)) for work in (train, learn)]
     for trial in range(trials):
-        draw = rng(1, trial)
+        draw, (work, expected, seconds) = rng(1, trial), works[trial % 4 == 3]
         with folder() as place:
             for _ in range(draw.randint(1, 4)):
-                child = Child(lambda: train(place / "run"))
+                child = Child(lambda: work(place / "run"))  # noqa: B023
                 child.kill(after=draw.uniform(0, 1.2 * seconds))
                 child.result()
                 kills += child.killed
-            first = in_child(lambda: train(place / "run"))
+            first = in_child(lambda: work(place / "run"))  # noqa: B023
             before = contents(place)
-            again = in_child(lambda: train(place / "run"))
+            again = in_child(lambda: work(place / "run"))  # noqa: B023
             found.count(first == expected, f"trial {trial}: other bits")
             found.count(again == expected and contents(place) == before, f"trial {trial}: a finished run was changed")
             found.count(not list(place.rglob(".*.tmp-*")), f"trial {trial}: half a file is left")
-    found.note = f"{trials} trainings, {kills} kills"
+    found.note = f"{trials} trainings, a quarter of them of policies, {kills} kills"
     return found
 
 
