@@ -205,6 +205,8 @@ def test_the_readme_states_what_is_run() -> None:
     assert set(re.findall(r"`?(--(?!no-deps)[a-z]+)", readme)) <= known
     steps = model_free.STEPS
     assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v0']:,} pushing" in readme
+    steps = model_free.SEARCH_STEPS
+    assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v0']:,} for" in readme
     for name in ("learning_rate", "target_kl", "episodes", "std"):
         values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
         assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name

@@ -210,7 +210,7 @@ def test_rows_survive_a_table(tmp_path: Any) -> None:
     [
         ([*rows(seed=1, records=2)], "seed 1, copy 0 was measured at 2 points up to 220, expected the 3 up to 440"),
         ([*rows()], "return_true of seed 0 stands twice at 0"),
-        ([*rows(fingerprint={"env": "tsm/PymunkReacher-v0"}, seed=1)], "give rows of one of them"),
+        ([*rows(fingerprint={"env": "tsm/PymunkReacher-v0"}, seed=1)], "give those of one of them"),
     ],
 )
 def test_rows_that_do_not_belong_together_are_refused(more: list[dict[str, Any]], message: str) -> None:
@@ -237,6 +237,11 @@ def test_references_are_the_oracles_and_zero_torque() -> None:
     from tsmlib import store
     from tsmlib.runs import ROOT
 
-    found = policy_report.references(store.load_table(ROOT / "data" / "results" / "05_control.csv"))
+    rows = store.load_table(ROOT / "data" / "results" / "05_control.csv")
+    found = policy_report.references(row for row in rows if row["sim"] == "mujoco")
     assert {"reach", "push"} <= set(found)
-    assert all("zero" in levels and len(levels) >= 2 for levels in (found["reach"], found["push"]))
+    for levels in (found["reach"], found["push"]):
+        assert max(levels.values()) > levels["zero"]
+        assert {label.split()[0] for label in levels} == {"oracle", "zero"}
+    with pytest.raises(ValueError, match="of one of them"):
+        policy_report.references(rows)

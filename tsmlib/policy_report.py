@@ -57,14 +57,7 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     one task was learned in two environments.
     """
     methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    envs: dict[str, str] = {}
-    for row in rows:
-        if row["condition"] != "learning":
-            continue
-        if envs.setdefault(row["task"], row["env"]) != row["env"]:
-            raise ValueError(
-                f"task {row['task']} was learned in {envs[row['task']]} and in {row['env']}; give rows of one of them"
-            )
+    for row in _one_env([row for row in rows if row["condition"] == "learning"]):
         methods.setdefault((row["task"], f"{row['model']} {row['prior']}".strip()), []).append(row)
     found: dict[str, dict[str, Curves]] = {}
     for (task, label), own in methods.items():
@@ -112,13 +105,26 @@ def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def references(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Task -> label -> mean true return of the oracle and of no torque, from rows of 05_control.csv (metric means)."""
+    """Task -> label -> mean true return of the oracle's plans and of no torque, from rows of 05_control.csv.
+
+    ValueError where one task was done in two environments.
+    """
     found: dict[str, dict[str, float]] = {}
-    for row in rows:
-        if row["metric"] == "return_true" and (row["model"] == "oracle" or row["planner"] == "zero"):
+    for row in _one_env([row for row in rows if row["metric"] == "return_true"]):
+        if row["model"] == "oracle" or row["planner"] == "zero":
             label = "zero" if row["planner"] == "zero" else f"oracle {row['prior']} {row['planner']}"
             found.setdefault(row["task"], {})[label] = row["value"]
     return found
+
+
+def _one_env(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    envs: dict[str, str] = {}
+    for row in rows:
+        if envs.setdefault(row["task"], row["env"]) != row["env"]:
+            raise ValueError(
+                f"rows of task {row['task']} are of {envs[row['task']]} and of {row['env']}; give those of one of them"
+            )
+    return rows
 
 
 def samples_to_reach(curves: Curves, level: float) -> float | None:
