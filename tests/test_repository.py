@@ -97,7 +97,7 @@ def uses() -> dict[str, set[str]]:
 
 
 PICTURES = {"style", "axes", "diagrams", "film", "plan_figures", "predict_figures", "gallery", "figures"}
-ALONE = {"envs", "rewards", "nets", "trajectory", "style"}
+ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
 
 
 def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
@@ -106,7 +106,8 @@ def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
 
 def test_figures_know_nothing_but_figures() -> None:
     needs = uses()
-    for name in ("diagrams", "film", "plan_figures", "axes"):
+    assert needs["style"] == needs["film"] == {"disk"}
+    for name in ("diagrams", "plan_figures", "axes"):
         assert needs[name] == {"style"}, name
     for name in ("predict_figures", "gallery"):
         assert needs[name] == {"axes", "style"}, name

@@ -374,7 +374,11 @@ def two_writers(trials: int) -> Outcome:
 
 
 def full_disk(trials: int = 0) -> Outcome:
-    """R10: nothing more fits while a data set, table or checkpoint is written: the old one stays, and it is said."""
+    """R10: nothing more fits while data, a table, picture, film or checkpoint is written: the old stays, it is said."""
+    from matplotlib.figure import Figure
+
+    from tsmlib import figures
+
     found, (expected, _) = Outcome(), reference()
 
     def cramped(work: Callable[[], Any], size: int) -> tuple[bool, Any]:
@@ -389,8 +393,13 @@ def full_disk(trials: int = 0) -> Outcome:
 
     with folder() as place:
         data, table = place / "data.safetensors", place / "table.csv"
+        picture, film = place / "picture.pdf", place / "film.mp4"
         rows = [{"metric": "success", "value": 0.5, "n": i} for i in range(200)]
-        writers = {data: lambda: store.save_trajectories(data, TRAIN), table: lambda: store.save_table(table, rows)}
+        writers: dict[Path, Callable[[], Any]] = {
+            data: lambda: store.save_trajectories(data, TRAIN),
+            table: lambda: store.save_table(table, rows),
+            picture: lambda: figures.save(Figure(), place / "picture"),
+        }
         for path, write in writers.items():
             write()
             before = path.read_bytes()
@@ -398,6 +407,11 @@ def full_disk(trials: int = 0) -> Outcome:
                 good, said = cramped(write, size)
                 clear = not good and str(path) in said and f"{len(before)} bytes" in said and "too large" in said
                 found.count(clear and path.read_bytes() == before, f"{path.name}, {size} bytes: {said}")
+        frames = np.zeros((3, 64, 64, 3), np.uint8)
+        figures.video(frames, film)
+        before = film.read_bytes()
+        good, said = cramped(lambda: figures.video(frames, film), 1000)
+        found.count(not good and str(film) in said and film.read_bytes() == before, said)
         stopped_at(place / "run", 9)
         good, said = cramped(lambda: train(place / "run"), 1000)
         found.count(not good and "StoreError: cannot write" in said, said)
