@@ -125,11 +125,12 @@ def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
     table, task = model_free.Table(tmp_path / "model_free.csv"), study.task("tsm/Reacher-v0")
     for seed in range(3):
         key = dict(env=task.env, model="trpo", condition="learning", configuration="std=0.14", seed=seed)
-        table.put(key, task, records(0, 500, 1000))
+        table.put(key, task, [record | {"seconds": 99.0} for record in records(0, 500, 1000)])
     table.put(key | {"condition": "search"}, task, records(200))
     curves = learning_curves(store.load_table(table.path))["reach"]["trpo"]
     assert curves["return_true"].tolist() == [[-1.0, -2.0, -3.0]] * 3
     assert curves["samples"].tolist() == [0, 500, 1000]
+    assert curves["seconds"].tolist() == [-1.0, -2.0, -3.0]  # the processor's
     assert "iterations" not in curves
 
 

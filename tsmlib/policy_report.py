@@ -53,8 +53,9 @@ def learning_rows(
 def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     """The input of ``figures.figure7``: task -> label -> curves, from rows of learning; others are passed over.
 
-    Copies and seeds of a label are its k lines. ValueError where they were not measured at the same points, or where
-    one task was learned in two environments.
+    Copies and seeds of a label are its k lines. Seconds are the processor's where a table has them, else the clock's,
+    which are more on a busy machine; training of the model is counted. ValueError where lines were not measured at the
+    same points, or where one task was learned in two environments.
     """
     methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in _one_env([row for row in rows if row["condition"] == "learning"]):
@@ -92,7 +93,7 @@ def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
         return np.array([[line[x] for x in at.tolist()] for line in by_metric[metric].values()])
 
     curves = {metric: stacked(metric) for metric in by_metric if metric in UNITS}
-    curves["seconds"] = stacked("seconds").mean(0)
+    curves["seconds"] = stacked("cpu_seconds" if "cpu_seconds" in by_metric else "seconds").mean(0)
     if model_free:
         return curves | {"samples": at}
     samples, before = (
