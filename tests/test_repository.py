@@ -96,7 +96,8 @@ def uses() -> dict[str, set[str]]:
     return {name: needs - {name} for name, needs in found.items()}
 
 
-PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery", "plan_figures", "predict_figures", "policy_figures"}
+PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery"}
+PICTURES |= {"plan_figures", "predict_figures", "policy_figures"}
 ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
 
 

@@ -56,7 +56,7 @@ CHECKS: dict[str, list[tuple[str, Callable[[int], Outcome], int, int]]] = {  # R
     "pipelines": [
         ("R12", pipelines.notebooks_in_any_order, LONG_ONLY, 2),
         ("R12", pipelines.cells_out_of_order, LONG_ONLY, 20),
-        ("R14", pipelines.killed_runs, LONG_ONLY, 120),  # tests/test_runner.py has each once
+        ("R14", pipelines.killed_runs, LONG_ONLY, 24),  # tests/test_runner.py has each once
         ("R20", pipelines.elsewhere, 2, 3),
         ("R21", pipelines.threads, LONG_ONLY, 20),
         ("R21", pipelines.another_thread_count, 0, 0),

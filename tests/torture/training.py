@@ -33,6 +33,7 @@ from torture.world import (
     new_model,
     reference,
     rng,
+    tiny,
     train,
 )
 from tsmlib import disk, store
@@ -490,7 +491,7 @@ def run(client: Any, cell: str) -> str:
 
 def memory(trials: int) -> Outcome:
     """R16: resident memory over ``trials`` training steps, sampled after a tenth of them: at most 1 MB per 1,000."""
-    found, model, data = Outcome(), new_model(), episodes(30, 0)
+    found, model, data = Outcome(), new_model(tiny), episodes(30, 0)
     samples: list[tuple[int, float]] = []
     page = os.sysconf("SC_PAGE_SIZE") / 1e6
     calls = 0

@@ -33,7 +33,6 @@ from tsmlib.tsm import TSM
 
 H = 4
 SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=24, batch_size=8, validate_every=4, warmup=3)
-REACHER = "tsm/Reacher-v0"
 
 
 @dataclass
@@ -81,11 +80,21 @@ def episodes(n: int, seed: int) -> Trajectories:
 TRAIN, HELD_OUT = episodes(30, 0), episodes(5, 1)
 
 
-def new_model(seed: int = 0) -> TSM:
+def small() -> TSM:
+    """A temporal segment model that trains fast."""
+    return TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
+
+
+def tiny() -> OneStep:
+    """What trains fastest."""
+    return OneStep(3, 2, angles=(0,), hidden=8, layers=1)
+
+
+def new_model(make: Callable[[], Any] = small) -> Any:
     """The same small weights every time."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
+        torch.manual_seed(0)
+        model = make()
     model.features.fit(torch.from_numpy(TRAIN.states))
     return model
 
@@ -103,10 +112,7 @@ def learn(checkpoint: Path | None) -> str:
     def near(target: Tensor) -> Reward:
         return lambda states, actions: -(states[..., 1:] - target[:, None]).square().sum(-1)
 
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        model = OneStep(3, 2, angles=(0,), hidden=8, layers=1)
-    policy = OneStepPolicy(3, 2, angles=(0,), hidden=8, copies=2)
+    policy, model = OneStepPolicy(3, 2, angles=(0,), hidden=8, copies=2), new_model(tiny)
     starts = episodes_from(torch.from_numpy(TRAIN.states[:, 0]))
     curve = improve(
         policy, model, near, starts, horizon=6, episodes=4, iterations=24, record_every=4, checkpoint=checkpoint
