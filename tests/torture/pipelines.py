@@ -91,41 +91,33 @@ def cells_out_of_order(trials: int) -> Outcome:
     A table that comes about in this way may say anything, and so counts for nothing: without a complete run in
     status.json nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
     """
-    from jupyter_client.manager import start_new_kernel
-
-    from torture.training import answer
+    from torture.training import answer, kernel
 
     found, tables = Outcome(), 0
-    environment = {
-        **os.environ,
-        "TSM_SCALE": "smoke",
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": str(ROOT),
-        "TQDM_DISABLE": "1",
-    }
     for word, notebook in runs.notebooks().items():
         cells = [cell.source for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
         mixed = [random.Random(trial).sample(range(len(cells)), len(cells)) for trial in range(trials)]
-        manager, client = start_new_kernel(kernel_name="python3", env=environment, cwd=str(runs.NOTEBOOKS))
-        for order in [[index] for index in range(len(cells))] + mixed:
-            with folder() as place:
-                answer(
-                    client, client.execute(f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os")
-                )
-                for index in order:
-                    reply = answer(client, client.execute(cells[index]))
-                    ours = ("NameError", "StoreError", "ParameterError", "RunError")
-                    known = reply["status"] == "ok" or reply["ename"] in ours
-                    found.count(known, f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}")
-                tables += len(list(place.rglob("metrics/*.csv")))
-                run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
-                try:
-                    runs.require(run, notebook.stem)
-                    found.count(False, f"{word}: taken for complete")
-                except RunError as error:
-                    found.count(f"python -m tsmlib run {word} --scale smoke" in str(error), str(error))
-        client.stop_channels()
-        manager.shutdown_kernel(now=True)
+        with kernel(TSM_SCALE="smoke", TQDM_DISABLE="1") as (_, client):
+            for order in [[index] for index in range(len(cells))] + mixed:
+                with folder() as place:
+                    answer(
+                        client,
+                        client.execute(f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"),
+                    )
+                    for index in order:
+                        reply = answer(client, client.execute(cells[index]))
+                        ours = ("NameError", "StoreError", "ParameterError", "RunError")
+                        known = reply["status"] == "ok" or reply["ename"] in ours
+                        found.count(
+                            known, f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}"
+                        )
+                    tables += len(list(place.rglob("metrics/*.csv")))
+                    run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
+                    try:
+                        runs.require(run, notebook.stem)
+                        found.count(False, f"{word}: taken for complete")
+                    except RunError as error:
+                        found.count(f"python -m tsmlib run {word} --scale smoke" in str(error), str(error))
     found.note = f"{tables} tables came about; none is taken for a result"
     return found
 

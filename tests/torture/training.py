@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -11,7 +12,7 @@ import signal
 import subprocess
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from torture.world import (
     tiny,
     train,
 )
-from tsmlib import disk, store
+from tsmlib import disk, runs, store
 from tsmlib.checkpoint import TrainingStopped, load_generation
 from tsmlib.train import fit
 from tsmlib.trajectory import Window
@@ -426,15 +427,10 @@ def full_disk(trials: int = 0) -> Outcome:
 
 def interrupted_in_a_cell(trials: int) -> Outcome:
     """R15: SIGINT at a random moment of a cell that trains; the cell runs again, and ends with the same bits."""
-    from jupyter_client.manager import start_new_kernel
-
-    found = Outcome()
-    (expected, _) = reference()
+    found, (expected, _) = Outcome(), reference()
     tests = Path(__file__).resolve().parent.parent
-    manager, client = start_new_kernel(kernel_name="python3", env={**os.environ, "OMP_NUM_THREADS": "1"})
-    try:
+    with kernel() as (manager, client):
         run(client, f"import sys; sys.path[:0] = [{str(tests)!r}, {str(tests.parent)!r}]")
-        began = time.monotonic()
         run(client, "from pathlib import Path; from torture.world import train; import torch; torch.set_num_threads(1)")
         run(client, "train(None)")
         began = time.monotonic()
@@ -456,16 +452,29 @@ def interrupted_in_a_cell(trials: int) -> Outcome:
                 found.count(run(client, cell) == repr(expected), f"trial {trial}: other bits")
         found.count(slowest < 5, f"the prompt came back after {slowest:.1f} s")
         found.note = f"{stopped} of {trials} stopped, prompt back within {slowest:.2f} s"
+    return found
+
+
+@contextlib.contextmanager
+def kernel(**environment: str) -> Iterator[tuple[Any, Any]]:
+    """Manager and client of a kernel in the folder of the notebooks."""
+    from jupyter_client.manager import start_new_kernel
+
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(runs.ROOT), **environment}
+    manager, client = start_new_kernel(
+        kernel_name="python3", env=environment, cwd=str(runs.NOTEBOOKS), stderr=subprocess.DEVNULL
+    )
+    try:
+        yield manager, client
     finally:
         client.stop_channels()
         manager.shutdown_kernel(now=True)
-    return found
 
 
 def answer(client: Any, request: str) -> dict[str, Any]:
     """The reply to a request, once the kernel is idle again."""
     while True:
-        reply = client.get_shell_msg(timeout=300)
+        reply = client.get_shell_msg(timeout=3600)
         if reply["parent_header"].get("msg_id") == request:
             return reply["content"]
 
@@ -475,7 +484,7 @@ def run(client: Any, cell: str) -> str:
     shown = ""
     request = client.execute(cell)
     while True:
-        message = client.get_iopub_msg(timeout=300)
+        message = client.get_iopub_msg(timeout=3600)
         if message["parent_header"].get("msg_id") != request:
             continue
         if message["msg_type"] == "execute_result":
