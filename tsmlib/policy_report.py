@@ -69,6 +69,19 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     return found
 
 
+def finished(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows without those of seeds that stopped before the longest one of their method: for a table still growing."""
+    rows = [row for row in rows if row["condition"] == "learning"]
+    ends: dict[tuple[Any, ...], dict[Any, int]] = {}
+    for row in rows:
+        seeds = ends.setdefault((row["env"], row["model"], row["prior"]), {})
+        seeds[row["seed"]] = max(seeds.get(row["seed"], 0), row["horizon"])
+    return [
+        row for row in rows
+        for seeds in [ends[row["env"], row["model"], row["prior"]]] if seeds[row["seed"]] == max(seeds.values())
+    ]  # fmt: skip
+
+
 def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
     """The curves of one method."""
     by_metric: dict[str, dict[tuple[int, Any], dict[int, float]]] = {}  # metric -> (seed, copy) -> horizon -> value
