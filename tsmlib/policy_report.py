@@ -70,7 +70,7 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
 
 
 def finished(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows without those of seeds that stopped before the longest one of their method: for a table still growing."""
+    """The rows of a growing table without those of seeds that stopped before the longest one of their method."""
     rows = [row for row in rows if row["condition"] == "learning"]
     ends: dict[tuple[Any, ...], dict[Any, int]] = {}
     for row in rows:
