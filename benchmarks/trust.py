@@ -2,7 +2,7 @@
 
 A checkpoint is held against the 250 updates between two of them, in one training; a load with all its checks against
 reading the bytes and copying them into a model that exists. In processor seconds, which other work disturbs less; a
-checkpoint's flush to the disk comes on top, some tens of milliseconds.
+checkpoint's flush to the disk comes on top.
 
     python benchmarks/trust.py        or        python -m tsmlib bench trust
 """
