@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tsmlib import parameters as schema
+from tsmlib.disk import alive, only_writer
 from tsmlib.parameters import ParameterError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -142,7 +143,6 @@ def execute(
     if "scale" in values:
         values["scale"] = run.scale
     from tsmlib import store  # heavy, and not needed to refuse a parameter
-    from tsmlib.disk import only_writer
     from tsmlib.provenance import provenance
 
     try:
@@ -183,7 +183,7 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
         store.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
     )
     state = entry.get("state") if isinstance(entry, dict) else "damaged"
-    if state == "running" and not _alive(entry):
+    if state == "running" and not alive(entry.get("pid")):
         state = "interrupted: its process is gone"
     if state == "complete" and {"files", "sha256"} & set(entry) and not store.intact(entry):  # older ones have neither
         state = "damaged"
@@ -200,16 +200,6 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
     if changed:
         raise RunError(f"{run.dir / changed[0]} is not what {notebook} made, or is gone. Run it again: {command}")
     return entry
-
-
-def _alive(entry: Mapping[str, Any]) -> bool:
-    try:
-        os.kill(int(entry["pid"]), 0)
-    except (KeyError, TypeError, ValueError, OverflowError, ProcessLookupError):
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
