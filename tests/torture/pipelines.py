@@ -25,7 +25,7 @@ TESTS = str(Path(__file__).resolve().parent.parent)
 
 # The truth about a run -----------------------------------------------------------------------------------------------
 
-SLEEPER = "import os, sys, time\nopen({mark!r}, 'w').write(str(os.getpid()))\ntime.sleep(120)"
+SLEEPER = "import os, sys, time\nopen({mark!r}, 'w').write(str(os.getpid()))\ntime.sleep(3600)"
 RUNNER = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     "import sys; from pathlib import Path; from tsmlib import runs; from tsmlib.__main__ import main\n"
@@ -67,7 +67,7 @@ def killed_runs(trials: int) -> Outcome:
                         os.kill(kernel, signal.SIGKILL)
                     else:
                         process.send_signal(getattr(signal, how))
-                code = process.wait(120)
+                code = process.wait(600)
             state = json.loads((place / "runs/smoke/seed0/status.json").read_text())["01_first"]["state"]
             found.count(code != 0 and state != "complete", f"{how}: exit {code}, {state}")
             run = runs.resolve("02_second", scale="smoke", run_dir=str(place / "runs"))
