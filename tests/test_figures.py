@@ -112,6 +112,17 @@ def test_figure6_shows_means_of_cost_and_gap_and_the_better_oracle() -> None:
     assert float(cost.lines[0].get_xdata()[0]) == -rows["oracle codes cem"]["true"].mean()
 
 
+def test_figure6_pairs_targets_with_the_oracle_and_says_what_lies_far_off() -> None:
+    hard = 3 * noise(12) - 5
+    rows = {"oracle codes cem": hard, "tsm codes cem": hard - 0.5, "lstm codes cem": hard - 0.6, "zero": hard - 20}
+    cost, _ = figures.figure6({"push": {label: {"true": true, "predicted": true} for label, true in rows.items()}}).axes
+    for bar in cost.containers:  # all targets are missed by the same, however different they are
+        assert np.ptp(bar.lines[2][0].get_segments()[0][:, 0]) == pytest.approx(0, abs=1e-9)
+    assert "outside: zero torque" in cost.get_xlabel()
+    assert cost.get_xlim()[1] < 10
+    assert [label.get_text() for label in cost.get_yticklabels()] == ["", ""]  # over codes by CEM, all of them
+
+
 def test_the_gap_along_the_way_is_the_last_one() -> None:
     (ax,) = figures.along_the_way(steps()).axes
     assert [text.get_text() for text in ax.texts] == ["gap +1.00"]
