@@ -275,8 +275,14 @@ def plan_paths(
     dreamt, done = shaped("dreamt", dreamt, "n T 2"), shaped("done", done, "n T 2")
     if len(dreamt) != len(done):
         raise ValueError(f"dreamt holds {len(dreamt)} paths and done {len(done)}")
-    figure, axes = panels(len(done), 4, 1.8, sharex=True, sharey=True)
-    dark, main = COLOURS["data"], colour(label)
+    columns, dark, main = min(4, len(done)), COLOURS["data"], colour(label)
+    rows = -(-len(done) // columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(1.7 * columns + 0.5, 1.8 * rows + 0.35), squeeze=False, sharex=True, sharey=True
+    )
+    for ax in grid.flat[len(done) :]:
+        ax.remove()
+    axes = list(grid.flat[: len(done)])
     if wanted is not None:
         wanted = np.broadcast_to(wanted, (len(done), *np.shape(wanted)[-2:]))
     for i, ax in enumerate(axes):
@@ -307,9 +313,10 @@ def plan_actions(data_actions: np.ndarray, prior_plan: np.ndarray, direct_plan: 
     figure, axes = plt.subplots(1, 3, figsize=(WIDTH, 1.6), sharey=True)
     shown = (("training data", data_actions, COLOURS["data"]), ("plan over codes", prior_plan, colour(label)),
               ("plan over actions", direct_plan, colour(label)))  # fmt: skip
+    limit = max(float(np.abs(actions).max()) for _, actions, _ in shown) or 1.0
     for ax, (title, actions, main) in zip(axes, shown, strict=True):
         actions = shaped(title, actions, "T 2")
-        torques(ax, actions, dt, main)
+        torques(ax, actions, dt, main, limit=limit)
         ax.set_title(title)
         change = np.abs(np.diff(actions, axis=0)).mean() if len(actions) > 1 else 0.0
         ax.set_title(f"mean |Δu| {change:.3f}", loc="right", fontsize=6.5, color="#555555")
