@@ -39,8 +39,8 @@ def publish(run: Run) -> None:
     store.save_table(RESULTS / predicted.name, rows)  # of every seed beside this run
     learned = run.dir.parents[1] / "bench" / "model_free.csv"
     if learned.exists():
-        rows = policy_report.finished(store.load_table(learned))
-        store.save_table(RESULTS / learned.name, rows, extra=["configuration"])
+        finished = policy_report.finished(store.load_table(learned))
+        store.save_table(RESULTS / learned.name, finished, extra=["configuration"])
     store.write_manifest(ROOT / "data")
     before, _, rest = README.read_text().partition(MARKS[0])
     after = rest.partition(MARKS[1])[2]
@@ -63,7 +63,7 @@ def readme_results() -> str:
         + scoreboard.board(predict, METRICS, env=env)
         for env in envs
     )
-    n = max(row["n"] for row in predict if row["condition"] == "clean")
+    n = max(row["n"] for row in predict if row["condition"] == "clean" and row["n"] != "")
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
 
 **Prediction.** {n:,} test episodes, open loop with the true torques for 90 steps after ten observed ones; means over
