@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
+import torch
 from torture import files, pipelines, simulators, training
 from torture.__main__ import CHECKS
 from torture.world import Outcome
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for _, check, quick, _ in part}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """As in the children that a check forks; a training that goes on with other threads would say so."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def quick(check: Callable[[int], Outcome]) -> None:

@@ -65,6 +65,7 @@ CHECKS: dict[str, list[tuple[str, Callable[[int], Outcome], int, int]]] = {  # R
 
 
 def main() -> int:
+    torch.set_num_threads(1)  # as in the children that a check forks
     quick = "--quick" in sys.argv
     by_name = {entry[1].__name__: [entry] for part in CHECKS.values() for entry in part}
     chosen: list[tuple[str, Callable[[int], Outcome], int]] = []
