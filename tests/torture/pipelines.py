@@ -244,7 +244,7 @@ def another_thread_count(trials: int = 0) -> Outcome:
     found = Outcome()
 
     def work(place: Path, count: int) -> tuple[list[str], list[str]]:
-        torch.set_num_threads(count)
+        torch.get_num_threads = lambda: count  # only said: a forked child cannot have more than one
         model = new_model()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
