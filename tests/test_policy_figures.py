@@ -261,4 +261,4 @@ def test_references_are_the_oracles_and_zero_torque() -> None:
         assert max(levels.values()) > levels["zero"]
         assert {label.split()[0] for label in levels} == {"oracle", "zero"}
     with pytest.raises(ValueError, match="of one of them"):
-        policy_report.references(rows)
+        policy_report.references([*rows, *(row | {"env": row["env"].replace("tsm/", "tsm/Pymunk")} for row in rows)])

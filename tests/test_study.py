@@ -260,7 +260,7 @@ def flipped(data: bytes) -> bytes:
 def test_a_damaged_file_is_named_and_left_alone(run: Run, what: str, damage: Callable[[bytes], bytes]) -> None:
     path = run.dir / f"{what}.safetensors"
     path.write_bytes(damaged := damage(path.read_bytes()))
-    with pytest.raises(StoreError, match=rf"{path.name} is damaged.*(Delete it and make|Restore)"):
+    with pytest.raises(StoreError, match=rf"{path.name} is damaged.*(Delete it and|Restore)"):
         if what.startswith("data"):
             study.dataset(run, REACHER, "train")
         else:
