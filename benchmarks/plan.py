@@ -29,13 +29,13 @@ from tsmlib.tsm import TSM
 ENV = "tsm/ReacherPush-v0"
 
 
-def models(run: runs.Run) -> tuple[TSM, ActionPrior, str]:
+def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
     """The shipped models; where there are none, untrained ones, which are as fast."""
-    folder = run.shipped / study.short(ENV)
+    folder = run.shipped / study.short(env)
     if all((folder / f"{name}.safetensors").exists() for name in ("tsm", "prior")):
         tsm = store.load_model(folder / "tsm.safetensors", TSM)
         return tsm, store.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
-    data = study.random_data(ENV, 50, seed=0)
+    data = study.random_data(env, 50, seed=0)
     return study.fresh(run, "tsm", data), study.fresh(run, "prior", data), "untrained"
 
 
@@ -60,7 +60,7 @@ def main() -> None:
     arguments = parser.parse_args()
     run = runs.resolve("bench", scale="laptop")
     task = study.task(ENV).take(arguments.targets)
-    model, prior, origin = models(run)
+    model, prior, origin = models(run, ENV)
     n_rollouts = (arguments.iterations + 2) * arguments.samples * len(task)  # before, between and after the iterations
 
     totals: dict[str, list[float]] = defaultdict(list)

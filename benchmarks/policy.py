@@ -16,24 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from plan import models
 from tqdm.auto import tqdm
 
 from tsmlib import rewards, runs, store, study
 from tsmlib.policy import OneStepPolicy, SegmentPolicy, episodes_from, improve
-from tsmlib.prior import ActionPrior
-from tsmlib.tsm import TSM
 
 SCHEDULE = 2200  # updates until the rate has decayed to its end, A25
-
-
-def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
-    """The shipped models; where there are none, untrained ones, which are as fast."""
-    folder = run.shipped / study.short(env)
-    if all((folder / f"{name}.safetensors").exists() for name in ("tsm", "prior")):
-        tsm = store.load_model(folder / "tsm.safetensors", TSM)
-        return tsm, store.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
-    data = study.random_data(env, 50, seed=0)
-    return study.fresh(run, "tsm", data), study.fresh(run, "prior", data), "untrained"
 
 
 def main() -> None:

@@ -272,7 +272,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})")
     found.add_argument("--seeds", type=int, default=3, help="0, 1, ... (default 3)")
     found.add_argument("--records", type=int, default=RECORDS, help=f"along each curve (default {RECORDS})")
-    found.add_argument("--out", type=Path, default=ROOT / "runs" / "bench" / "model_free.csv", help="the table")
+    found.add_argument("--out", type=Path, default=ROOT / "runs/paper/seed0/metrics/model_free.csv", help="the table")
     return found
 
 
