@@ -63,11 +63,11 @@ def readme_results() -> str:
     n = max(row["n"] for row in predict if row["condition"] == "clean" and row["n"] != "")
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
 
-**Prediction.** {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten observed
-ones; means over steps, in standardised units, with half the 95 % t interval where there are several training seeds. Higher
-is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models of an environment got
-as many updates as fit into the same time on one idle core (`study.BUDGET`). `pets` is the same kind of model as `ensemble`,
-by mbrl-lib (`benchmarks/peers`).
+**Prediction.** {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
+observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
+seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
+of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`). `pets` is the same
+kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
 
 {boards}
 
