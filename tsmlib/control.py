@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -19,11 +20,13 @@ from tsmlib import rewards
 from tsmlib.collect import Controller, collect, once, smooth_torques
 from tsmlib.dynamics import DynamicsModel
 from tsmlib.envs.base import BLOCK_RADIUS, LINK_LENGTHS, WALL
+from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 from tsmlib.trajopt import Plan, Planner, Space, reassess, through_model, through_simulator
 
 TOLERANCE = 0.03  # metres: a trial that ends within it is a success
+SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be repeated
 
 
 @dataclass(frozen=True)
@@ -141,16 +144,25 @@ class Trial:
 
 
 def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
-    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say."""
+    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say.
+
+    A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
+    """
     actions = plan.actions if isinstance(plan, Plan) else plan
     env = gymnasium.make_vec(task.env, num_envs=len(task))
     if isinstance(actions, Tensor):
-        seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+        seen = collect(env, once(actions), horizon=actions.shape[1], seed=SENSORS, states=task.start)
     else:
-        seen = collect(env, actions, horizon=task.horizon, states=task.start)
+        seen = collect(env, actions, horizon=task.horizon, seed=SENSORS, states=task.start)
         actions = torch.from_numpy(seen.actions)
+    states = _truth(env, seen.states)
     env.close()
-    return _measured(task, torch.from_numpy(seen.states), actions, plan if isinstance(plan, Plan) else None)
+    return _measured(task, states, actions, plan if isinstance(plan, Plan) else None)
+
+
+def _truth(env: VectorEnv, seen: np.ndarray) -> Tensor:
+    """The true states of the episodes just collected, of which ``seen`` is what the sensors said."""
+    return torch.from_numpy(np.float32(env.truth) if isinstance(env, ImperfectArms) else seen)
 
 
 def replan(
@@ -210,7 +222,8 @@ def replan(
         return made.actions[:, :steps]
 
     env = gymnasium.make_vec(task.env, num_envs=len(task))
-    seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, states=task.start)
+    seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
+    states = _truth(env, seen.states)
     env.close()
     bar.close()
     actions = torch.from_numpy(seen.actions)
@@ -218,7 +231,7 @@ def replan(
         actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted=promises[0],
         curve=torch.stack(promises), seconds=time.perf_counter() - began,
     )  # fmt: skip
-    return _measured(task, torch.from_numpy(seen.states), actions, made)
+    return _measured(task, states, actions, made)
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
