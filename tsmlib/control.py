@@ -126,7 +126,8 @@ class Trial:
     """Actions executed in the true simulator.
 
     actions (B, T, du); states (B, T + 1, dx) from the start on; true (B,): undiscounted return executed;
-    final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan.
+    final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan;
+    observed (B, T + 1, dx): what the sensors said, where they are noisy.
     """
 
     actions: Tensor
@@ -134,6 +135,7 @@ class Trial:
     true: Tensor
     final_distance: Tensor
     plan: Plan | None = None
+    observed: Tensor | None = None
 
     @property
     def gap(self) -> Tensor:
@@ -155,14 +157,8 @@ def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
     else:
         seen = collect(env, actions, horizon=task.horizon, seed=SENSORS, states=task.start)
         actions = torch.from_numpy(seen.actions)
-    states = _truth(env, seen.states)
     env.close()
-    return _measured(task, states, actions, plan if isinstance(plan, Plan) else None)
-
-
-def _truth(env: VectorEnv, seen: np.ndarray) -> Tensor:
-    """The true states of the episodes just collected, of which ``seen`` is what the sensors said."""
-    return torch.from_numpy(np.float32(env.truth) if isinstance(env, ImperfectArms) else seen)
+    return _measured(task, env, seen.states, actions, plan if isinstance(plan, Plan) else None)
 
 
 def replan(
@@ -223,7 +219,6 @@ def replan(
 
     env = gymnasium.make_vec(task.env, num_envs=len(task))
     seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
-    states = _truth(env, seen.states)
     env.close()
     bar.close()
     actions = torch.from_numpy(seen.actions)
@@ -231,7 +226,7 @@ def replan(
         actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted=promises[0],
         curve=torch.stack(promises), seconds=time.perf_counter() - began,
     )  # fmt: skip
-    return _measured(task, states, actions, made)
+    return _measured(task, env, seen.states, actions, made)
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
@@ -251,14 +246,18 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
     return total
 
 
-def _measured(task: Task, states: Tensor, actions: Tensor, plan: Plan | None) -> Trial:
-    """The trial that went through ``states`` (B, T + 1, dx)."""
+def _measured(task: Task, env: VectorEnv, seen: np.ndarray, actions: Tensor, plan: Plan | None) -> Trial:
+    """The trial that just ended in ``env``, of which the sensors said ``seen`` (B, T + 1, dx)."""
+    states = observed = torch.from_numpy(seen)
+    if isinstance(env, ImperfectArms):
+        states = torch.from_numpy(env.truth).float()
     return Trial(
         actions=actions,
         states=states,
         true=rewarded(task.reward, states[:, 1:], actions).sum(-1),
         final_distance=rewards.final_distance(states, task.target, task.position),
         plan=plan,
+        observed=None if states is observed else observed,
     )
 
 

@@ -39,6 +39,7 @@ from tsmlib.plan_figures import (  # noqa: F401
 )
 from tsmlib.policy_figures import figure7  # noqa: F401
 from tsmlib.predict_figures import against_horizon, calibration, differences, figure5  # noqa: F401
+from tsmlib.robust_figures import advantage_map, figure8, filtering, imperfect_episode  # noqa: F401
 from tsmlib.style import (  # noqa: F401
     COLOURS,
     WIDTH,

@@ -46,6 +46,7 @@ COLOURS = {
     "random": "#7A7A7A",
     "zero": "#B0B0B0",
     "data": "#4A4A4A",
+    "filter": "#111111",
 }
 NAMES = {
     "tsm": "TSM",
@@ -62,6 +63,7 @@ NAMES = {
     "trpo": "TRPO",
     "random": "random torques",
     "zero": "zero torque",
+    "filter": "Kalman filter",
 }
 JOINTS = ("shoulder", "elbow")
 

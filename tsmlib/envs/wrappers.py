@@ -103,7 +103,7 @@ class ImperfectArms(VectorWrapper):
         return np.concatenate(self._seen, axis=1)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """As the arms', with noisy states; actions still on the way are forgotten."""
         if seed is not None:
