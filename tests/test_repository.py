@@ -96,7 +96,10 @@ def uses() -> dict[str, set[str]]:
     return {name: needs - {name} for name, needs in found.items()}
 
 
-PICTURES = {"style", "axes", "diagrams", "film", "plan_figures", "predict_figures", "gallery", "figures"}
+PICTURES = {
+    *("style", "axes", "diagrams", "film", "figures"),
+    *("gallery", "latent_figures", "plan_figures", "predict_figures", "prior_figures"),
+}
 ALONE = {"envs", "rewards", "nets", "trajectory", "style"}
 
 
@@ -108,7 +111,7 @@ def test_figures_know_nothing_but_figures() -> None:
     needs = uses()
     for name in ("diagrams", "film", "plan_figures", "axes"):
         assert needs[name] == {"style"}, name
-    for name in ("predict_figures", "gallery"):
+    for name in ("predict_figures", "gallery", "latent_figures", "prior_figures"):
         assert needs[name] == {"axes", "style"}, name
     assert needs["figures"] <= PICTURES
 

@@ -27,10 +27,11 @@ from tsmlib import evaluate
 from tsmlib.control import sim_of
 from tsmlib.dynamics import rollout
 from tsmlib.envs import closest_gap, has_block
-from tsmlib.envs.base import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL
+from tsmlib.envs.base import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, task_of
 from tsmlib.invariants import NEAR
 from tsmlib.nets import Features, kl_from_standard_normal, sample_posterior, standard_normal
 from tsmlib.rewards import BLOCK
+from tsmlib.scoreboard import values
 from tsmlib.trajectory import Segment, Trajectories, Window, windows
 from tsmlib.tsm import TSM
 
@@ -341,8 +342,8 @@ def futures(model: TSM, window: Window, codes: Tensor, steps: int) -> Tensor:
 def principal(codes: Tensor) -> tuple[Tensor, Tensor]:
     """The two directions of largest variance of codes (N, dz): coordinates (N, 2), and the share of variance (2,)."""
     centred = codes - codes.mean(0)
-    _, values, directions = torch.linalg.svd(centred, full_matrices=False)
-    return centred @ directions[:2].T, values[:2].square() / values.square().sum().clamp_min(1e-30)
+    _, sizes, axes = torch.linalg.svd(centred, full_matrices=False)
+    return centred @ axes[:2].T, sizes[:2].square() / sizes.square().sum().clamp_min(1e-30)
 
 
 def directions(codes: Tensor, outcome: Tensor) -> tuple[Tensor, float]:
@@ -382,12 +383,23 @@ def code_rows(model: TSM, seen: Seen, generator: torch.Generator, /, **common: A
         add("active_units", float(active_units(mean).sum()))
         for i, value in enumerate(kl.mean(0)):
             add("kl_dimension", float(value), unit="nat", dimension=i)
+        if task_of(seen.env) == "push":
+            way = seen.window.future.states[:, -1, BLOCK] - seen.window.past.states[:, -1, BLOCK]
+            moved = way.norm(dim=1) > 0.01
+            if moved.sum() > 2 * model.latent_dim:
+                add(
+                    "direction_told",
+                    directions(mean[moved], way[moved])[1],
+                    "object moves",
+                    "share",
+                    n=int(moved.sum()),
+                )
         errors = reconstruction(model, seen.window, generator)
         for condition, chosen in subsets.items():
             if chosen.any():
                 add("kl", float(kl[chosen].sum(1).mean()), condition, "nat", n=int(chosen.sum()))
-                for word, values in errors.items():
-                    add(f"error_{word}", float(values[chosen].mean()), condition, n=int(chosen.sum()))
+                for word, each in errors.items():
+                    add(f"error_{word}", float(each[chosen].mean()), condition, n=int(chosen.sum()))
     for i, value in enumerate(importance(model, seen.window, generator)):
         add("importance", float(value), dimension=i)
     variance, squared = deviations(seen, model.features)
@@ -432,7 +444,7 @@ def deflection_rows(found: Deflections, env: str, **common: Any) -> list[dict[st
     common = dict(common, env=env, sim=sim_of(env), planner="none", condition="first touch", n=len(found.travel))
     low, high = torch.quantile(found.travels, torch.tensor([0.1, 0.9]), dim=0)
     miss = (found.travels.mean(0) - found.travel).abs()
-    values = {
+    measured = {
         "deflection_error": (float(found.error.median()), "deg"),
         "deflection_spread": (float(found.spread.median()), "deg"),
         "deflection_spearman": (spearman(found.spread, found.error), ""),
@@ -443,7 +455,36 @@ def deflection_rows(found: Deflections, env: str, **common: Any) -> list[dict[st
         "travel_spearman": (spearman(found.travels.std(0), miss), ""),
         "travel_coverage80": (float(((found.travel >= low) & (found.travel <= high)).float().mean()), "share"),
     }
-    return [dict(common, metric=metric, value=value, unit=unit) for metric, (value, unit) in values.items()]
+    return [dict(common, metric=metric, value=value, unit=unit) for metric, (value, unit) in measured.items()]
+
+
+def use_panels(found: Rows, envs: Sequence[str]) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """What ``figures.code_use`` draws: title -> environment and condition -> model -> one value per seed."""
+    panels: dict[str, dict[str, dict[str, np.ndarray]]] = {"KL per segment": {}, "spread of samples": {}}
+    whole = ("", "segments", "segments")
+    parts = ((", no touch", "segments free", "before touch"), (", with a touch", "segments contact", "after touch"))
+    for env in envs:
+        for words, kl, spread in parts if has_block(env) else (whole,):
+            row = (env.partition("/")[2].partition("-")[0].replace("Reacher", "") or "Reacher") + words
+            panels["KL per segment"][row] = values(found, "kl", env=env, condition=kl)
+            panels["spread of samples"][row] = values(found, "spread", env=env, condition=spread)
+    return panels
+
+
+def recall_panels(found: Rows, env: str) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """What ``figures.contact_recall`` draws: title -> model -> metric -> (seeds, 3), where all of it was measured."""
+    panels: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    for event, title in zip(EVENTS, ("arm touches object", "object hits wall"), strict=True):
+        by_metric = {
+            metric: [values(found, metric, env=env, condition=event, horizon=end) for end in range(10, HORIZON + 1, 10)]
+            for metric in ("recall", "precision", "chance")
+        }
+        for model in by_metric["recall"][0]:
+            seeds = [part.get(model, np.zeros(0)) for parts in by_metric.values() for part in parts]
+            if len({len(part) for part in seeds}) == 1:
+                shares = {metric: np.stack([p[model] for p in parts], 1) for metric, parts in by_metric.items()}
+                panels.setdefault(title, {})[model] = shares
+    return panels
 
 
 def reached(found: Rows, models: Sequence[str]) -> str:
@@ -456,8 +497,8 @@ def reached(found: Rows, models: Sequence[str]) -> str:
             cells = []
             for model in models:
                 wanted = (metric, condition, env, model, horizon)
-                values = [row["value"] for row in found if _key(row) == wanted]
-                cells.append(f"{np.mean(values):.3g}" if values else "")
+                seeds = [row["value"] for row in found if _key(row) == wanted]
+                cells.append(f"{np.mean(seeds):.3g}" if seeds else "")
             what = f"`{env}`: {metric.replace('_', ' ')}{f' ({condition})' * (metric == 'recall')}{ahead}"
             lines.append(f"| {what} | {word} {bound:g} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
