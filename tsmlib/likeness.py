@@ -191,6 +191,12 @@ def board(found: Sequence[Mapping[str, Any]], env: str) -> str:
     return "\n".join(lines)
 
 
+def same_method(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two rows are about one method under one condition, whatever their metric and seed."""
+    fields = ("env", "model", "planner", "prior", "condition")
+    return all(row[field] == other[field] for field in fields)
+
+
 def title(row: Mapping[str, Any]) -> str:
     """Whose torques a row is about, in words."""
     known = {
