@@ -130,7 +130,7 @@ def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match="k 3"):
+    with pytest.raises(ValueError, match="k, 3"):
         recall(recall=np.zeros((2, 4)))
     with pytest.raises(ValueError, match="not finite"):
         figures.walk(DRAW, START, np.full((9, 30, 2), np.nan), {9: 0.1})
