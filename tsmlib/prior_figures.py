@@ -93,8 +93,8 @@ def prior_walks(walks: np.ndarray, dt: float) -> Figure:
                 ax.plot(seconds, way, color=shade, lw=0.9)
             ax.axhline(0, color="#DDDDDD", lw=0.5, zorder=0)
             ax.set_xlim(0, seconds[-1])
-    for ax, joint in zip(grid[:, 0], ("shoulder", "elbow"), strict=True):
-        ax.set_ylabel(joint)
+    for ax, word in zip(grid[:, 0], ("shoulder", "elbow"), strict=True):
+        ax.set_ylabel(word)
     figure.supxlabel("time (s)", fontsize=7)
     figure.supylabel("torque (share of full)", fontsize=7)
     return figure
