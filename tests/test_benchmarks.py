@@ -15,7 +15,7 @@ from tsmlib.__main__ import main
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2", "--rounds", "2"],
     "plan": ["--targets", "2", "--iterations", "1", "--samples", "1", "--rounds", "2"],
-    "trust": ["--steps", "2", "--loads", "1", "--rounds", "2"],
+    "trust": ["--steps", "4", "--loads", "1", "--rounds", "2"],
     "policy": ["--copies", "2", "--iterations", "1", "--rounds", "2"],
 }
 

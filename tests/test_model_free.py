@@ -125,11 +125,12 @@ def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
     table, task = model_free.Table(tmp_path / "model_free.csv"), study.task("tsm/Reacher-v0")
     for seed in range(3):
         key = dict(env=task.env, model="trpo", condition="learning", configuration="std=0.14", seed=seed)
-        table.put(key, task, records(0, 500, 1000))
+        table.put(key, task, [record | {"seconds": 99.0} for record in records(0, 500, 1000)])
     table.put(key | {"condition": "search"}, task, records(200))
     curves = learning_curves(store.load_table(table.path))["reach"]["trpo"]
     assert curves["return_true"].tolist() == [[-1.0, -2.0, -3.0]] * 3
     assert curves["samples"].tolist() == [0, 500, 1000]
+    assert curves["seconds"].tolist() == [-1.0, -2.0, -3.0]  # the processor's
     assert "iterations" not in curves
 
 
@@ -205,6 +206,8 @@ def test_the_readme_states_what_is_run() -> None:
     assert set(re.findall(r"`?(--(?!no-deps)[a-z]+)", readme)) <= known
     steps = model_free.STEPS
     assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v0']:,} pushing" in readme
+    steps = model_free.SEARCH_STEPS
+    assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v0']:,} for" in readme
     for name in ("learning_rate", "target_kl", "episodes", "std"):
         values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
         assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name

@@ -29,7 +29,7 @@ def learned(k: int = 3, end: float = -4.5, samples: float = 50_000) -> dict[str,
 
 def model_free(k: int = 3) -> dict[str, np.ndarray]:
     true = np.linspace(-12, -5, 26) + 0.1 * np.random.default_rng(1).normal(size=(k, 26))
-    return {"return_true": true, "samples": np.linspace(0, 3e5, 26), "seconds": np.linspace(0, 90, 26)}
+    return {"return_true": true, "samples": np.linspace(0, 3e5, 26), "seconds": np.linspace(1e-5, 90, 26)}
 
 
 def both_tasks() -> dict[str, dict[str, dict[str, np.ndarray]]]:
@@ -106,6 +106,16 @@ def test_a_model_free_run_has_no_place_among_iterations_of_an_optimiser() -> Non
     figure = figure7({"reach": {"tsm codes": learned(), "ppo": model_free()}})
     assert [bool(lines(ax, "ppo")) for ax in figure.axes] == [False, True, True]
     assert {"PPO", "TSM, codes", "what the model promised", "95 % interval"} == set(legend(figure))
+
+
+def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> None:
+    ax = figure7({"reach": {"tsm codes": learned(), "ppo": model_free()}}, against=["seconds"]).axes[0]
+    assert ax.get_xscale() == "log"
+    (curve,), (own,) = lines(ax, "ppo"), lines(ax, "tsm")
+    assert len(curve.get_xdata()) == 25
+    assert own.get_xdata()[0] == 400
+    low, high = ax.get_xlim()
+    assert low < 3.6 < 1400 < high
 
 
 def test_a_policy_through_the_prior_is_filled_and_one_of_torques_open() -> None:
@@ -210,12 +220,19 @@ def test_rows_survive_a_table(tmp_path: Any) -> None:
     [
         ([*rows(seed=1, records=2)], "seed 1, copy 0 was measured at 2 points up to 220, expected the 3 up to 440"),
         ([*rows()], "return_true of seed 0 stands twice at 0"),
-        ([*rows(fingerprint={"env": "tsm/PymunkReacher-v0"}, seed=1)], "give rows of one of them"),
+        ([*rows(fingerprint={"env": "tsm/PymunkReacher-v0"}, seed=1)], "give those of one of them"),
     ],
 )
 def test_rows_that_do_not_belong_together_are_refused(more: list[dict[str, Any]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         policy_report.learning_curves([*rows(), *more])
+
+
+def test_seeds_that_stopped_early_are_left_out_of_a_growing_table() -> None:
+    growing = [*rows(), *rows(seed=1, records=2), *rows(seed=2, records=2, model="lstm")]
+    curves = policy_report.learning_curves(policy_report.finished(growing))["reach"]
+    assert {label: len(own["return_true"]) for label, own in curves.items()} == {"tsm codes": 2, "lstm codes": 2}
+    assert policy_report.learning_curves(policy_report.finished(rows())).keys() == {"reach"}
 
 
 def test_samples_to_reach_a_level_are_read_off_the_mean_curve() -> None:
@@ -237,6 +254,11 @@ def test_references_are_the_oracles_and_zero_torque() -> None:
     from tsmlib import store
     from tsmlib.runs import ROOT
 
-    found = policy_report.references(store.load_table(ROOT / "data" / "results" / "05_control.csv"))
+    rows = store.load_table(ROOT / "data" / "results" / "05_control.csv")
+    found = policy_report.references(row for row in rows if row["sim"] == "mujoco")
     assert {"reach", "push"} <= set(found)
-    assert all("zero" in levels and len(levels) >= 2 for levels in (found["reach"], found["push"]))
+    for levels in (found["reach"], found["push"]):
+        assert max(levels.values()) > levels["zero"]
+        assert {label.split()[0] for label in levels} == {"oracle", "zero"}
+    with pytest.raises(ValueError, match="of one of them"):
+        policy_report.references(rows)

@@ -215,7 +215,7 @@ def start(place: Path) -> subprocess.Popen[bytes]:
     """A process that runs a notebook which never ends, once its kernel is in that cell."""
     write_notebook(
         place / "notebooks" / "01_first.ipynb",
-        f"open({str(place / 'inside')!r}, 'w').write(str(__import__('os').getpid()))\nimport time; time.sleep(60)",
+        f"open({str(place / 'inside')!r}, 'w').write(str(__import__('os').getpid()))\nimport time; time.sleep(3600)",
     )
     code = (
         # SIGINT would be ignored where the tests themselves run in the background.
@@ -228,7 +228,7 @@ def start(place: Path) -> subprocess.Popen[bytes]:
     return process
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 600) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -247,7 +247,7 @@ def gone(pid: int) -> bool:
 def test_a_stopped_run_is_interrupted_and_its_kernel_goes(place: Path, number: signal.Signals) -> None:
     process = start(place)
     process.send_signal(number)
-    assert process.wait(120) == 130
+    assert process.wait(600) == 130
     assert status(place)["01_first"]["state"] == "interrupted"
     wait_for(lambda: gone(int((place / "inside").read_text())))
 

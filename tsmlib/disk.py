@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 PathLike = str | os.PathLike[str]
 
@@ -23,7 +24,7 @@ def write_bytes(path: PathLike, data: bytes) -> None:
     try:
         _make(path.parent)
         for left in path.parent.glob(".*.tmp-*"):  # by a process that was killed
-            if not _alive(left.name.rpartition("-")[2]):
+            if not alive(left.name.rpartition("-")[2]):
                 left.unlink(missing_ok=True)
         with open(temporary, "wb") as file:
             file.write(data)
@@ -59,12 +60,13 @@ def _sync(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _alive(pid: str) -> bool:
+def alive(pid: Any) -> bool:
+    """Whether there may be a process of this number; True for what is none."""
     try:
         os.kill(int(pid), 0)
     except ProcessLookupError:
         return False
-    except (ValueError, OverflowError, PermissionError):
+    except (TypeError, ValueError, OverflowError, PermissionError):
         pass
     return True
 

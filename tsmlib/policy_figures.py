@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from tsmlib.axes import arrow, finish, finite, foot, known, limits, looks, spell
 from tsmlib.plan_figures import REFERENCES
@@ -41,6 +41,7 @@ def figure7(
 
     Lines are means, bands their 95 % t intervals over the k. Against iterations, dashes show the promise. A policy
     whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of it.
+    Seconds are on a logarithmic axis from 1 s.
     """
     references = references or {}
     known("against", against, list(AXES))
@@ -64,14 +65,15 @@ def figure7(
         for ax, word in zip(column, against, strict=True):
             _levels(ax, levels)
             drawn = {label: rows[label] for label in look_of if word in rows.get(label, {})}
-            far = max((row[word].max() for row in drawn.values()), default=1.0)
-            ax.set_xlim(-0.015 * far, 1.02 * far)
+            far = _scale(ax, word, [row[word] for row in drawn.values()])
             notes = []
             for i, (label, row) in enumerate(drawn.items()):
                 look, at, (mean, half) = look_of[label], row[word], _band(row["return_true"])
-                if np.ptp(at) == 0:
+                if word == "seconds":
+                    at, mean, half = (part[at >= 1] for part in (at, mean, half))
+                if word == "samples" and np.ptp(at) == 0:
                     ax.plot([at[-1], far], [mean[-1]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
-                    ax.errorbar(at[-1], mean[-1], half[-1], elinewidth=0.9, **{**look, "ls": "", "ms": 4.2}, zorder=4)
+                    ax.errorbar(at[-1], mean[-1], half[-1], elinewidth=0.9, **{**look, "ls": ""}, zorder=4)
                     at, mean, half = at[-1:], mean[-1:], half[-1:]
                 else:
                     every = max(1, len(at) // 6)
@@ -87,8 +89,6 @@ def figure7(
                     if gone.any():
                         arrow(ax, "y", at[gone.argmax()], side, look["color"])
                         notes.append(f"{name(label)} to {spell(side * (side * mean).max())}")
-            ax.xaxis.set_major_locator(MaxNLocator(5))
-            ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
             ax.grid(axis="y", color="#EEEEEE", lw=0.6)
             foot(ax, AXES[word], notes, WIDTH / len(checked) - 0.5)
         column[0].set_title(task.capitalize())
@@ -124,13 +124,36 @@ def _checked(field: str, given: Mapping[str, np.ndarray]) -> Curves:
 def _look(label: str, look: Mapping[str, Any]) -> dict[str, Any]:
     """Filled and thick where the policy acts through the action prior, open where it gives torques itself."""
     actions = "actions" in words(label)[1].split()
-    return {**look, "ls": "-", "lw": 0.9 if actions else 1.3, "mfc": "white" if actions else look["color"]}
+    return {
+        **look,
+        "ls": "-",
+        "ms": 5 if look["marker"] == "*" else 3.2,
+        "lw": 0.9 if actions else 1.3,
+        "mfc": "white" if actions else look["color"],
+    }
 
 
 def _band(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and half its 95 % interval (R,) of lines (k, R)."""
     mean, half = np.array([interval(values) for values in lines.T]).T
     return mean, half
+
+
+def _scale(ax: Axes, word: str, at: Sequence[np.ndarray]) -> float:
+    """The x axis for everything in ``at``, logarithmic for seconds; where it ends."""
+    every = np.concatenate(at) if at else np.ones(1)
+    far = float(every.max())
+    if word == "seconds" and far > 1:
+        near = float(every[every >= 1].min())
+        ax.set_xscale("log")
+        ax.set_xlim(0.8 * near, 1.15 * far)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if far < 100 * near else (1.0,)))
+        ax.xaxis.set_minor_locator(NullLocator())
+    else:
+        ax.set_xlim(-0.015 * far, 1.02 * far)
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    return far
 
 
 def _levels(ax: Axes, levels: Mapping[str, float]) -> None:

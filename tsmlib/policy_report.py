@@ -53,18 +53,12 @@ def learning_rows(
 def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     """The input of ``figures.figure7``: task -> label -> curves, from rows of learning; others are passed over.
 
-    Copies and seeds of a label are its k lines. ValueError where they were not measured at the same points, or where
-    one task was learned in two environments.
+    Copies and seeds of a label are its k lines. Seconds are the processor's where a table has them, else the clock's,
+    which are more on a busy machine; training of the model is counted. ValueError where lines were not measured at the
+    same points, or where one task was learned in two environments.
     """
     methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    envs: dict[str, str] = {}
-    for row in rows:
-        if row["condition"] != "learning":
-            continue
-        if envs.setdefault(row["task"], row["env"]) != row["env"]:
-            raise ValueError(
-                f"task {row['task']} was learned in {envs[row['task']]} and in {row['env']}; give rows of one of them"
-            )
+    for row in _one_env([row for row in rows if row["condition"] == "learning"]):
         methods.setdefault((row["task"], f"{row['model']} {row['prior']}".strip()), []).append(row)
     found: dict[str, dict[str, Curves]] = {}
     for (task, label), own in methods.items():
@@ -73,6 +67,19 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
         except ValueError as error:
             raise ValueError(f"{task}, {label}: {error}") from None
     return found
+
+
+def finished(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows of a growing table without those of seeds that stopped before the longest one of their method."""
+    rows = [row for row in rows if row["condition"] == "learning"]
+    ends: dict[tuple[Any, ...], dict[Any, int]] = {}
+    for row in rows:
+        seeds = ends.setdefault((row["env"], row["model"], row["prior"]), {})
+        seeds[row["seed"]] = max(seeds.get(row["seed"], 0), row["horizon"])
+    return [
+        row for row in rows
+        for seeds in [ends[row["env"], row["model"], row["prior"]]] if seeds[row["seed"]] == max(seeds.values())
+    ]  # fmt: skip
 
 
 def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
@@ -99,7 +106,7 @@ def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
         return np.array([[line[x] for x in at.tolist()] for line in by_metric[metric].values()])
 
     curves = {metric: stacked(metric) for metric in by_metric if metric in UNITS}
-    curves["seconds"] = stacked("seconds").mean(0)
+    curves["seconds"] = stacked("cpu_seconds" if "cpu_seconds" in by_metric else "seconds").mean(0)
     if model_free:
         return curves | {"samples": at}
     samples, before = (
@@ -112,13 +119,26 @@ def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def references(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Task -> label -> mean true return of the oracle and of no torque, from rows of 05_control.csv (metric means)."""
+    """Task -> label -> mean true return of the oracle's plans and of no torque, from rows of 05_control.csv.
+
+    ValueError where one task was done in two environments.
+    """
     found: dict[str, dict[str, float]] = {}
-    for row in rows:
-        if row["metric"] == "return_true" and (row["model"] == "oracle" or row["planner"] == "zero"):
+    for row in _one_env([row for row in rows if row["metric"] == "return_true"]):
+        if row["model"] == "oracle" or row["planner"] == "zero":
             label = "zero" if row["planner"] == "zero" else f"oracle {row['prior']} {row['planner']}"
             found.setdefault(row["task"], {})[label] = row["value"]
     return found
+
+
+def _one_env(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    envs: dict[str, str] = {}
+    for row in rows:
+        if envs.setdefault(row["task"], row["env"]) != row["env"]:
+            raise ValueError(
+                f"rows of task {row['task']} are of {envs[row['task']]} and of {row['env']}; give those of one of them"
+            )
+    return rows
 
 
 def samples_to_reach(curves: Curves, level: float) -> float | None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tsmlib import scoreboard, store, study
-from tsmlib.report import report
+from tsmlib import policy_report, scoreboard, store, study
+from tsmlib.report import by_loop, report
 from tsmlib.runs import ROOT, Run, require
 from tsmlib.study import RESULTS
 
@@ -17,9 +17,9 @@ MARKS = ("<!-- results -->", "<!-- end of results -->")
 def publish(run: Run) -> None:
     """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results.
 
-    The table of 03_predict has the rows of the other seeds beside this run as well.
-    Raises RunError, before anything is written, unless the notebooks ran to their end and
-    their results are as they left them.
+    The table of 03_predict has the rows of the other seeds beside this run as well, and model-free policies come from
+    ``bench/model_free.csv`` beside the scales. Raises RunError, before anything is written, unless the notebooks ran to
+    their end and their results are as they left them.
     """
     for notebook in ("01_collect", "02_train", "03_predict", "05_control"):
         require(run, notebook)
@@ -37,6 +37,10 @@ def publish(run: Run) -> None:
     predicted = run.metrics / "03_predict.csv"
     rows = study.evidence(replace(run, notebook="03_predict"), store.load_table(predicted))
     store.save_table(RESULTS / predicted.name, rows)  # of every seed beside this run
+    learned = run.dir.parents[1] / "bench" / "model_free.csv"
+    if learned.exists():
+        finished = policy_report.finished(store.load_table(learned))
+        store.save_table(RESULTS / learned.name, finished, extra=["configuration"])
     store.write_manifest(ROOT / "data")
     before, _, rest = README.read_text().partition(MARKS[0])
     after = rest.partition(MARKS[1])[2]
@@ -44,24 +48,14 @@ def publish(run: Run) -> None:
     store.write_bytes(README, text.encode())
 
 
-def shipped_report() -> str:
-    """The published results of 05_control as a Markdown table."""
-    table = RESULTS / "05_control.csv"
-    if not table.exists():  # while they are being made
-        return "Nothing is published yet: `python -m tsmlib run all --scale paper`, then `python -m tsmlib publish`."
-    return report(store.load_table(table))
-
-
 def readme_results() -> str:
     """What README says about results, from the shipped tables alone."""
     control = store.load_table(RESULTS / "05_control.csv")
-    arms, others = (
-        report([row for row in control if row["sim"] == sim and row["metric"] not in ("success", "plan_seconds")])
-        for sim in ("mujoco", "pymunk")
-    )
-    predict = store.load_table(RESULTS / "03_predict.csv")
+    predict, learned = store.load_table(RESULTS / "03_predict.csv"), control
     if (peers := RESULTS / "peers_pets.csv").exists():
         predict += store.load_table(peers)
+    if (free := RESULTS / "model_free.csv").exists():
+        learned = [*control, *store.load_table(free)]
     envs = list(dict.fromkeys(row["env"] for row in predict))
     seeds = {env: len({row["seed"] for row in predict if row["env"] == env}) for env in envs}
     boards = "\n\n".join(
@@ -69,7 +63,7 @@ def readme_results() -> str:
         + scoreboard.board(predict, METRICS, env=env)
         for env in envs
     )
-    n = max(row["n"] for row in predict if row["condition"] == "clean")
+    n = max(row["n"] for row in predict if row["condition"] == "clean" and row["n"] != "")
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
 
 **Prediction.** {n:,} test episodes, open loop with the true torques for 90 steps after ten observed ones; means over
@@ -80,11 +74,16 @@ model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
 
 {boards}
 
-**Planning, MuJoCo.** Training seed {control[0]["seed"]}, frozen targets, T = 50 steps, executed open loop; means over
-targets, returns in metres summed over steps.
+**Planning.** Training seed {control[0]["seed"]}, frozen targets, T = 50 steps, the cross-entropy method through each
+model, executed open loop; means over targets, returns in metres summed over steps.
 
-{arms}
+{report([row for row in control if row["metric"] != "plan_seconds"])}
 
-**Planning, pymunk.**
+**Planning again** every ten steps, pushing:
 
-{others}"""
+{by_loop(control)}
+
+**Policies** learned inside the models, and model-free ones in the environment; returns of the last record, mean over
+copies with half the 95 % t interval.
+
+{policy_report.report(policy_report.learning_curves(learned))}"""

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tsmlib import parameters as schema
+from tsmlib.disk import alive, only_writer
 from tsmlib.parameters import ParameterError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -142,7 +143,6 @@ def execute(
     if "scale" in values:
         values["scale"] = run.scale
     from tsmlib import store  # heavy, and not needed to refuse a parameter
-    from tsmlib.disk import only_writer
     from tsmlib.provenance import provenance
 
     try:
@@ -183,7 +183,7 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
         store.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
     )
     state = entry.get("state") if isinstance(entry, dict) else "damaged"
-    if state == "running" and not _alive(entry):
+    if state == "running" and not alive(entry.get("pid")):
         state = "interrupted: its process is gone"
     if state == "complete" and {"files", "sha256"} & set(entry) and not store.intact(entry):  # older ones have neither
         state = "damaged"
@@ -202,16 +202,6 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
     return entry
 
 
-def _alive(entry: Mapping[str, Any]) -> bool:
-    try:
-        os.kill(int(entry["pid"]), 0)
-    except (KeyError, TypeError, ValueError, OverflowError, ProcessLookupError):
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
 def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
     """Tables and pictures of a run, and when each was written."""
     found = [path for folder in ("metrics", "figures") for path in (run.dir / folder).glob("[!.]*") if path.is_file()]
@@ -224,7 +214,7 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
 
     output = run.dir / notebook.name
     unfinished = output.with_name(f".{notebook.stem}.running.ipynb")
-    failure = None
+    failure, seen = None, ""
     try:
         executed = papermill.execute_notebook(
             _literally(notebook),
@@ -246,9 +236,10 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
     finally:
         if unfinished.exists() and _is_whole(unfinished):
             os.replace(unfinished, output)
+            seen = f"\nSee {output}"
         unfinished.unlink(missing_ok=True)
     if failure:
-        raise RunError(f"{notebook.stem} failed: {failure}\nSee {output}")
+        raise RunError(f"{notebook.stem} failed: {failure}{seen}")
     return output
 
 
