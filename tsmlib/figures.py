@@ -4,7 +4,7 @@ Every function draws in the style of ``tsm.mplstyle`` and returns its ``Figure``
 the last line of a notebook cell it shows once, and ``save`` writes it. Here are the figures of data and of learning;
 those of predictions are in ``tsmlib.predict_figures``, of codes in ``tsmlib.latent_figures``, of plans and policies in
 ``tsmlib.plan_figures`` and ``tsmlib.policy_figures``, of the action prior in ``tsmlib.prior_figures``, the diagrams of
-the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, and colours and labels in ``tsmlib.style``: all
+the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, colours and labels in ``tsmlib.style``: all
 are reached from here.
 
 Letters in shapes: n episodes, T steps, S samples, dx state size, H and W pixels.
