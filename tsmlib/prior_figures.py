@@ -8,6 +8,7 @@ Letters in shapes: B targets, T steps, F frequencies, n codes on a walk.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -66,14 +67,13 @@ def spectra(
     )
     for ax, (title, rows) in zip(grid[0], curves.items(), strict=True):
         for word, (frequency, power) in rows.items():
-            main, line = looks[word]
-            thick = 2.2 if main == "data" else 1.1
+            look = _line(*looks[word])
             ax.plot(finite(f"{title}, {word}", frequency, "F"), finite(f"{title}, {word}", power, "F"),
-                    color=COLOURS[main], ls=line, lw=thick, alpha=0.5 if main == "data" else 1)  # fmt: skip
+                    **look)  # fmt: skip
         ax.set(yscale="log", title=title, xlabel="frequency (Hz)")
     grid[0, 0].set_ylabel("power of the torques (1/Hz)")
     names = dict.fromkeys(word for rows in curves.values() for word in rows)
-    legend(figure, [Line2D([], [], color=COLOURS[looks[w][0]], ls=looks[w][1], label=w) for w in names], columns=4)
+    legend(figure, [Line2D([], [], **_line(*looks[word]), label=word) for word in names], columns=4)
     return figure
 
 
@@ -122,3 +122,9 @@ def cost_of_prior(values: Mapping[str, Mapping[str, np.ndarray]], labels: Mappin
             ax.locator_params(nbins=5)
     grid[0, 0].set_ylabel("return lost by codes (m)")
     return figure
+
+
+def _line(main: str, dashes: str) -> dict[str, Any]:
+    """How a spectrum is drawn: the data broad and pale, behind all others."""
+    broad = main == "data"
+    return {"color": COLOURS[main], "ls": dashes, "lw": 2.2 if broad else 1.1, "alpha": 0.5 if broad else 1.0}
