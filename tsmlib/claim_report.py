@@ -1,4 +1,4 @@
-"""The ledger of claims as tables and a picture: verdicts, why they are what they are, and what the paper leaves open."""
+"""The ledger of claims as tables and a picture: verdicts, what decides them, and what the paper leaves open."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from tsmlib.claims import FAILED, REPLICATED, VERDICTS, Claim, Verdict, figure
+from tsmlib.claims import REPLICATED, VERDICTS, Claim, Verdict, figure
 from tsmlib.runs import ROOT
 from tsmlib.style import WIDTH, legend, styled
 
@@ -29,7 +30,7 @@ def counts(verdicts: Sequence[Verdict]) -> str:
 def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "") -> str:
     """The ledger as a Markdown table, with the check that decides each verdict: the one furthest from holding.
 
-    ours: the same claims with ``claims.OURS`` for TSM. root: path from the reader to the repository, '' or with a slash.
+    ours: the same claims with ``claims.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
     """
     head = "| | the paper says | verdict | with our model | check that decides | estimate [interval] | n | shown in |"
     lines = [head, "|---" * 8 + "|"]
@@ -86,8 +87,8 @@ def choices(verdicts: Sequence[Verdict]) -> str:
 def effects(verdicts: Sequence[Verdict]) -> Figure:
     """Every effect against its margin, a row per claim that has any: the margin is the line, the claimed side tinted.
 
-    Each row has a scale of its own, from its furthest end. Thick is the check that decides, with its estimate and
-    interval in numbers; thin are the others. An open mark has no interval.
+    Each check has a scale of its own, to the furthest end of its interval: the further out the estimate, the surer.
+    Thick is the check that decides, with its estimate and interval in numbers; an open mark has no interval.
     """
     shown = [verdict for verdict in verdicts if any(effect.value is not None for effect in verdict.effects[""])]
     if not shown:
@@ -98,12 +99,13 @@ def effects(verdicts: Sequence[Verdict]) -> Figure:
     for y, verdict in enumerate(shown):
         colour, key = COLOURS[verdict.word], verdict.key
         found = [effect for effect in verdict.effects[""] if effect.value is not None]
-        scale = np.nanmax(np.abs([effect.beyond for effect in found])) or 1.0
         for i, effect in enumerate(sorted(found, key=lambda effect: effect is key)):
-            (value, low, high), main = np.array(effect.beyond) / scale, effect is key
+            (value, low, high), main = effect.beyond / (np.nanmax(np.abs(effect.beyond)) or 1.0), effect is key
             at = y + (0 if main or len(found) == 1 else 0.5 * (i / (len(found) - 1) - 0.5))
             alone = effect.low is None
-            look = dict(color=colour, lw=1.3 if main else 0.5, alpha=1 if main else 0.55, zorder=4 if main else 3)
+            look: dict[str, Any] = dict(
+                color=colour, lw=1.3 if main else 0.5, alpha=1 if main else 0.55, zorder=4 if main else 3
+            )
             ax.plot([low, high], [at, at], **look)
             ax.plot(value, at, "o", ms=3.4 if main else 1.8, mfc="white" if alone else colour, mew=0.7, **look)
         text = figure(key) if key.value is not None else "rows are missing"

@@ -56,7 +56,7 @@ PAPERS, OURS = "tsm", "tsm+energy+direct"
 
 Row = Mapping[str, Any]
 Words = Mapping[str, Mapping[str, Any]]
-Query = dict[str, Any]  # column -> value; file, and whether trials are asked for, beside them
+Query = dict[str, Any]  # column -> value, file, and whether a row per trial is asked for
 
 
 class ClaimError(ValueError):
@@ -99,12 +99,10 @@ class Effect:
     why: str = ""
 
     @property
-    def beyond(self) -> tuple[float, float, float]:
-        """How far estimate and both ends of the interval lie beyond the margin; negative on the wrong side."""
-        ends = (self.value, self.low, self.high)
-        side = -1 if self.check.op[0] == "<" else 1
-        value, low, high = (np.nan if end is None else side * (end - self.check.margin) for end in ends)
-        return value, min(low, high), max(low, high)
+    def beyond(self) -> np.ndarray:
+        """How far estimate and ends of the interval (3,) lie beyond the margin: negative on the wrong side, or NaN."""
+        ends = np.array([np.nan if end is None else end for end in (self.value, self.low, self.high)])
+        return (ends - self.check.margin) * (-1 if self.check.op[0] == "<" else 1)
 
     @property
     def right_side(self) -> bool:
@@ -225,38 +223,41 @@ def _checks(line: str, base: Query, words: Words) -> Iterator[Check]:
         op, queries = names[type(kind)], _queries(left, base, words) | _queries(right, base, words)
         if not _queries(left, base, words):
             left, right, op = right, left, op.translate(str.maketrans("<>", "><"))
-        text = f"{ast.unparse(left)} {op} {ast.unparse(right)}"
-        places = ", ".join(dict.fromkeys(filter(None, map(_place, queries.values()))))
-        expression, margin = ast.unparse(left), 0.0
+        margin = 0.0
         if _queries(right, base, words):
-            expression = f"{expression} - ({ast.unparse(right)})"
+            left = ast.BinOp(left, ast.Sub(), right)
         else:
             margin = float(_number(right, {}))
-        level = 0.95 if len(tree.ops) == 1 else 0.90
-        yield Check(f"{text} ({places})" if places else text, expression, op, margin, level, queries)
+        expression, level = ast.unparse(left), 0.95 if len(tree.ops) == 1 else 0.90
+        with np.errstate(all="ignore"):  # what nobody can evaluate is found now
+            _number(left, {term: np.ones(2) if query["trials"] else 1.0 for term, query in queries.items()})
+        places = ", ".join(dict.fromkeys(filter(None, map(_place, queries.values()))))
+        text = f"{expression} {op} {margin:g}" + f" ({places})" * bool(places)
+        yield Check(text, expression, op, margin, level, queries)
 
 
 def _queries(node: ast.AST, base: Query, words: Words, trials: bool = False) -> dict[str, Query]:
     """The query of every term below ``node``, by its text."""
-    if isinstance(node, ast.Call):
-        trials = trials or ast.unparse(node.func) in OVER_TRIALS
-        below = list(node.args)
-    elif not _is_term(node):
-        below = list(ast.iter_child_nodes(node))
-    else:
-        term, query = ast.unparse(node), {}
-        while not isinstance(node, ast.Name):  # from the right, so what is known already stays
-            if isinstance(node, ast.Attribute):
-                query = {"metric": node.attr} | query
-            elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
-                query = {"horizon": node.slice.value} | query
-            else:
-                query = _columns(ast.unparse(node.slice), words) | query
-            node = node.value
+    if _is_term(node):
+        term, query = ast.unparse(node), Query()
+        while not isinstance(node, ast.Name):  # from the right: what stands there already stays
+            match node:
+                case ast.Attribute(value=inner, attr=metric):
+                    columns: Query = {"metric": metric}
+                case ast.Subscript(value=inner, slice=ast.Constant(value=steps)):
+                    columns = {"horizon": steps}
+                case ast.Subscript(value=inner, slice=place):
+                    columns = _columns(ast.unparse(place), words)
+                case _:
+                    raise ValueError(f"{term!r} is no query; write word[place].metric[horizon]")
+            node, query = inner, columns | query
         query = base | _columns(node.id, words) | query | {"trials": trials}
         if not {"metric", "file"} <= set(query):
             raise ValueError(f"{term!r} names no metric or no file")
         return {term: query}
+    below: list[Any] = list(ast.iter_child_nodes(node))
+    if isinstance(node, ast.Call):
+        trials, below = trials or ast.unparse(node.func) in OVER_TRIALS, list(node.args)
     found: dict[str, Query] = {}
     for child in below:
         for term, query in _queries(child, base, words, trials).items():
@@ -312,6 +313,7 @@ class Tables:
     """Rows of metrics tables, by file, metric and model."""
 
     def __init__(self, rows: Mapping[str, Sequence[Row]]) -> None:
+        self.rows = rows
         self.answers: dict[str, dict[int, dict[tuple[Any, ...], float]]] = {}
         self.found: dict[tuple[str, Any, Any], list[Row]] = {}
         for file, table in rows.items():
@@ -324,6 +326,13 @@ class Tables:
         if name not in self.answers:
             self.answers[name] = self._ask(query)
         return self.answers[name]
+
+    def relabelled(self, models: Mapping[str, str]) -> Tables:
+        """The same rows with other models' names on them: a check of the checker."""
+        return Tables({
+            file: [{**row, "model": models.get(row["model"], row["model"])} for row in table]
+            for file, table in self.rows.items()
+        })  # fmt: skip
 
     def _ask(self, query: Query) -> dict[int, dict[tuple[Any, ...], float]]:
         wanted = {column: value for column, value in query.items() if column not in ("file", "trials")}
@@ -390,16 +399,21 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     first, key = states.pop(""), min(effects[""], key=_ease)
     holds = [reading for reading, found in states.items() if found == "holds"]
     turned = [reading for reading in states if not all(effect.right_side for effect in effects[reading])]
+    measured = f"{key.check.text}: it is {figure(key)}."
+    failing = sum(effect.state == "fails" for effect in effects[""])
     word, why = {
         "holds": (REPLICATED, ""),
-        "fails": (FAILED, f"{key.check.text}: it is {figure(key)}."),
-        "open": (INCONCLUSIVE, f"{key.check.text}: it is {figure(key)}."),
+        "fails": (FAILED, f"{measured} {failing} of {len(effects[''])} checks fail."),
+        "open": (
+            INCONCLUSIVE,
+            f"{measured} {'The interval holds the margin.' if key.low is not None else 'One seed has no interval.'}",
+        ),
         "missing": (UNTESTABLE, key.why),
     }[first]
     if first == "holds" and turned:
-        word, why = DEPENDENT, f"It holds as the paper words it, but turns with {'; '.join(turned)}."
+        word, why = DEPENDENT, f"It holds as the paper words it. It turns with: {'; '.join(turned)}."
     elif first in ("fails", "open") and holds:
-        word, why = DEPENDENT, f"It holds with {'; '.join(holds)}. As the paper words it: {why}"
+        word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. As the paper words it, {why}"
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
 
 
@@ -415,7 +429,9 @@ STATES = ("fails", "missing", "open", "holds")
 def _ease(effect: Effect) -> tuple[int, float]:
     """Sorts checks by how far they are from holding, the furthest first."""
     value, low, high = effect.beyond
-    return STATES.index(effect.state), 0.0 if np.isnan(low) else value / (high - low + 1e-300)
+    if np.isnan(low):  # of what has no interval the side alone is known
+        return STATES.index(effect.state), -1.0 if value < 0 else 0.0
+    return STATES.index(effect.state), float(value / (abs(high - low) + 1e-300))
 
 
 def _effect(claim: Claim, check: Check, rows: Tables) -> Effect:
@@ -488,7 +504,7 @@ EXTRA = ("claim", "reading", "check", "low", "high", "margin", "level", "state",
 
 
 def as_rows(verdicts: Sequence[Verdict], **common: Any) -> list[dict[str, Any]]:
-    """Rows of metrics/08_claims.csv, one per check and reading. common: model, scale."""
+    """Rows of metrics/08_claims.csv, one per effect, and at least one per claim. common: model, scale."""
     return [
         dict(
             common, metric="effect", claim=v.claim.id, reading=reading, check=e.check.text, margin=e.check.margin,
@@ -496,6 +512,7 @@ def as_rows(verdicts: Sequence[Verdict], **common: Any) -> list[dict[str, Any]]:
             verdict=v.word, sha256=v.claim.sha256,
         )
         for v in verdicts for reading, effects in v.effects.items() for e in effects
+        if e.value is not None or e is v.key
     ]  # fmt: skip
 
 
