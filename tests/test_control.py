@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import control, report, rewards, runs, study
+from tsmlib import control, rewards, study
 from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, execute, random_torques, replan, zero_torques
@@ -188,20 +188,6 @@ def test_the_gap_is_predicted_minus_true() -> None:
         _ = plain.gap
 
 
-def test_a_table_holds_what_the_trials_measured() -> None:
-    task = some_task()
-    trial = execute(task, zero_torques(task))
-    run = runs.resolve("05_control", scale="smoke", seed=2, run_dir="/nowhere")
-    summary, per_target = report.tables([task], {REACHER: {"zero": trial}}, run)
-    found = {row["metric"]: row for row in summary}
-    assert found["return_true"]["value"] == pytest.approx(float(trial.true.mean()))
-    near = trial.final_distance <= control.TOLERANCE
-    assert found["success"]["value"] == pytest.approx(float(near.float().mean()))
-    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
-    returns = [row["value"] for row in per_target if row["metric"] == "return_true"]
-    np.testing.assert_allclose(returns, trial.true, rtol=1e-6)
-
-
 # Closed loop ---------------------------------------------------------------------------------------------------------
 
 as_it_is = partial(adam, iterations=0)  # the planner that leaves a plan as it is
@@ -343,26 +329,9 @@ def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
         study.task(REACHER, "validation").take(n)
 
 
-def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> None:
-    task = some_task()
-    nothing, random = (execute(task, torques(task)) for torques in (zero_torques, random_torques))
-    oracle = dataclasses.replace(nothing, true=nothing.true / 2)
-    among = {"zero": nothing, "oracle codes cem": oracle, "random": random}
-    assert report.means(oracle, among)["cost_over_oracle"][0] == pytest.approx(1)
-    assert report.means(oracle, among)["gain_share"][0] == pytest.approx(1)
-    assert report.means(nothing, among)["cost_over_oracle"][0] == pytest.approx(2)
-    assert report.means(nothing, among)["gain_share"][0] == pytest.approx(0)
-
-
 def test_pushing_without_an_object_is_refused() -> None:
     with pytest.raises(ValueError, match=f"there is nothing to push in {REACHER}"):
         dataclasses.replace(some_task(), name="push")
-
-
-def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
-    task = some_task()
-    with pytest.raises(ValueError, match="not planned"):
-        report.strip(task, execute(task, zero_torques(task)), 0)
 
 
 def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

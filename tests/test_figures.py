@@ -39,6 +39,11 @@ def curve() -> dict[str, np.ndarray]:
     return {"seconds": steps, "train": np.exp(-steps), "validation": 1.1 * np.exp(-steps)}
 
 
+def steps() -> dict[str, dict[str, np.ndarray]]:
+    at = np.array([0.0, 5.0, 20.0])
+    return {"tsm codes cem": {"iterations": at, "true": -5 + at / 20, "predicted": -5 + at / 10}}
+
+
 def draw(ax: plt.Axes, state: np.ndarray, target: np.ndarray) -> None:
     ax.plot([0, state[4]], [0, state[5]])
     ax.plot(*target, "o")
@@ -58,6 +63,9 @@ EVERY = {
     "rollouts": lambda: figures.rollouts(noise(15, 6), noise(4, 15, 6), NAMES, UNITS),
     "plan_strip": lambda: figures.plan_strip(draw, noise(10, 6), noise(10, 6), np.zeros(2), [0, 4, 9]),
     "plan_actions": lambda: figures.plan_actions(noise(20, 2), noise(20, 2), noise(20, 2), 0.02),
+    "along_the_way": lambda: figures.along_the_way(steps()),
+    "final_distances": lambda: figures.final_distances({"push": {"tsm codes cem": {"open": np.abs(noise(9))}}}, 0.03),
+    "plan_paths": lambda: figures.plan_paths(noise(2, 9, 2), noise(2, 10, 2), wanted=noise(5, 2), zone=(0.1, 0, 0.05)),
     "ll_against_horizon": lambda: figures.ll_against_horizon({"tsm": noise(30), "tsm free": noise(30)}),
 }
 
@@ -70,7 +78,11 @@ def test_every_figure_is_returned_and_none_is_left_open(name: str) -> None:
 
 def test_every_figure_function_is_tested() -> None:
     drawn = {name: value for name, value in vars(figures).items() if getattr(value, "__wrapped__", None)}
-    elsewhere = {name for name, value in drawn.items() if value.__module__[7:] in ("predict_figures", "gallery")}
+    elsewhere = {
+        name
+        for name, value in drawn.items()
+        if value.__module__[7:] in ("predict_figures", "policy_figures", "gallery")
+    }
     assert set(drawn) - elsewhere == set(EVERY)  # those have their own test file
 
 
@@ -98,6 +110,20 @@ def test_figure6_shows_means_of_cost_and_gap_and_the_better_oracle() -> None:
     assert points == {round(-rows[label]["true"].mean(), 6) for label in rows if label.split()[0] in ("tsm", "onestep")}
     assert [float(bar.lines[0].get_xdata()[0]) for bar in gap.containers] == pytest.approx([0.1, 1.5, 3.5])
     assert float(cost.lines[0].get_xdata()[0]) == -rows["oracle codes cem"]["true"].mean()
+
+
+def test_the_gap_along_the_way_is_the_last_one() -> None:
+    (ax,) = figures.along_the_way(steps()).axes
+    assert [text.get_text() for text in ax.texts] == ["gap +1.00"]
+    np.testing.assert_array_equal(ax.lines[1].get_ydata(), [-5, -4.75, -4])
+
+
+def test_a_share_of_targets_reached_is_a_count() -> None:
+    (ax,) = figures.final_distances({"push": {"tsm": {"closed": np.array([0.02, 0.01, 0.2, 0.04])}}}, 0.03).axes
+    line = ax.lines[0]
+    np.testing.assert_allclose(line.get_xdata(), [0, 10, 20, 40, 200])
+    np.testing.assert_allclose(line.get_ydata(), [0, 25, 50, 75, 100])
+    assert ax.lines[1].get_xdata()[0] == 30
 
 
 def test_the_interval_of_five_values_is_the_one_in_the_tables() -> None:
@@ -128,6 +154,11 @@ def test_a_rollout_is_drawn_over_the_truth() -> None:
         (lambda: figures.figure6({"reach": {"tsm": {"true": np.array([1, np.nan])}}}), "reach, tsm: 1 of 2 true"),
         (lambda: figures.figure6({}), "nothing to draw"),
         (lambda: figures.predicted_vs_true({"reach": {"zero": {"true": noise(3)}}}), "no label has predicted"),
+        (lambda: figures.along_the_way({}), "nothing to draw"),
+        (lambda: figures.along_the_way({"tsm": {**steps()["tsm codes cem"], "true": noise(2)}}), r"expected \(3\)"),
+        (lambda: figures.final_distances({}, 0.03), "nothing to draw"),
+        (lambda: figures.final_distances({"push": {"tsm": {"shut": noise(3)}}}, 0.03), "'shut', expected open or"),
+        (lambda: figures.plan_paths(noise(2, 9, 2), noise(3, 9, 2)), "dreamt holds 2 paths and done 3"),
         (lambda: figures.loss_curves({"tsm": {"train": noise(3)}}), "expected 'seconds' or 'step'"),
         (lambda: figures.plan_strip(draw, noise(9, 6), noise(9, 6), np.zeros(2), [9]), "between 0 and 8"),
         (lambda: figures.video(noise(2, 4, 4, 3), "a.mp4"), "expected uint8"),

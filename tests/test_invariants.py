@@ -10,7 +10,7 @@ import torch
 from tsmlib.collect import smooth_torques
 from tsmlib.envs import closest_gap
 from tsmlib.envs.base import fingertip
-from tsmlib.invariants import broken, novelty, rates, roughness
+from tsmlib.invariants import broken, novelty, roughness, shares, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
 
@@ -35,8 +35,8 @@ def test_the_true_world_breaks_nearly_none(env_id: str, rms: float) -> None:
     states = world(env_id, rms=rms)
     found = broken(states, env_id)
     assert (closest_gap(states, env_id) < 1e-3).any(1).mean() > 0.2  # objects are met
-    assert found["either"].shape == (200, 50)
-    assert found["either"].mean() < 1e-3
+    assert found["broken"].shape == (200, 50)
+    assert found["broken"].mean() < 1e-3
     step = np.linalg.norm(np.diff(states[..., 6:8], axis=1), axis=-1)
     sliding = (step > 0.005) & (closest_gap(states, env_id)[:, 1:] > 0.005)
     assert sliding.mean() > 5e-3  # the paper's wording alone would blame the world
@@ -65,7 +65,7 @@ def test_a_pushed_object_may_slide_as_far_as_its_speed_carries_it() -> None:
     sliding = still(2, block=(0.0, 0.1))
     sliding[:, :, 7] += speed * decay * (1 - np.exp(-seconds / decay)) * 0.6
     sliding[:, :, 9] = 0.6 * speed * np.exp(-seconds / decay)
-    assert not broken(sliding, PUSH)["either"].any()
+    assert not broken(sliding, PUSH)["broken"].any()
     sliding[1, 30:, 7] += 0.02  # and then a little more
     assert broken(sliding, PUSH)["moves_untouched"].sum(1).tolist() == [0, 21]
 
@@ -89,7 +89,7 @@ def test_an_arm_that_passes_through_is_found() -> None:
     assert inside.sum() > 5
     np.testing.assert_array_equal(found["penetrates"][1], inside)
     assert not found["moves_untouched"].any()
-    assert not found["either"][0].any()
+    assert not found["broken"][0].any()
 
 
 def test_a_fast_arm_may_hit_the_object_between_two_states() -> None:
@@ -111,18 +111,23 @@ def test_every_made_up_violation_is_found() -> None:
     assert found[alone][:, 24:].mean() > 0.999
 
 
-def test_rates_are_shares_of_steps_over_all_and_over_the_worst_plans() -> None:
+def test_shares_are_of_the_steps_of_each_plan() -> None:
     dreams = still(20)
     dreams[3, 26:, 6] += 0.1  # 25 of its 50 steps
     dreams[7, :, 0], dreams[7, 0, 0] = np.pi / 2, 0.0  # the arm lies inside the object, but for the start
+    found = shares(dreams[:, 0], np.stack([dreams[:, 1:], still(20)[:, 1:]]), PUSH)  # every other dream is sound
+    expected = np.zeros((2, 20))
+    expected[0, 3], expected[1, 7] = 0.25, 0.5
+    np.testing.assert_allclose(found["moves_untouched"], expected[0])
+    np.testing.assert_allclose(found["penetrates"], expected[1])
+    np.testing.assert_allclose(found["broken"], expected.sum(0))
+
+
+def test_the_worst_tenth_is_what_was_promised_most_in_excess() -> None:
     error = np.zeros(20)
-    error[[3, 5]] = 2.0, 1.0  # the worst tenth
-    found = rates(dreams[:, 0], np.stack([dreams[:, 1:]] * 2), PUSH, error)
-    assert found["moves_untouched"] == pytest.approx(25 / 1000)
-    assert found["penetrates"] == pytest.approx(50 / 1000)
-    assert found["either"] == pytest.approx(75 / 1000)
-    assert found["moves_untouched_worst"] == pytest.approx(25 / 100)
-    assert found["penetrates_worst"] == 0
+    error[[3, 5, 9]] = 2.0, 1.0, -7.0  # promised less than came true: no exploitation
+    assert sorted(worst(error)) == [3, 5]
+    assert worst(error[:3]).tolist() == [0]  # at least one
 
 
 def test_states_without_an_object_or_a_number_are_refused() -> None:

@@ -122,7 +122,7 @@ def test_values_take_the_type_of_the_default(place: Path) -> None:
 
 def test_the_schema_knows_every_environment_model_and_parameter() -> None:
     assert set(parameters.ENVS) == set(ENV_IDS)
-    assert set(study.MODELS) <= set(parameters.MODELS)
+    assert set(study.MODELS) == set(parameters.MODELS)
     for notebook in runs.notebooks().values():
         assert set(parameters.declared(notebook)) <= set(parameters.SCHEMA), notebook.name
         for name, default in parameters.declared(notebook).items():

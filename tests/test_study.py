@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,10 +137,11 @@ def some_task(n: int = 2) -> control.Task:
     return study.task(REACHER, "validation").take(n)
 
 
-@pytest.mark.parametrize("planner", ["adam", "adam+starts", "cem"])
+@pytest.mark.parametrize("every", [0, 20])
+@pytest.mark.parametrize("planner", ["adam", "adam+starts", "cem", "mppi"])
 @pytest.mark.parametrize("prior", ["codes", "actions"])
-def test_every_method_plans_and_executes(made: Run, planner: str, prior: str) -> None:
-    trial = study.trial(made, some_task(), "tsm", planner, prior)
+def test_every_method_plans_and_executes(made: Run, planner: str, prior: str, every: int) -> None:
+    trial = study.trial(made, some_task(), "tsm", planner, prior, every=every)
     assert trial.plan is not None
     assert trial.actions.shape == (2, 50, 2)
     torch.testing.assert_close(trial.gap, trial.plan.predicted - trial.true)
@@ -160,6 +162,69 @@ def test_a_plan_is_kept_for_its_task_and_models_alone(made: Run, monkeypatch: py
             study.plan(made, some_task(3), "tsm", "cem", "codes")  # other targets
         with pytest.raises(AssertionError):
             study.plan(made, some_task(), "tsm", "cem", "codes", iterations=1)  # another budget
+        patch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
+        with pytest.raises(AssertionError):
+            study.plan(made, some_task(), "tsm", "cem", "codes")  # another planner by the same name
+
+
+def test_a_kept_plan_is_the_one_that_was_made(made: Run) -> None:
+    first, again = (study.plan(made, some_task(), "tsm", "mppi", "actions", iterations=3) for _ in range(2))
+    assert first.trace is not None
+    assert again.trace is not None
+    for name in ("actions", "parameters", "states", "predicted", "curve", "trace"):
+        assert torch.equal(getattr(first, name), getattr(again, name)), name
+
+
+def test_a_task_with_a_reward_of_its_own_is_planned_for_each_time(made: Run) -> None:
+    plain = study.plan(made, some_task(), "tsm", "cem", "codes")
+    before = {path: path.stat().st_mtime_ns for path in (made.dir / "plans").iterdir()}
+    for height in (0.1, -0.1):
+        own = some_task().with_reward("reach", lambda states, actions, h=height: -(states[..., 5] - h).abs())
+        plan = study.plan(made, own, "tsm", "cem", "codes")
+        assert not torch.equal(plan.predicted, plain.predicted)
+        torch.testing.assert_close(study.trial(made, own, "tsm", "cem", "codes").actions, plan.actions)
+    assert {path: path.stat().st_mtime_ns for path in (made.dir / "plans").iterdir()} == before
+
+
+def test_a_closed_loop_begins_with_the_open_plan_and_is_kept(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = study.plan(made, some_task(), "tsm", "cem", "codes")
+    first = study.trial(made, some_task(), "tsm", "cem", "codes", every=20)
+    assert torch.equal(first.actions[:, :20], before.actions[:, :20])
+    assert not torch.equal(first.actions[:, 20:], before.actions[:, 20:])
+    assert first.plan is not None
+    assert first.plan.curve.shape == (3, 2)  # one promise for each plan
+    monkeypatch.setattr(study.plans, "_closed_loop", no_training)
+    again = study.trial(made, some_task(), "tsm", "cem", "codes", every=20)
+    assert torch.equal(again.states, first.states)
+    with pytest.raises(AssertionError):
+        study.trial(made, some_task(), "tsm", "cem", "codes", every=10)
+
+
+def test_along_the_way_an_optimisation_only_promises_more(made: Run) -> None:
+    found = study.along_the_way(made, some_task(), "tsm", "adam", "actions", iterations=6, at=[0, 3, 6])
+    whole = study.plan(made, some_task(), "tsm", "adam", "actions", iterations=6)
+    assert (found[0].actions == 0).all()
+    assert torch.equal(found[6].actions, whole.actions)
+    for trial in found.values():
+        assert trial.plan is not None
+    assert not torch.equal(found[0].actions, found[3].actions)
+
+
+def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = runs.resolve("05_control", scale="laptop", run_dir=str(tmp_path / "runs"))
+    monkeypatch.setattr(study.plans, "RESULTS", tmp_path)
+    monkeypatch.setattr(study.plans, "_budget", lambda *_: (4, 1))
+    monkeypatch.setattr(study.plans, "_planner", lambda *_: partial(cem, candidates=4, elites=2, iterations=1))
+    made = study.plan(asked, some_task(3), "oracle", "cem", "actions")
+    (own,) = (asked.dir / "plans").iterdir()
+    own.rename(tmp_path / own.name)
+    monkeypatch.setattr(study.plans, "_search", no_training)
+    assert torch.equal(study.plan(asked, some_task(), "oracle", "cem", "actions").actions, made.actions[:2])
+    monkeypatch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
+    with pytest.raises(AssertionError):
+        study.plan(asked, some_task(), "oracle", "cem", "actions")
 
 
 def test_what_is_promised_is_not_what_the_planner_searched_with(made: Run) -> None:
@@ -174,7 +239,7 @@ def test_an_unknown_method_is_refused_before_anything_is_trained(
     tmp_path: Path, bad: tuple[str, str, str, int]
 ) -> None:
     *method, iterations = bad
-    with pytest.raises(ValueError, match="expected adam, adam\\+starts or cem, codes or actions, and 0"):
+    with pytest.raises(ValueError, match="expected adam, adam\\+starts, cem or mppi, codes or actions, and 0"):
         study.plan(new_run(tmp_path), some_task(), *method, iterations=iterations)
     assert not any(tmp_path.iterdir())
 

@@ -96,10 +96,6 @@ def test_an_episode_restored_or_replayed_goes_on_with_the_same_bits() -> None:
     quick(simulators.restores)
 
 
-def test_a_run_that_was_killed_is_never_called_complete() -> None:
-    quick(pipelines.killed_runs)
-
-
 def test_another_place_time_zone_locale_or_hash_seed_changes_no_bit() -> None:
     quick(pipelines.elsewhere)
 

@@ -161,7 +161,9 @@ def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, An
             warnings.warn(f"{' '.join(refused)} Going on from the generation before: {path}", stacklevel=2)
         return path, tensors, header
     if refused:
-        raise StoreError(f"no generation in {folder} can be used. {' '.join(refused)} Delete it to start anew.")
+        raise StoreError(
+            f"no generation in {folder} can be used. {' '.join(refused)} Delete that folder to start anew."
+        )
     return None
 
 

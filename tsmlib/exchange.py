@@ -62,7 +62,9 @@ def load_minari(
         raise StoreError(f"{file} is not a whole HDF5 file: {error!r:.200}. Ask for it again.") from error
     if len({states.shape for states, _ in episodes}) > 1 or len({actions.shape for _, actions in episodes}) > 1:
         lengths = sorted({len(actions) for _, actions in episodes})
-        raise StoreError(f"{file} holds episodes of {lengths[0]} to {lengths[-1]} steps; expected equally long ones.")
+        raise StoreError(
+            f"{file} holds episodes of {lengths[0]} to {lengths[-1]} steps; expected equally long ones. Cut them."
+        )
     try:
         return Trajectories(
             np.stack([states for states, _ in episodes]), np.stack([actions for _, actions in episodes]),

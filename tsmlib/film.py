@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tsmlib.style import replacing
+from tsmlib.disk import write_bytes
 
 if TYPE_CHECKING:
     from IPython.display import Video
@@ -45,15 +46,24 @@ def side_by_side(left: np.ndarray, right: np.ndarray, labels: tuple[str, str]) -
 def video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
     """Write ``frames`` (T, H, W, 3) uint8 as an mp4 that browsers play; odd sizes get one repeated row or column."""
     import imageio.v2 as imageio  # an mp4 is no figure: only who writes one needs it
+    from imageio_ffmpeg import count_frames_and_secs
 
     frames, path = _frames("frames", frames), Path(path)
     if path.suffix != ".mp4":
         raise ValueError(f"video file {path} must end in .mp4")
     even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")
     options = ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart"]  # one thread: the same bytes again
-    with replacing(path) as partial:
-        imageio.mimwrite(partial, list(even), fps=fps, codec="libx264", quality=7, macro_block_size=1,
-                         pixelformat="yuv420p", output_params=options)  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "film.mp4"
+        try:
+            imageio.mimwrite(made, list(even), fps=fps, codec="libx264", quality=7, macro_block_size=1,
+                             pixelformat="yuv420p", output_params=options)  # fmt: skip
+            if count_frames_and_secs(str(made))[0] != len(even):  # ffmpeg says nothing of a full disk
+                raise OSError("frames are missing")
+        except (OSError, RuntimeError) as error:
+            reason = str(error).partition("\n")[0]
+            raise OSError(f"ffmpeg could not make {path}: {reason}. Make room in {tempfile.gettempdir()}.") from error
+        write_bytes(path, made.read_bytes())
     return path
 
 

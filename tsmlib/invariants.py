@@ -23,7 +23,7 @@ def broken(states: np.ndarray, env: str) -> dict[str, np.ndarray]:
 
     ``moves_untouched``: since some earlier state arm and walls have kept 5 mm away from the object, and yet the
     object is more than 5 mm further from where it was then than its speed at that time can carry it.
-    ``penetrates``: the arm is more than 5 mm inside the object. ``either``: one or both.
+    ``penetrates``: the arm is more than 5 mm inside the object. ``broken``: one or both.
 
     An object that was pushed slides on: "moves by 5 mm in a step while the arm is away" is also true of the real
     world, in 3 % of the steps of random torques, and therefore no invariant.
@@ -44,20 +44,22 @@ def broken(states: np.ndarray, env: str) -> dict[str, np.ndarray]:
         moved = np.linalg.norm(position[..., since + 1 :, :] - position[..., since, None, :], axis=-1)
         untouched[..., since:] |= alone & (moved > slides + NEAR)
     penetrates = closest_gap(states[..., 1:, :], env) < -NEAR
-    return {"moves_untouched": untouched, "penetrates": penetrates, "either": untouched | penetrates}
+    return {"moves_untouched": untouched, "penetrates": penetrates, "broken": untouched | penetrates}
 
 
-def rates(start: np.ndarray, states: np.ndarray, env: str, error: np.ndarray) -> dict[str, float]:
-    """Share of steps that break each invariant (claims C30, C31): over all plans, and ``_worst`` over the worst tenth.
+def shares(start: np.ndarray, states: np.ndarray, env: str) -> dict[str, np.ndarray]:
+    """Share of predicted steps that break each invariant (claims C30, C31), for each plan: (B,) each.
 
-    start (B, dx); states (S, B, T, dx) that a model predicted for the plans; error (B,): predicted minus true return,
-    of which the largest tenth, at least one plan, is the worst (claim C34).
+    start (B, dx); states (S, B, T, dx) that a model predicted for the plans.
     """
     first = np.broadcast_to(np.asarray(start)[:, None], (*states.shape[:2], 1, states.shape[-1]))
     found = broken(np.concatenate([first, states], axis=-2), env)
-    worst = np.argsort(-np.asarray(error), kind="stable")[: -(-len(error) // 10)]
-    shares = {name: float(steps.mean()) for name, steps in found.items()}
-    return shares | {f"{name}_worst": float(steps[:, worst].mean()) for name, steps in found.items()}
+    return {name: steps.mean((0, 2)) for name, steps in found.items()}
+
+
+def worst(error: np.ndarray) -> np.ndarray:
+    """The tenth of plans, at least one, with the largest error (B,): predicted minus true return (claim C34)."""
+    return np.argsort(-np.asarray(error), kind="stable")[: -(-len(error) // 10)]
 
 
 def _gap_during_steps(states: np.ndarray, env: str) -> np.ndarray:

@@ -7,12 +7,14 @@ Letters in shapes: n targets, T steps, dx state size.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
 
 from tsmlib.style import (
     COLOURS,
@@ -23,6 +25,7 @@ from tsmlib.style import (
     joint_legend,
     legend,
     name,
+    panels,
     pretty,
     shaped,
     styled,
@@ -174,6 +177,103 @@ def predicted_vs_true(results: Results) -> Figure:
             ax.set_xlabel("true return" if i + columns >= len(rows) else "")
             ax.set_ylabel("" if i % columns else f"{task.capitalize()}: predicted return")
         first += heights[task]
+    return figure
+
+
+@styled
+def along_the_way(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """What more optimisation is worth: what the model promises and what the arm earns, against iterations.
+
+    curves: label -> {"iterations": (I,), "true": (I,), "predicted": (I,)}, mean returns of the plan so far, executed
+    open loop. One panel per label; where the shaded gap grows, the planner exploits the model.
+    """
+    if not curves:
+        raise ValueError("curves hold no label: nothing to draw")
+    figure, axes = panels(len(curves), 4, 1.45, sharey=True)
+    for ax, (label, curve) in zip(axes, curves.items(), strict=True):
+        at = shaped(f"{label}: iterations", curve["iterations"], "I")
+        true, predicted = (shaped(f"{label}: {word}", curve[word], str(len(at))) for word in ("true", "predicted"))
+        main = colour(label)
+        ax.fill_between(at, true, predicted, color=tint(main, 0.25), lw=0)
+        ax.plot(at, predicted, color=main, lw=0.9, ls=(0, (3, 1.5)))
+        ax.plot(at, true, color=main, lw=1.3, marker="o", ms=2.5)
+        model, rest = words(label)
+        ax.set_title(f"{NAMES.get(model, model)}\n{', '.join(pretty(rest))}", fontsize=7)
+        ax.annotate(f"gap {predicted[-1] - true[-1]:+.2f}", (0.96, 0.06), xycoords="axes fraction", ha="right",
+                    fontsize=6.5)  # fmt: skip
+        ax.set_xlabel("iterations")
+        ax.locator_params(nbins=4)
+    for ax in axes[:: min(4, len(axes))]:
+        ax.set_ylabel("return (m)")
+    dark = COLOURS["data"]
+    legend(figure, [Line2D([], [], color=dark, lw=0.9, ls=(0, (3, 1.5)), label="promised by the model"),
+                    Line2D([], [], color=dark, lw=1.3, marker="o", ms=2.5, label="earned by the arm")])  # fmt: skip
+    return figure
+
+
+@styled
+def final_distances(distances: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]], tolerance: float) -> Figure:
+    """How near trials end, as the share of targets within a distance: solid in closed loop, dashed open loop.
+
+    distances: task -> label -> {"open" or "closed": (n,)} in m. tolerance: what counts as a success, m.
+    """
+    if not any(distances.values()):
+        raise ValueError("distances hold no task with a label: nothing to draw")
+    figure, axes = panels(len(distances), 2, 2.2)
+    looks: dict[str, dict[str, Any]] = {"open": {"ls": (0, (2, 1.2)), "lw": 0.8}, "closed": {"ls": "-", "lw": 1.3}}
+    labels: dict[str, None] = {}
+    for ax, (task, rows) in zip(axes, distances.items(), strict=True):
+        for label, ways in rows.items():
+            labels.setdefault(label)
+            for way, values in ways.items():
+                if way not in looks:
+                    raise ValueError(f"{task}, {label} has '{way}', expected open or closed")
+                end = np.sort(shaped(f"{task}, {label}, {way}", values, "n"))
+                share = np.arange(len(end) + 1) / len(end)
+                ax.step(1000 * np.append(0, end), 100 * share, where="post", color=colour(label), **looks[way])
+        ax.axvline(1000 * tolerance, color="#999999", lw=0.6, zorder=1)
+        ax.set(title=task.capitalize(), xlabel="final distance (mm)", xlim=(0, 250), ylim=(0, 102))
+    axes[0].set_ylabel("targets reached (%)")
+    handles = [Line2D([], [], color=colour(label), label=name(label)) for label in labels]
+    handles += [Line2D([], [], color=COLOURS["data"], **looks[way], label=f"{way} loop") for way in looks]
+    legend(figure, handles, columns=4)
+    return figure
+
+
+@styled
+def plan_paths(
+    dreamt: np.ndarray, done: np.ndarray, *, wanted: np.ndarray | None = None,
+    zone: tuple[float, float, float] | None = None, reach: float | None = None, label: str = "tsm",
+) -> Figure:  # fmt: skip
+    """Paths in the plane, one panel per episode: what the model dreamt and what the arm did, (n, T, 2) each, in m.
+
+    wanted (k, 2) or (n, k, 2): the line to follow, or one point to end at. zone: x, y and radius of a disc to keep away
+    from. reach: radius of the circle that the fingertip cannot leave. label: whose dream it is.
+    """
+    dreamt, done = shaped("dreamt", dreamt, "n T 2"), shaped("done", done, "n T 2")
+    if len(dreamt) != len(done):
+        raise ValueError(f"dreamt holds {len(dreamt)} paths and done {len(done)}")
+    figure, axes = panels(len(done), 4, 1.8, sharex=True, sharey=True)
+    dark, main = COLOURS["data"], colour(label)
+    if wanted is not None:
+        wanted = np.broadcast_to(wanted, (len(done), *np.shape(wanted)[-2:]))
+    for i, ax in enumerate(axes):
+        if zone is not None:
+            ax.add_patch(Circle(zone[:2], zone[2], fc=tint(COLOURS["multistep"], 0.25), ec="none"))
+        if reach is not None:
+            ax.add_patch(Circle((0, 0), reach, fill=False, ec="#BBBBBB", lw=0.6))
+        if wanted is not None:
+            ax.plot(*wanted[i].T, color="#BBBBBB", lw=3 if len(wanted[i]) > 1 else 0, marker="" if len(wanted[i]) > 1
+                    else "+", ms=7, mew=1.2, mec=dark, solid_capstyle="round")  # fmt: skip
+        ax.plot(*dreamt[i].T, color=main, lw=0.9, ls=(0, (3, 1.5)))
+        ax.plot(*done[i].T, color=dark, lw=1.1)
+        ax.plot(*done[i, 0], "o", color=dark, ms=3)
+        ax.set(aspect="equal", xlabel="x (m)")
+        ax.locator_params(nbins=4)
+    axes[0].set_ylabel("y (m)")
+    shown: dict[str, Any] = {"lw": 1.1, "marker": "o", "ms": 3, "markevery": [0]}
+    legend(figure, [Line2D([], [], color=main, lw=0.9, ls=(0, (3, 1.5)), label=f"dreamt by {name(label)}"),
+                    Line2D([], [], color=dark, label="done by the arm", **shown)])  # fmt: skip
     return figure
 
 

@@ -224,7 +224,7 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
 
     output = run.dir / notebook.name
     unfinished = output.with_name(f".{notebook.stem}.running.ipynb")
-    failure = None
+    failure, seen = None, ""
     try:
         executed = papermill.execute_notebook(
             _literally(notebook),
@@ -246,9 +246,10 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
     finally:
         if unfinished.exists() and _is_whole(unfinished):
             os.replace(unfinished, output)
+            seen = f"\nSee {output}"
         unfinished.unlink(missing_ok=True)
     if failure:
-        raise RunError(f"{notebook.stem} failed: {failure}\nSee {output}")
+        raise RunError(f"{notebook.stem} failed: {failure}{seen}")
     return output
 
 

@@ -68,7 +68,7 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
     if path.suffix != ".safetensors":
         raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'.")
     arrays = {name: _owned(value) for name, value in tensors.items()}
-    _require_finite(path, arrays, "Nothing was written.")
+    _require_finite(path, arrays, "Nothing was written: check what computed them.")
     about = _dumps(
         path, {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind, "header": dict(header), "provenance": provenance()}
     )
@@ -84,7 +84,7 @@ def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Any
     Raises StoreError if the file is missing, damaged, of another kind, or holds a value that is not finite.
     """
     tensors, about = _load(Path(path), kind)
-    _require_finite(Path(path), tensors, _again(kind))
+    _require_finite(Path(path), tensors, _again(Path(path), kind))
     return tensors, about["header"]
 
 
@@ -104,7 +104,7 @@ def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         return safetensors.torch.load(data), about
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(kind)}") from error
+        raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(path, kind)}") from error
 
 
 def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str, Any]]:
@@ -115,7 +115,7 @@ def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str,
     if len(data) < 8 or header_end > len(data) or at < len(_MARK):
         raise StoreError(
             f"{path} is damaged, or was not written by tsmlib: {len(data)} bytes found, and no tsmlib checksum in the "
-            f"header. {_again(kind)}"
+            f"header. {_again(path, kind)}"
         )
     view, end = memoryview(data), at + len(_ZEROS)
     stated = data[at:end].decode("latin-1")
@@ -125,19 +125,19 @@ def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str,
     if digest.hexdigest() != stated:
         raise StoreError(
             f"{path} is damaged: its {len(data)} bytes have SHA-256 {digest.hexdigest()[:12]}..., expected "
-            f"{stated[:12]!a}.... {_again(kind)}"
+            f"{stated[:12]!a}.... {_again(path, kind)}"
         )
     try:
         about = _loads(_loads(data[8:header_end])["__metadata__"]["tsmlib"])
         schema, found, _ = about["schema"], about["kind"], {**about["header"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {_again(kind)}") from error
+        raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {_again(path, kind)}") from error
     if type(schema) is not int or not 1 <= schema <= SCHEMA:
         raise StoreError(
             f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
         )
     if kind is not None and found != kind:
-        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_again(kind)}")
+        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_other(kind)}")
     return data, about
 
 
@@ -159,9 +159,22 @@ def _require_finite(path: Path, tensors: Mapping[str, Tensor], remedy: str) -> N
             )
 
 
-def _again(kind: str | None) -> str:
+def _again(path: Path, kind: str | None = None) -> str:
+    """What to do about a file that is damaged."""
+    if path.name == STATUS:
+        return "Delete it and run the notebooks again: python -m tsmlib run all"
+    if any((folder / MANIFEST).is_file() for folder in path.absolute().parents):
+        return "Restore it: git checkout -- data, where it came with the repository."
+    if kind == "checkpoint":
+        return "Delete it: training goes on from the one before it."
     command = _REMEDY.get(kind or "")
-    return f"Delete it and make it again: {command}" if command else "Restore it, or delete it and make it again."
+    return f"Delete it and make it again: {command}" if command else "Delete it and run the notebook that makes it."
+
+
+def _other(kind: str | None) -> str:
+    """What to do about a whole file that is not the one that was asked for."""
+    command = _REMEDY.get(kind or "")
+    return "Name another file" + (f", or delete it and make one that fits: {command}" if command else ".")
 
 
 # Trajectories and models ---------------------------------------------------------------------------------------------
@@ -206,11 +219,11 @@ def load_trajectories(
         )
         fingerprint = {**about["header"].get("fingerprint", {}), **fields}
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
-        raise StoreError(f"{path} holds no usable trajectories: {error}. {_again('trajectories')}") from error
+        raise StoreError(f"{path} holds no usable trajectories: {error}. {_again(path, 'trajectories')}") from error
     if env is not None and found.env != env:
-        raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_again('trajectories')}")
+        raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_other('trajectories')}")
     if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_again('trajectories')}")
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other('trajectories')}")
     return found
 
 
@@ -234,10 +247,10 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     """
     path = Path(path)
     tensors, about = _load(path, "model")
-    _require_finite(path, tensors, _again("model"))
+    _require_finite(path, tensors, _again(path, "model"))
     header = about["header"]
     if header.get("class") != cls.__name__:
-        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_again('model')}")
+        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_other('model')}")
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
         with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
@@ -245,12 +258,12 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
         differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
     except Exception as error:  # what the file says goes to a constructor, which may fail in any way
         raise StoreError(
-            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_again('model')}"
+            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_other('model')}"
         ) from error
     if differs:
-        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_again('model')}")
+        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_other('model')}")
     if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. Load a model that does, or {_REMEDY['model']}")
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other('model')}")
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
@@ -305,12 +318,12 @@ def load_table(path: PathLike) -> list[dict[str, Any]]:
     try:
         columns, *rows = reader
     except (csv.Error, ValueError) as error:
-        raise StoreError(f"{path} is not a table ({error}). {_again(None)}") from error
+        raise StoreError(f"{path} is not a table ({error}). {_again(path)}") from error
     if missing := [name for name in COLUMNS if name not in columns]:
-        raise StoreError(f"{path} is not a metrics table: it lacks the columns {missing}. {_again(None)}")
+        raise StoreError(f"{path} is not a metrics table: it lacks the columns {missing}. {_again(path)}")
     for line, row in enumerate(rows, start=2):
         if len(row) != len(columns):
-            raise StoreError(f"{path}, line {line}: {len(row)} fields, expected {len(columns)}. {_again(None)}")
+            raise StoreError(f"{path}, line {line}: {len(row)} fields, expected {len(columns)}. {_again(path)}")
     return [{name: _number(field) for name, field in zip(columns, row, strict=True)} for row in rows]
 
 
@@ -326,7 +339,7 @@ def read_json(path: PathLike) -> Any:
     except (ValueError, RecursionError) as error:
         if isinstance(error, StoreError):
             raise
-        raise StoreError(f"{path} is not valid JSON: {error}. {_again(None)}") from error
+        raise StoreError(f"{path} is not valid JSON: {error}. {_again(Path(path))}") from error
 
 
 def read_own_json(path: PathLike) -> Any:
@@ -337,9 +350,9 @@ def read_own_json(path: PathLike) -> Any:
         value = _loads(data)
         as_written = data == (_dumps(path, value, indent=1) + "\n").encode()
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path} is damaged: {error}. {_restore(path)}") from error
+        raise StoreError(f"{path} is damaged: {error}. {_again(path)}") from error
     if not as_written or not isinstance(value, dict):
-        raise StoreError(f"{path} is damaged: it is not as it was written. {_restore(path)}")
+        raise StoreError(f"{path} is damaged: it is not as it was written. {_again(path)}")
     return value
 
 
@@ -438,7 +451,7 @@ def verify(path: PathLike) -> list[Path]:
     def check(file: Path, wanted: str | None) -> None:
         try:
             if wanted is not None and (found := sha256(file)) != wanted:
-                raise StoreError(f"{file} has SHA-256 {found[:12]}..., expected {wanted[:12]}.... {_again(None)}")
+                raise StoreError(f"{file} has SHA-256 {found[:12]}..., expected {wanted[:12]}.... {_again(file)}")
             if file.suffix == ".safetensors" and file not in checked:
                 checked[file] = None
                 inputs = read_header(file).get("inputs", {})
@@ -463,7 +476,10 @@ def verify(path: PathLike) -> list[Path]:
             check(file, _listed(file))
         elif file == path:
             if (stated := _listed(file)) is None:
-                raise StoreError(f"{file} carries no checksum, and no {MANIFEST} above it lists it: nothing to check.")
+                raise StoreError(
+                    f"{file} carries no checksum, and no {MANIFEST} or {STATUS} above it lists it: nothing to check. "
+                    "Name a folder, or an artefact (*.safetensors)."
+                )
             check(file, stated)
     if problems:
         raise StoreError("\n".join(problems))
@@ -485,18 +501,12 @@ def _manifest(path: Path) -> dict[str, str]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         if isinstance(error, StoreError):
             raise
-        raise StoreError(f"{path} is not a manifest ({error!r}). {_restore(path)}") from error
+        raise StoreError(f"{path} is not a manifest ({error!r}). {_again(path)}") from error
     if not whole:
-        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {_restore(path)}")
+        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {_again(path)}")
     if any(name.is_absolute() or ".." in name.parts for name in map(Path, digests)):
-        raise StoreError(f"{path} lists files outside its own folder. {_restore(path)}")
+        raise StoreError(f"{path} lists files outside its own folder. {_again(path)}")
     return digests
-
-
-def _restore(path: Path) -> str:
-    if path.name == STATUS:
-        return "Delete it and run the notebooks again: python -m tsmlib run all"
-    return "Restore it: git checkout -- data, where it came with the repository."
 
 
 def _listed(path: Path) -> str | None:
@@ -520,7 +530,7 @@ def _read(path: Path, kind: str | None = None) -> bytes:
         command = _REMEDY.get(kind or "")
         raise StoreError(f"{path} does not exist. {f'Make it: {command}' if command else 'Check the name.'}") from None
     except (OSError, ValueError) as error:
-        raise StoreError(f"cannot read {path}: {error}.") from error
+        raise StoreError(f"cannot read {path}: {error}. Check its name and permissions.") from error
 
 
 def _text(path: Path) -> str:
@@ -529,9 +539,9 @@ def _text(path: Path) -> str:
     if wanted is not None and (found := hashlib.sha256(data).hexdigest()) != wanted:
         raise StoreError(
             f"{path} is damaged, or was changed after its run was complete: its SHA-256 is {found[:12]}..., expected "
-            f"{wanted[:12]}.... {_again(None)}"
+            f"{wanted[:12]}.... {_again(path)}"
         )
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        raise StoreError(f"{path} is not text: {error}. {_again(None)}") from error
+        raise StoreError(f"{path} is not text: {error}. {_again(path)}") from error

@@ -6,12 +6,10 @@ adam"``, ``"tsm+energy"``, ``"oracle"``. Its first word gives the colour.
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import wraps
+from io import BytesIO
 from pathlib import Path
 from typing import Any, ParamSpec
 
@@ -22,6 +20,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
+
+from tsmlib.disk import write_bytes
 
 P = ParamSpec("P")
 
@@ -40,6 +40,8 @@ COLOURS = {
     "ensemble": "#CC79A7",
     "ensemble+mse": "#6A2BD9",
     "prior": "#882255",
+    "ppo": "#999933",
+    "trpo": "#7B4B2A",
     "oracle": "#111111",
     "random": "#7A7A7A",
     "zero": "#B0B0B0",
@@ -56,6 +58,8 @@ NAMES = {
     "ensemble": "ensemble (Gaussian)",
     "ensemble+mse": "ensemble (squared error)",
     "prior": "action prior",
+    "ppo": "PPO",
+    "trpo": "TRPO",
     "random": "random torques",
     "zero": "zero torque",
 }
@@ -83,28 +87,17 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file to write beside ``path`` that takes its name when all went well and disappears when not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    os.close(handle)
-    try:
-        yield Path(name)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
 def save(figure: Figure, stem: str | Path) -> tuple[Path, Path]:
-    """Write ``<stem>.pdf`` and ``<stem>.png``; the same figure gives the same bytes, on any day."""
+    """Write ``<stem>.pdf`` and ``<stem>.png``, each in one step; the same figure gives the same bytes, on any day."""
     pdf, png = Path(f"{stem}.pdf"), Path(f"{stem}.png")
-    with plt.style.context(STYLE):
-        with replacing(pdf) as path:
-            figure.savefig(path, metadata={"CreationDate": None, "Creator": None, "Producer": None})
-        with replacing(png) as path:
-            figure.savefig(path, metadata={"Software": None})
+    none: dict[Path, dict[str, None]] = {
+        pdf: {"CreationDate": None, "Creator": None, "Producer": None}, png: {"Software": None}
+    }  # fmt: skip
+    for path, metadata in none.items():
+        drawn = BytesIO()  # the disk may be full
+        with plt.style.context(STYLE):
+            figure.savefig(drawn, format=path.suffix[1:], metadata=metadata)
+        write_bytes(path, drawn.getvalue())
     return pdf, png
 
 

@@ -412,8 +412,8 @@ def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
 
 
 @torch.no_grad()
-def evaluate(predict: Predict, reward: Reward, space: Space, parameters: Tensor, *, rows: int = 6400) -> Tensor:
-    """Expected return (C, B) of parameters (C, B, *shape), about ``rows`` candidates at a time to bound memory."""
+def evaluate(predict: Predict, reward: Reward, space: Space, parameters: Tensor, *, rows: int = 1600) -> Tensor:
+    """Expected return (C, B) of parameters (C, B, *shape), about ``rows`` at a time, which fit in a cache."""
     returns = []
     for chunk in parameters.split(max(1, rows // parameters.shape[1])):
         actions = space.decode(chunk)

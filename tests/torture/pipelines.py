@@ -86,39 +86,38 @@ def killed_runs(trials: int) -> Outcome:
 
 
 def cells_out_of_order(trials: int) -> Outcome:
-    """R12: the cells of each notebook in random order, and each alone: no table that is then taken for a result.
+    """R12: each cell of a notebook alone, and its cells in random order: no table that is then taken for a result.
 
     A table that comes about in this way may say anything, and so counts for nothing: without a complete run in
-    status.json nothing downstream reads it. Each trial executes the cells that can be executed, in one kernel.
+    status.json nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
     """
-    from jupyter_client.manager import start_new_kernel
-
-    from torture.training import answer
+    from torture.training import answer, kernel
 
     found, tables = Outcome(), 0
     for word, notebook in runs.notebooks().items():
         cells = [cell.source for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
-        for trial in range(trials):
-            with folder() as place:
-                order = list(range(len(cells)))
-                random.Random(trial).shuffle(order)
-                environment = {**os.environ, "TSM_RUN_DIR": str(place), "TSM_SCALE": "smoke", "OMP_NUM_THREADS": "1",
-                               "PYTHONPATH": str(ROOT), "TQDM_DISABLE": "1"}  # fmt: skip
-                manager, client = start_new_kernel(kernel_name="python3", env=environment, cwd=str(runs.NOTEBOOKS))
-                for index in order:
-                    reply = answer(client, client.execute(cells[index]))
-                    if reply["status"] == "error":
-                        alone = reply["ename"] in ("NameError", "StoreError", "ParameterError", "RunError", "KeyError")
-                        found.count(alone, f"{word}, cell {index}: {reply['ename']}: {reply['evalue']}")
-                client.stop_channels()
-                manager.shutdown_kernel(now=True)
-                tables += len(list(place.rglob("metrics/*.csv")))
-                run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
-                try:
-                    runs.require(run, notebook.stem)
-                    found.count(False, f"{word}: taken for complete")
-                except RunError as error:
-                    found.count(f"python -m tsmlib run {word} --scale smoke" in str(error), str(error))
+        mixed = [random.Random(trial).sample(range(len(cells)), len(cells)) for trial in range(trials)]
+        with kernel(TSM_SCALE="smoke", TQDM_DISABLE="1") as (_, client):
+            for order in [[index] for index in range(len(cells))] + mixed:
+                with folder() as place:
+                    answer(
+                        client,
+                        client.execute(f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"),
+                    )
+                    for index in order:
+                        reply = answer(client, client.execute(cells[index]))
+                        ours = ("NameError", "StoreError", "ParameterError", "RunError")
+                        known = reply["status"] == "ok" or reply["ename"] in ours
+                        found.count(
+                            known, f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}"
+                        )
+                    tables += len(list(place.rglob("metrics/*.csv")))
+                    run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
+                    try:
+                        runs.require(run, notebook.stem)
+                        found.count(False, f"{word}: taken for complete")
+                    except RunError as error:
+                        found.count(f"python -m tsmlib run {word} --scale smoke" in str(error), str(error))
     found.note = f"{tables} tables came about; none is taken for a result"
     return found
 
@@ -160,28 +159,31 @@ import hashlib, json, os, sys
 os.umask(int(sys.argv[2], 8))
 import torch; torch.set_num_threads(int(sys.argv[3]))
 from tsmlib import runs, store, study
-run = runs.resolve("05_control", scale="smoke", seed=int(sys.argv[4]), run_dir=sys.argv[1])
-net, header = study.load_or_train(run, "tsm/Reacher-v0", "tsm")
-trial = study.trial(run, study.task("tsm/Reacher-v0", "validation").take(2), "tsm", "cem", "actions")
-data = {path.name: store.sha256(path) for path in sorted((run.data / "Reacher").glob("*.safetensors"))}
-curve = header["curves"]["loss"]
-print(json.dumps({
-    "data": data, "weights": store.digest(net.state_dict()), "plan": store.digest({"u": trial.actions}),
-    "losses": [curve["train"], curve["validation"]], "validation": curve["validation"][-1],
-    "true": trial.true.mean().item(),
-}))
+for seed in range(int(sys.argv[4])):
+    run = runs.resolve("05_control", scale="smoke", seed=seed, run_dir=sys.argv[1])
+    net, header = study.load_or_train(run, "tsm/Reacher-v0", "tsm")
+    trial = study.trial(run, study.task("tsm/Reacher-v0", "validation").take(2), "tsm", "cem", "actions")
+    data = {path.name: store.sha256(path) for path in sorted((run.data / "Reacher").glob("*.safetensors"))}
+    curve = header["curves"]["loss"]
+    print("made", json.dumps({
+        "data": data, "weights": store.digest(net.state_dict()), "plan": store.digest({"u": trial.actions}),
+        "losses": [curve["train"], curve["validation"]], "validation": curve["validation"][-1],
+        "true": trial.true.mean().item(),
+    }))
 """
 
 
-def whole(place: Path, *, umask: str = "022", threads: int = 1, seed: int = 0, **environment: str) -> dict[str, Any]:
-    """Data, a model and plans, made in a fresh process."""
+def whole(
+    place: Path, *, umask: str = "022", threads: int = 1, seeds: int = 1, **environment: str
+) -> list[dict[str, Any]]:
+    """Data, a model and plans of each of the first seeds, made in a fresh process."""
     done = subprocess.run(
-        [sys.executable, "-c", WHOLE, str(place / "runs"), umask, str(threads), str(seed)],
+        [sys.executable, "-c", WHOLE, str(place / "runs"), umask, str(threads), str(seeds)],
         env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads), **environment},
         cwd=place, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return [json.loads(line[5:]) for line in done.stdout.splitlines() if line.startswith("made ")]
 
 
 ELSEWHERE: list[dict[str, str]] = [
@@ -204,7 +206,7 @@ def elsewhere(trials: int) -> Outcome:
         with folder() as place:
             there = place / f"a folder ü {len(made)}"
             there.mkdir()
-            made.append(whole(there, **surroundings))
+            made += whole(there, **surroundings)
             for name in made[0]:
                 found.count(made[-1][name] == made[0][name], f"{name} differs with {surroundings}")
     return found
@@ -212,14 +214,12 @@ def elsewhere(trials: int) -> Outcome:
 
 def threads(trials: int) -> Outcome:
     """R21: one and two threads over many seeds: the mean difference lies within half a seed's standard deviation."""
-    found = Outcome()
-    values: dict[int, list[list[float]]] = {1: [], 2: []}
-    for seed in range(trials):
-        for count in values:
-            with folder() as place:
-                made = whole(place, threads=count, seed=seed)
-                values[count].append([made["validation"], made["true"]])
-    one, two = np.array(values[1]), np.array(values[2])
+    found, values = Outcome(), []
+    for count in (1, 2):
+        with folder() as place:
+            made = whole(place, threads=count, seeds=trials)
+            values.append(np.array([[one["validation"], one["true"]] for one in made]))
+    one, two = values
     deviation, difference = one.std(0, ddof=1), two - one
     mean, error = difference.mean(0), difference.std(0, ddof=1) / np.sqrt(trials)
     for i, name in enumerate(("validation loss", "true return")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -11,7 +12,7 @@ import signal
 import subprocess
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,36 +30,38 @@ from torture.world import (
     folder,
     forged,
     in_child,
+    learn,
     new_model,
     reference,
     rng,
+    tiny,
     train,
 )
-from tsmlib import disk, store
+from tsmlib import disk, runs, store
 from tsmlib.checkpoint import TrainingStopped, load_generation
 from tsmlib.train import fit
 from tsmlib.trajectory import Window
 
 
 def killed_at_random_moments(trials: int) -> Outcome:
-    """R1: SIGKILL 1 to 4 times at random moments, resume, compare with a training that nobody disturbed."""
-    found, (expected, seconds) = Outcome(), reference()
-    kills = 0
+    """R1: SIGKILL 1 to 4 times at random moments of a training, of a model or a policy: the bits of one left alone."""
+    found, kills = Outcome(), 0
+    works = [(work, *reference(work)) for work in (train, learn)]
     for trial in range(trials):
-        draw = rng(1, trial)
+        draw, (work, expected, seconds) = rng(1, trial), works[trial % 4 == 3]
         with folder() as place:
             for _ in range(draw.randint(1, 4)):
-                child = Child(lambda: train(place / "run"))
+                child = Child(lambda: work(place / "run"))  # noqa: B023
                 child.kill(after=draw.uniform(0, 1.2 * seconds))
                 child.result()
                 kills += child.killed
-            first = in_child(lambda: train(place / "run"))
+            first = in_child(lambda: work(place / "run"))  # noqa: B023
             before = contents(place)
-            again = in_child(lambda: train(place / "run"))
+            again = in_child(lambda: work(place / "run"))  # noqa: B023
             found.count(first == expected, f"trial {trial}: other bits")
             found.count(again == expected and contents(place) == before, f"trial {trial}: a finished run was changed")
             found.count(not list(place.rglob(".*.tmp-*")), f"trial {trial}: half a file is left")
-    found.note = f"{trials} trainings, {kills} kills"
+    found.note = f"{trials} trainings, a quarter of them of policies, {kills} kills"
     return found
 
 
@@ -373,7 +376,11 @@ def two_writers(trials: int) -> Outcome:
 
 
 def full_disk(trials: int = 0) -> Outcome:
-    """R10: nothing more fits while a data set, table or checkpoint is written: the old one stays, and it is said."""
+    """R10: nothing more fits while data, a table, picture, film or checkpoint is written: the old stays, it is said."""
+    from matplotlib.figure import Figure
+
+    from tsmlib import figures
+
     found, (expected, _) = Outcome(), reference()
 
     def cramped(work: Callable[[], Any], size: int) -> tuple[bool, Any]:
@@ -388,8 +395,13 @@ def full_disk(trials: int = 0) -> Outcome:
 
     with folder() as place:
         data, table = place / "data.safetensors", place / "table.csv"
+        picture, film = place / "picture.pdf", place / "film.mp4"
         rows = [{"metric": "success", "value": 0.5, "n": i} for i in range(200)]
-        writers = {data: lambda: store.save_trajectories(data, TRAIN), table: lambda: store.save_table(table, rows)}
+        writers: dict[Path, Callable[[], Any]] = {
+            data: lambda: store.save_trajectories(data, TRAIN),
+            table: lambda: store.save_table(table, rows),
+            picture: lambda: figures.save(Figure(), place / "picture"),
+        }
         for path, write in writers.items():
             write()
             before = path.read_bytes()
@@ -397,6 +409,11 @@ def full_disk(trials: int = 0) -> Outcome:
                 good, said = cramped(write, size)
                 clear = not good and str(path) in said and f"{len(before)} bytes" in said and "too large" in said
                 found.count(clear and path.read_bytes() == before, f"{path.name}, {size} bytes: {said}")
+        frames = np.zeros((3, 64, 64, 3), np.uint8)
+        figures.video(frames, film)
+        before = film.read_bytes()
+        good, said = cramped(lambda: figures.video(frames, film), 1000)
+        found.count(not good and str(film) in said and film.read_bytes() == before, said)
         stopped_at(place / "run", 9)
         good, said = cramped(lambda: train(place / "run"), 1000)
         found.count(not good and "StoreError: cannot write" in said, said)
@@ -410,15 +427,10 @@ def full_disk(trials: int = 0) -> Outcome:
 
 def interrupted_in_a_cell(trials: int) -> Outcome:
     """R15: SIGINT at a random moment of a cell that trains; the cell runs again, and ends with the same bits."""
-    from jupyter_client.manager import start_new_kernel
-
-    found = Outcome()
-    (expected, _) = reference()
+    found, (expected, _) = Outcome(), reference()
     tests = Path(__file__).resolve().parent.parent
-    manager, client = start_new_kernel(kernel_name="python3", env={**os.environ, "OMP_NUM_THREADS": "1"})
-    try:
+    with kernel() as (manager, client):
         run(client, f"import sys; sys.path[:0] = [{str(tests)!r}, {str(tests.parent)!r}]")
-        began = time.monotonic()
         run(client, "from pathlib import Path; from torture.world import train; import torch; torch.set_num_threads(1)")
         run(client, "train(None)")
         began = time.monotonic()
@@ -440,16 +452,29 @@ def interrupted_in_a_cell(trials: int) -> Outcome:
                 found.count(run(client, cell) == repr(expected), f"trial {trial}: other bits")
         found.count(slowest < 5, f"the prompt came back after {slowest:.1f} s")
         found.note = f"{stopped} of {trials} stopped, prompt back within {slowest:.2f} s"
+    return found
+
+
+@contextlib.contextmanager
+def kernel(**environment: str) -> Iterator[tuple[Any, Any]]:
+    """Manager and client of a kernel in the folder of the notebooks."""
+    from jupyter_client.manager import start_new_kernel
+
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(runs.ROOT), **environment}
+    manager, client = start_new_kernel(
+        kernel_name="python3", env=environment, cwd=str(runs.NOTEBOOKS), stderr=subprocess.DEVNULL
+    )
+    try:
+        yield manager, client
     finally:
         client.stop_channels()
         manager.shutdown_kernel(now=True)
-    return found
 
 
 def answer(client: Any, request: str) -> dict[str, Any]:
     """The reply to a request, once the kernel is idle again."""
     while True:
-        reply = client.get_shell_msg(timeout=300)
+        reply = client.get_shell_msg(timeout=3600)
         if reply["parent_header"].get("msg_id") == request:
             return reply["content"]
 
@@ -459,7 +484,7 @@ def run(client: Any, cell: str) -> str:
     shown = ""
     request = client.execute(cell)
     while True:
-        message = client.get_iopub_msg(timeout=300)
+        message = client.get_iopub_msg(timeout=3600)
         if message["parent_header"].get("msg_id") != request:
             continue
         if message["msg_type"] == "execute_result":
@@ -475,7 +500,7 @@ def run(client: Any, cell: str) -> str:
 
 def memory(trials: int) -> Outcome:
     """R16: resident memory over ``trials`` training steps, sampled after a tenth of them: at most 1 MB per 1,000."""
-    found, model, data = Outcome(), new_model(), episodes(30, 0)
+    found, model, data = Outcome(), new_model(tiny), episodes(30, 0)
     samples: list[tuple[int, float]] = []
     page = os.sysconf("SC_PAGE_SIZE") / 1e6
     calls = 0

@@ -252,7 +252,7 @@ class MujocoArm(ArmVectorEnv):
         """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond `MAX_SPEED`."""
         nq = self.model.nq
         clock = start_time[:, None] + DT * np.arange(1, physics.shape[1] + 1)
-        stopped = np.abs(physics[..., 0] - clock) > DT / 2
+        stopped = np.abs(physics[..., 0] - clock) > self.model.opt.timestep / 2
         stopped[:, -1] |= warned
         with np.errstate(invalid="ignore"):
             reasons = (

@@ -1,9 +1,10 @@
-"""Plans made with trained models, kept in the run's folder."""
+"""Plans made with trained models, open loop and closed loop, kept in the run's folder."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from tsmlib import store
-from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.control import Task, Trial, execute, random_torques, replan, zero_torques
 from tsmlib.runs import Run
 from tsmlib.study.data import short
 from tsmlib.study.models import load_or_train
@@ -20,104 +21,168 @@ from tsmlib.trajopt import (
     DirectActions,
     LatentActions,
     Plan,
+    Planner,
+    Predict,
     Space,
     adam,
     cem,
+    mppi,
     reassess,
     sampled_starts,
+    stopped,
     through_model,
     through_simulator,
 )
 
+PLANNERS = ("adam", "adam+starts", "cem", "mppi")
+VERSION = 2  # of planners and kept plans; others are made again
+KEPT = 4  # samples of the predicted states, of the 32 behind a promise
 
-def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Trial:
-    """Plan with one method and execute open loop in the true simulator.
+
+def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0, every: int = 0) -> Trial:
+    """Plan with one method and execute in the true simulator.
 
     model: any of DYNAMICS, or oracle (the true simulator), or none. planner: adam (from zero, as the paper),
-    adam+starts (from the best of sampled candidates), cem; with model none: random or zero torques. prior: codes
-    (Eq. 3) or actions (Eq. 2). iterations: of the planner; 0 means the scale's default.
+    adam+starts (from the best of sampled candidates), cem, mppi; with model none: random or zero torques. prior: codes
+    (Eq. 3) or actions (Eq. 2). iterations: of the planner; 0 means the scale's default. every: 0 executes open loop, as
+    the paper; else the arm stops after as many steps to plan again (``control.replan``), beginning with that plan.
     """
     if model == "none":
         return execute(task, {"random": random_torques, "zero": zero_torques}[planner](task))
-    return execute(task, plan(run, task, model, planner, prior, iterations=iterations))
+    return execute(task, plan(run, task, model, planner, prior, iterations=iterations, every=every))
 
 
-def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0) -> Plan:
+def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int = 0, every: int = 0) -> Plan:
     """The plan alone; see ``trial``. ``predicted`` comes from 32 model samples that the planner did not see.
 
-    Plans are kept in the run's folder and found again as long as task, models and budget are the same. At scale
-    laptop the oracle's plans are those that ship in data/results, since it simulates every candidate.
+    Of a closed loop it is what was done, with the first promise. Given iterations, it keeps its ``trace``. Plans are
+    kept in the run's folder and found again as long as task, models and budget are the same; a task with a reward of
+    its own is planned for each time. At scale laptop the oracle's plans are those that ship in data/results, since it
+    simulates every candidate.
     """
-    if planner not in ("adam", "adam+starts", "cem") or prior not in ("codes", "actions") or iterations < 0:
+    if planner not in PLANNERS or prior not in ("codes", "actions") or iterations < 0 or every < 0:
         raise ValueError(
-            f"planner is {planner!r}, prior {prior!r}, iterations {iterations}; expected adam, adam+starts or cem, "
-            "codes or actions, and 0 (the scale's default) or more"
+            f"planner is {planner!r}, prior {prior!r}, iterations {iterations}, every {every}; expected "
+            f"{', '.join(PLANNERS[:-1])} or {PLANNERS[-1]}, codes or actions, and 0 (the scale's default) or more"
         )
     nets = {}
     if prior == "codes":
         nets["prior"], _ = load_or_train(run, task.env, "prior")
     if model != "oracle":
         nets["model"], _ = load_or_train(run, task.env, model)
-    budget = (
-        run.pick(smoke=8, laptop=96, paper=128),
-        iterations
-        or (run.pick(smoke=2, laptop=8, paper=12) if planner == "cem" else run.pick(smoke=3, laptop=100, paper=100)),
-    )
-    name = f"{short(task.env)}-{model}-{prior}-{planner}.safetensors"
-    made_from = {
-        "env": task.env, "horizon": task.horizon, "seed": run.seed, "candidates": budget[0], "iterations": budget[1],
+    candidates, steps = _budget(run, planner, iterations, every)
+    kind = f"-every{every}" * bool(every) + f"-{iterations}" * bool(iterations)
+    name = f"{short(task.env)}-{model}-{prior}-{planner}{kind}.safetensors"
+    posed = {"version": VERSION, "task": task.name, "env": task.env, "horizon": task.horizon, "every": every}
+    made_from = posed | {
+        "seed": run.seed, "candidates": candidates, "iterations": steps,
         "weights": {word: store.digest(net.state_dict()) for word, net in nets.items()},
     }  # fmt: skip
     own, shipped = run.folder("plans") / name, RESULTS / name
-    if own.exists() and store.read_header(own)["made_from"] == made_from and (kept := _kept(own, task)):
+    if task.own is None and (kept := _kept(own, task, made_from)):
         return kept
-    if model == "oracle" and run.scale == "laptop" and shipped.exists() and (kept := _kept(shipped, task, prefix=True)):
+    if task.own is None and model == "oracle" and run.scale == "laptop" and (kept := _kept(shipped, task, posed)):
         return kept
-    found = _search(run, task, planner, nets, *budget, bar=f"{task.name}: {model}, {planner} over {prior}")
-    if model != "oracle":
-        net = nets["model"]
-        fresh_samples = through_model(net, task.past(net.past_len), samples=32, seed=run.seed + 1)
-        found = reassess(found, fresh_samples, task.reward)
-    arrays: dict[str, Any] = {
-        "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
-        "states": found.states[:1], "predicted": found.predicted, "curve": found.curve,
-    }  # fmt: skip
-    store.save(own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds})
+    bar = f"{task.name}: {model}, {planner} over {prior}"
+    if every:
+        first = plan(run, task, model, planner, prior)
+        found = _closed_loop(run, task, _planner(planner, candidates, steps, run.seed), nets, every, first, bar)
+    else:
+        found = _search(run, task, planner, nets, candidates, steps, bar)
+    found = replace(found, states=found.states[:KEPT], trace=found.trace if iterations else None)
+    if task.own is None:
+        arrays: dict[str, Any] = {
+            "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
+            "states": found.states, "predicted": found.predicted, "curve": found.curve,
+        } | ({} if found.trace is None else {"trace": found.trace})  # fmt: skip
+        store.save(own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds})
     return found
 
 
+def along_the_way(
+    run: Run, task: Task, model: str, planner: str, prior: str, *, iterations: int, at: list[int]
+) -> dict[int, Trial]:
+    """What a long optimisation promises and earns along its way: iteration -> trial (``trajopt.stopped``)."""
+    whole = plan(run, task, model, planner, prior, iterations=iterations)
+    nets = {word: load_or_train(run, task.env, word)[0] for word in ("prior", model)}
+    space, judge = _space(task, nets if prior == "codes" else {}), _judge(run, task, nets[model])
+    return {i: execute(task, stopped(whole, i, judge, task.reward, space)) for i in at}
+
+
+def _budget(run: Run, planner: str, iterations: int, every: int) -> tuple[int, int]:
+    """Candidates, and iterations of each plan; a plan that is made again starts from what is left of the last."""
+    candidates = run.pick(smoke=8, laptop=96, paper=96)
+    if planner in ("cem", "mppi"):
+        usual = run.pick(smoke=1, laptop=3, paper=4) if every else run.pick(smoke=2, laptop=8, paper=10)
+    else:
+        usual = run.pick(smoke=2, laptop=20, paper=20) if every else run.pick(smoke=3, laptop=100, paper=100)
+    return candidates, iterations or usual
+
+
+def _planner(word: str, candidates: int, iterations: int, seed: int, bar: str = "") -> Planner:
+    options: dict[str, Any] = dict(iterations=iterations, progress=bar)
+    if word == "cem":
+        return partial(cem, candidates=candidates, elites=max(2, candidates // 10), seed=seed, **options)
+    if word == "mppi":
+        return partial(mppi, candidates=candidates, seed=seed, **options)
+    return partial(adam, **options)
+
+
+def _space(task: Task, nets: dict[str, Any]) -> Space:
+    return LatentActions(nets["prior"], task.horizon) if "prior" in nets else DirectActions(task.horizon)
+
+
+def _samples(model: Any, n: int = 2) -> int:
+    """As many as a planner searches with; a deterministic model's are all the same."""
+    return n if getattr(model, "stochastic", True) else 1
+
+
+def _judge(run: Run, task: Task, model: Any) -> Predict:
+    return through_model(model, task.past(model.past_len), samples=_samples(model, 32), seed=run.seed + 1)
+
+
 def _search(
-    run: Run, task: Task, planner: str, nets: dict[str, Any], candidates: int, iterations: int, *, bar: str
+    run: Run, task: Task, planner: str, nets: dict[str, Any], candidates: int, iterations: int, bar: str
 ) -> Plan:
     began = time.perf_counter()
-    space: Space = LatentActions(nets["prior"], task.horizon) if "prior" in nets else DirectActions(task.horizon)
-    if "model" in nets:
-        predict = through_model(nets["model"], task.past(nets["model"].past_len), samples=2, seed=run.seed)
+    space, model = _space(task, nets), nets.get("model")
+    if model is not None:
+        predict = through_model(model, task.past(model.past_len), samples=_samples(model), seed=run.seed)
     else:
         predict = through_simulator(task.env, task.start)
-    if planner == "cem":
-        found = cem(
-            predict, task.reward, space, len(task),
-            candidates=candidates, elites=max(2, candidates // 10), iterations=iterations, seed=run.seed, progress=bar,
-        )  # fmt: skip
-    else:
-        start = torch.zeros(1, len(task), *space.shape)
-        if planner == "adam+starts":
-            start = sampled_starts(
-                predict, task.reward, space, len(task), candidates=candidates, keep=2, seed=run.seed
-            )  # fmt: skip
-        found = adam(predict, task.reward, space, start, iterations=iterations, progress=bar)
-    return replace(found, seconds=time.perf_counter() - began)
+    start = torch.zeros(1, len(task), *space.shape)
+    if planner == "adam+starts":
+        start = sampled_starts(predict, task.reward, space, len(task), candidates=candidates, keep=2, seed=run.seed)
+    found = _planner(planner, candidates, iterations, run.seed, bar)(predict, task.reward, space, start)
+    found = replace(found, seconds=time.perf_counter() - began)
+    return found if model is None else reassess(found, _judge(run, task, model), task.reward)
 
 
-def _kept(path: Path, task: Task, *, prefix: bool = False) -> Plan | None:
-    """The plan in ``path`` if it was made for this task, or, with ``prefix``, for more targets that begin with its."""
+def _closed_loop(
+    run: Run, task: Task, planner: Planner, nets: dict[str, Any], every: int, first: Plan, bar: str
+) -> Plan:
+    """``control.replan`` from the kept plan on; seconds of both."""
+    model = nets.get("model")
+    done = replan(
+        task, model, _space(task, nets), planner, every=every, plan=first,
+        samples=_samples(model), seed=run.seed, progress=bar,
+    ).plan  # fmt: skip
+    assert done is not None
+    return replace(done, seconds=first.seconds + done.seconds)
+
+
+def _kept(path: Path, task: Task, wanted: dict[str, Any]) -> Plan | None:
+    """The plan in ``path`` if it was made as ``wanted`` for this task, or for more targets that begin with its."""
+    if not path.exists():
+        return None
     tensors, header = store.load(path, kind="plan")
-    n = len(task)
-    same = np.array_equal(tensors["start"][:n].numpy(), task.start) and torch.equal(tensors["target"][:n], task.target)
-    if not same or (len(tensors["start"]) != n and not prefix):
+    n, made_from = len(task), header["made_from"]
+    if any(made_from.get(word) != value for word, value in wanted.items()):
+        return None
+    if not np.array_equal(tensors["start"][:n], task.start) or not torch.equal(tensors["target"][:n], task.target):
         return None
     return Plan(
         actions=tensors["actions"][:n], parameters=tensors["parameters"][:n], states=tensors["states"][:, :n],
         predicted=tensors["predicted"][:n], curve=tensors["curve"][:, :n], seconds=header["seconds"],
+        trace=tensors["trace"][:, :n] if "trace" in tensors else None,
     )  # fmt: skip

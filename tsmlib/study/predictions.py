@@ -51,14 +51,14 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
     return found
 
 
-def evidence(run: Run, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict[str, Any]]:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
     Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come
     to its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
-    rows.
+    rows. table: what follows the notebook's name in the table's, ``_rows`` for instance.
     """
-    name = f"{run.notebook}.csv"
+    name = f"{run.notebook}{table}.csv"
     if run.scale == "laptop" and (RESULTS / name).exists():
         published = store.load_table(RESULTS / name)
         known = {row["env"] for row in published}

@@ -1,0 +1,302 @@
+"""Policies learned without a model, by other hands: the model-free curves of figure 7.
+
+PPO from Stable-Baselines3 and TRPO from sb3-contrib (the paper names no method) on the tasks of section 5.3.2: the
+reward, the starts, the targets and the 50 steps of an episode are those of ``tsmlib.study.learn``, which asks a model
+where these ask the simulator. A few configurations are tried on validation targets; the best one learns with every
+seed, and what it truly earns on the frozen test targets is measured along the way. README.md tells how to install it.
+
+    OMP_NUM_THREADS=1 python benchmarks/model_free/model_free.py
+
+Every finished run is kept in the table and not repeated; of one that was stopped the table holds the beginning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tqdm.auto import tqdm
+
+import tsmlib.envs  # noqa: F401 - registers the environments
+from tsmlib import store, study
+from tsmlib.control import TOLERANCE, Task, execute, sim_of
+from tsmlib.runs import ROOT
+from tsmlib.trajectory import Segment
+
+ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v0")
+ALGORITHMS = ("ppo", "trpo")
+HORIZON, GAMMA = 50, 0.99  # A.3
+# The first four are half of all combinations, in which each pair of values meets once; pushing earned more with more
+# episodes and larger torques, and the last two go further that way.
+SETTINGS: dict[str, list[dict[str, float]]] = {
+    "ppo": [
+        {"learning_rate": 3e-4, "episodes": 20, "std": 0.14},
+        {"learning_rate": 3e-4, "episodes": 80, "std": 0.37},
+        {"learning_rate": 1e-3, "episodes": 20, "std": 0.37},
+        {"learning_rate": 1e-3, "episodes": 80, "std": 0.14},
+        {"learning_rate": 1e-3, "episodes": 80, "std": 0.37},
+        {"learning_rate": 1e-3, "episodes": 200, "std": 0.37},
+    ],
+    "trpo": [
+        {"target_kl": 0.01, "episodes": 20, "std": 0.14},
+        {"target_kl": 0.01, "episodes": 80, "std": 0.37},
+        {"target_kl": 0.03, "episodes": 20, "std": 0.37},
+        {"target_kl": 0.03, "episodes": 80, "std": 0.14},
+        {"target_kl": 0.03, "episodes": 80, "std": 0.37},
+        {"target_kl": 0.03, "episodes": 200, "std": 0.37},
+    ],
+}  # episodes: per update; std: of the actions, at first
+MINIBATCH = 250  # steps; of PPO, and of TRPO's value function
+STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v0": 600_000}  # of the environment, by each seed
+SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v0": 200_000}  # by each configuration
+SEARCH_SEED = 100
+RECORDS = 25  # along the way, and one before
+UNITS = {"return_true": "m", "final_distance": "m", "success": "share", "seconds": "s", "cpu_seconds": "s"}
+EXTRA = ("configuration",)  # a column beside the usual ones
+
+Predict = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, du)
+
+
+# The task ------------------------------------------------------------------------------------------------------------
+
+
+def observed(states: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """What a policy sees, as ours do: cosines and sines of the angles, the rest of the state, the target (n, k)."""
+    angles = states[:, :2]
+    return np.concatenate([np.cos(angles), np.sin(angles), states[:, 2:], target], axis=1, dtype=np.float32)
+
+
+class Episodes:
+    """Episodes of ``HORIZON`` steps in n arms at once, one after another. Starts and targets are the environment's."""
+
+    def __init__(self, env: str, n: int, *, seed: int) -> None:
+        self.arms: Any = gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped
+        self.seed: int | None = seed  # of the first reset; the later ones go on from there
+        self.taken = 0
+
+    def reset(self) -> np.ndarray:
+        """Begin n episodes: their first observations (n, k)."""
+        states, _ = self.arms.reset(seed=self.seed)
+        self.seed, self.taken = None, 0
+        return observed(states, self.arms.target)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Actions (n, 2) -> observations (n, k), rewards (n,), and whether the episodes are over."""
+        states, rewards, *_ = self.arms.step(actions)
+        self.taken += 1
+        return observed(states, self.arms.target), rewards, self.taken == HORIZON
+
+
+def measured(task: Task, predict: Predict) -> dict[str, float]:
+    """What a policy truly earns on a task, as ``study.assess`` measures ours: means over the targets."""
+    target = task.target.numpy()
+
+    def control(past: Segment) -> torch.Tensor:
+        actions = predict(observed(past.states[:, -1].numpy(), target))
+        return torch.from_numpy(np.asarray(actions, np.float32))[:, None]
+
+    done = execute(task, control)
+    return {
+        "return_true": float(done.true.mean()), "final_distance": float(done.final_distance.mean()),
+        "success": float((done.final_distance < TOLERANCE).float().mean()),
+    }  # fmt: skip
+
+
+# Theirs --------------------------------------------------------------------------------------------------------------
+
+
+def vectorised(episodes: Episodes) -> Any:
+    """``episodes`` as a vector environment of Stable-Baselines3. The end of an episode is a limit of time."""
+    from stable_baselines3.common.vec_env import VecEnv
+
+    class Arms(VecEnv):
+        def __init__(self) -> None:
+            arms = episodes.arms
+            k = observed(np.zeros((1, arms.single_observation_space.shape[0])), np.zeros((1, 2))).shape[1]
+            space = gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32)
+            super().__init__(arms.num_envs, space, arms.single_action_space)
+
+        def reset(self) -> np.ndarray:
+            return episodes.reset()
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self.actions = actions
+
+        def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+            seen, rewards, over = episodes.step(self.actions)
+            infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+            if over:
+                infos = [{"terminal_observation": last, "TimeLimit.truncated": True} for last in seen]
+                seen = episodes.reset()
+            return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
+
+        def close(self) -> None:
+            episodes.arms.close()
+
+        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+            return [getattr(episodes.arms, attr_name)] * self.num_envs
+
+        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+            raise NotImplementedError("the arms share their attributes")
+
+        def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+            raise NotImplementedError("the arms share their methods")
+
+        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+            return [False] * self.num_envs
+
+    return Arms()
+
+
+def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
+    """The library's algorithm with a configuration of the search; what is not named here is the library's default."""
+    from sb3_contrib import TRPO
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    special = {name: value for name, value in setting.items() if name not in ("episodes", "std")}
+    network = dict(net_arch=[64, 64], activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
+    arms = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
+    return {"ppo": PPO, "trpo": TRPO}[algorithm](
+        "MlpPolicy", VecNormalize(arms, gamma=GAMMA), n_steps=HORIZON, batch_size=MINIBATCH, gamma=GAMMA,
+        policy_kwargs=network, seed=seed, device="cpu", **special,
+    )  # fmt: skip
+
+
+def learn(
+    algorithm: str, task: Task, setting: Mapping[str, float], *, steps: int, records: int, seed: int
+) -> Iterator[dict[str, float]]:
+    """One run of at least ``steps`` steps: what is earned on ``task`` before it and ``records`` times along the way.
+
+    A record holds the steps taken, the seconds of learning (by the clock, and of the processor) and ``measured``.
+    """
+    model = learner(algorithm, task.env, setting, seed=seed)
+
+    def predict(seen: np.ndarray) -> np.ndarray:
+        return model.predict(model.env.normalize_obs(seen), deterministic=True)[0]
+
+    clock = np.zeros(2)
+    last = -1
+    title = f"{study.short(task.env)} {algorithm} {named(setting)}, seed {seed}"
+    with tqdm(total=steps, desc=title, unit="step", mininterval=5) as bar:
+        for goal in np.linspace(0, steps, records + 1).round().astype(int):
+            began = _clock()
+            if goal > model.num_timesteps:
+                model.learn(int(goal) - model.num_timesteps, reset_num_timesteps=False)
+            clock += _clock() - began
+            seconds, cpu_seconds = clock.tolist()
+            if model.num_timesteps > last:
+                last = model.num_timesteps
+                found = measured(task, predict)
+                bar.update(last - bar.n)
+                bar.set_postfix(earned=found["return_true"])
+                yield {"steps": last, "seconds": seconds, "cpu_seconds": cpu_seconds} | found
+    model.env.close()
+    return found
+
+
+def _clock() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+# The study -----------------------------------------------------------------------------------------------------------
+
+
+def named(setting: Mapping[str, float]) -> str:
+    """A configuration in one line: ``learning_rate=0.001 episodes=20 std=0.14``."""
+    return " ".join(f"{name}={value:g}" for name, value in setting.items())
+
+
+class Table:
+    """The rows of all finished runs, in a file. A run is known by environment, algorithm, condition, setting, seed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.rows = path, store.load_table(path) if path.exists() else []
+
+    def kept(self, key: Mapping[str, Any], steps: int) -> list[dict[str, Any]]:
+        """The rows of a run, if it took at least ``steps``."""
+        rows = [row for row in self.rows if all(row[name] == value for name, value in key.items())]
+        return rows if rows and max(row["horizon"] for row in rows) >= steps else []
+
+    def put(self, key: Mapping[str, Any], task: Task, records: list[dict[str, float]]) -> list[dict[str, Any]]:
+        """Write what is known of a run, in place of what was known before."""
+        common = dict(key, sim=sim_of(task.env), task=task.name, planner="policy", n=len(task), scale="paper")
+        new = [
+            dict(common, horizon=record["steps"], metric=metric, value=record[metric], unit=unit)
+            for record in records
+            for metric, unit in UNITS.items()
+        ]
+        others = [row for row in self.rows if any(row[name] != value for name, value in key.items())]
+        self.rows = [*others, *new]
+        store.save_table(self.path, self.rows, extra=EXTRA)
+        return new
+
+
+def run(
+    table: Table, env: str, algorithm: str, setting: Mapping[str, float], *, split: str, steps: int, records: int,
+    seed: int,
+) -> dict[str, float]:  # fmt: skip
+    """The last record of a run, on targets of ``split``: from the table, or learned now and put there."""
+    condition = {"validation": "search", "test": "learning"}[split]
+    key = dict(env=env, model=algorithm, condition=condition, configuration=named(setting), seed=seed)
+    rows = table.kept(key, steps)
+    if not rows:
+        task, found = study.task(env, split), []
+        for record in learn(algorithm, task, setting, steps=steps, records=records, seed=seed):
+            found.append(record)
+            rows = table.put(key, task, found)
+    last = {row["metric"]: row["value"] for row in rows}  # rows are in the order of time
+    print(f"{env} {algorithm} {named(setting)}, seed {seed}, {condition}: "
+          + ", ".join(f"{metric} {value:.3f}" for metric, value in last.items()), flush=True)  # fmt: skip
+    return last
+
+
+def search(table: Table, env: str, algorithm: str, *, steps: int) -> dict[str, float]:
+    """The configuration that earns most on the validation targets."""
+    options = dict(split="validation", steps=steps, records=2, seed=SEARCH_SEED)
+    return max(SETTINGS[algorithm], key=lambda s: run(table, env, algorithm, s, **options)["return_true"])
+
+
+def parser() -> argparse.ArgumentParser:
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("--env", choices=ENVS, help="one task instead of both")
+    found.add_argument("--algorithm", choices=ALGORITHMS, help="one instead of both")
+    found.add_argument("--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})")
+    found.add_argument("--seeds", type=int, default=3, help="0, 1, ... (default 3)")
+    found.add_argument("--records", type=int, default=RECORDS, help=f"along each curve (default {RECORDS})")
+    found.add_argument("--out", type=Path, default=ROOT / "runs" / "bench" / "model_free.csv", help="the table")
+    return found
+
+
+def main(given: list[str] | None = None) -> None:
+    """The command."""
+    arguments = parser().parse_args(given)
+    if arguments.steps < 0 or min(arguments.seeds, arguments.records) < 1:
+        raise SystemExit(
+            f"steps {arguments.steps}, seeds {arguments.seeds}, records {arguments.records}: expected positive numbers"
+        )
+    torch.set_num_threads(1)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    table = Table(arguments.out)
+    pairs = list(itertools.product([arguments.env] if arguments.env else ENVS,
+                                   [arguments.algorithm] if arguments.algorithm else ALGORITHMS))  # fmt: skip
+    steps = {env: arguments.steps or STEPS[env] for env in ENVS}
+    tried = {env: min(steps[env], SEARCH_STEPS[env]) for env in ENVS}
+    best = {(env, algorithm): search(table, env, algorithm, steps=tried[env]) for env, algorithm in pairs}
+    for seed in range(arguments.seeds):
+        for env, algorithm in pairs:
+            run(table, env, algorithm, best[env, algorithm], split="test", steps=steps[env],
+                records=arguments.records, seed=seed)  # fmt: skip
+    print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()

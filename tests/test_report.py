@@ -1,0 +1,196 @@
+"""Rows say what trials measured, tables say what rows say, and a bar is reached or it is not."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tsmlib import control, report, runs, study
+from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.trajopt import Plan
+
+REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+RUN = runs.resolve("05_control", scale="smoke", seed=2, run_dir="/nowhere")
+
+
+def some_task(env: str = PUSH, n: int = 10) -> Task:
+    return dataclasses.replace(study.draw_task(env, seed=3, n=n), horizon=20)
+
+
+def dreamt(task: Task, torques: Any, promised: float = 0.0) -> Trial:
+    """A trial of torques whose model saw the truth coming, and promised so much more."""
+    seen = execute(task, torques)
+    states = seen.states[None, :, 1:].clone()
+    plan = Plan(torques, torques, states, seen.true + promised, seen.true[None], seconds=1.0)
+    return dataclasses.replace(seen, plan=plan)
+
+
+def value(rows: Any, metric: str, **wanted: Any) -> float:
+    (found,) = (row["value"] for row in rows if row["metric"] == metric and all(row[k] == v for k, v in wanted.items()))
+    return float(found)
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_table_holds_what_the_trials_measured() -> None:
+    task = some_task(REACHER, 4)
+    trial = execute(task, zero_torques(task))
+    summary, per_target = report.tables([task], {REACHER: {"zero": trial}}, RUN)
+    assert value(summary, "return_true") == pytest.approx(float(trial.true.mean()))
+    near = trial.final_distance <= control.TOLERANCE
+    assert value(summary, "success") == pytest.approx(float(near.float().mean()))
+    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
+    np.testing.assert_allclose(report.by_target(per_target, "return_true")["zero"], trial.true, rtol=1e-6)
+
+
+def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> None:
+    task = some_task(REACHER, 4)
+    nothing, random = (execute(task, torques(task)) for torques in (zero_torques, random_torques))
+    oracle = dataclasses.replace(nothing, true=nothing.true / 2)
+    trials = {REACHER: {"zero": nothing, "oracle codes cem": oracle, "random": random}}
+    rows, _ = report.tables([task], trials, RUN)
+    assert value(rows, "cost_over_oracle", model="oracle") == pytest.approx(1)
+    assert value(rows, "gain_share", model="oracle") == pytest.approx(1)
+    assert value(rows, "cost_over_oracle", planner="zero") == pytest.approx(2)
+    assert value(rows, "gain_share", planner="zero") == pytest.approx(0)
+
+
+def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
+    task = some_task()
+    torques = random_torques(task)
+    sound, careless = dreamt(task, torques), dreamt(task, torques)
+    assert careless.plan is not None
+    jump = torch.zeros(10)
+    jump[3] = 0.05
+    careless.plan.states[0, :, 10:, 6] += jump[:, None]  # one object of ten, for half the time
+    careless.plan.predicted[3] += 1.0
+    rows, per_target = report.tables([task], {PUSH: {"tsm codes cem": sound, "lstm codes cem": careless}}, RUN)
+    assert value(rows, "broken", model="tsm") == 0
+    assert value(rows, "broken", model="lstm") == pytest.approx(0.05, abs=0.006)
+    assert value(rows, "broken_worst", model="lstm") == pytest.approx(0.5, abs=0.06)  # the worst tenth is that one
+    assert report.by_target(per_target, "broken")["lstm codes cem"].argmax() == 3
+    closed, _ = report.tables([task], {PUSH: {"tsm codes cem": sound}}, RUN, condition=report.CLOSED)
+    assert not any(row["metric"].startswith("broken") for row in closed)  # each plan dreams from another start
+
+
+def test_rough_torques_are_told_from_smooth_ones() -> None:
+    task = some_task(REACHER)
+    rough = 0.1 * torch.randn(10, 20, 2, generator=torch.Generator().manual_seed(0))
+    trials = {REACHER: {"random": execute(task, random_torques(task)), "tsm actions cem": dreamt(task, rough)}}
+    rows, _ = report.tables([task], trials, RUN)
+    for metric in ("torque_change", "torque_fast", "torque_novelty"):
+        assert value(rows, metric, model="tsm") > 1.5 * value(rows, metric, model="none"), metric
+
+
+def test_plans_along_the_way_are_told_by_their_iteration() -> None:
+    task = some_task(REACHER)
+    rows = []
+    for iteration, promised in ((0, 0.0), (5, 0.5), (20, 2.0)):
+        trials = {REACHER: {"tsm codes adam": dreamt(task, zero_torques(task), promised)}}
+        rows += report.tables([task], trials, RUN, condition=report.ALONG, iteration=iteration)[0]
+    (curve,) = report.along_the_way(rows, REACHER).values()
+    np.testing.assert_array_equal(curve["iterations"], [0, 5, 20])
+    np.testing.assert_allclose(curve["predicted"] - curve["true"], [0.0, 0.5, 2.0], atol=1e-5)
+    assert report.along_the_way(rows, PUSH) == {}
+
+
+def test_seeds_are_averaged_target_by_target() -> None:
+    rows = [
+        dict(model="tsm", prior="codes", planner="cem", metric="return_true", target=i, seed=seed, value=i + seed)
+        for seed in (0, 2)
+        for i in range(3)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(report.by_target(rows, "return_true")["tsm codes cem"], [1.0, 2.0, 3.0])
+
+
+# Tables --------------------------------------------------------------------------------------------------------------
+
+
+def made_up(**changed: float) -> list[dict[str, Any]]:
+    """Rows of a study in which every bar is reached, but for what is ``changed``."""
+    given = {
+        "near": 1.05, "relative": 0.02, "far": 1.1, "size": 0.1, "rival_size": 0.3, "earned": -7.0, "rival": -7.5,
+        "success": 0.5, "oracle_success": 0.4, "broken": 0.01,
+    } | changed  # fmt: skip
+    ours, oracle, rival = ("tsm", "codes"), ("oracle", "codes"), ("lstm", "actions")
+    numbers = [
+        (REACHER, *ours, report.OPEN, "cost_over_oracle", given["near"]),
+        (REACHER, *ours, report.OPEN, "relative_gap_median", given["relative"]),
+        (PUSH, *ours, report.OPEN, "cost_over_oracle", given["far"]),
+        (PUSH, *ours, report.OPEN, "gap_absolute", given["size"]),
+        (PUSH, *ours, report.OPEN, "exploitation_gap", given["size"]),
+        (PUSH, *ours, report.OPEN, "return_true", given["earned"]),
+        (PUSH, *ours, report.OPEN, "broken", given["broken"]),
+        (PUSH, *rival, report.OPEN, "gap_absolute", given["rival_size"]),
+        (PUSH, *rival, report.OPEN, "exploitation_gap", given["rival_size"]),
+        (PUSH, *rival, report.OPEN, "return_true", given["rival"]),
+        (PUSH, *ours, report.CLOSED, "success", given["success"]),
+        (PUSH, *oracle, report.CLOSED, "success", given["oracle_success"]),
+    ]
+    return [
+        dict(env=env, model=model, prior=prior, planner="cem", condition=condition, metric=metric, value=value, n=100)
+        for env, model, prior, condition, metric, value in numbers
+    ]
+
+
+def test_every_bar_can_be_reached_and_missed() -> None:
+    found = report.bars(made_up(), "tsm")
+    assert all(met for _, _, met in found.values())
+    for changed in (
+        {"near": 1.2}, {"relative": 0.06}, {"far": 1.16}, {"size": 0.2}, {"rival": -6.9}, {"success": 0.3},
+        {"broken": 0.06},
+    ):  # fmt: skip
+        missed = [what for what, (_, _, met) in report.bars(made_up(**changed), "tsm").items() if not met]
+        assert len(missed) == 1, changed
+    assert "| no |" in report.verdicts(report.bars(made_up(near=1.2), "tsm"))
+    assert report.bars(made_up(success=0.8, oracle_success=0.9), "tsm")["push, closed loop: within 0.03 m"][2]
+
+
+def test_tables_keep_models_planners_and_loops_apart() -> None:
+    rows = made_up()
+    rows += [dict(row, planner="mppi", value=-1.0) for row in rows if row["condition"] == report.OPEN]
+    assert "-1.00" not in report.report(rows)
+    assert "| TSM | codes |" in report.report(rows)
+    lines = report.by_planner([row for row in rows if row["env"] == PUSH]).splitlines()
+    assert lines[0].endswith("| CEM | MPPI |")
+    assert "| -7.00 (+0.10) | -1.00 (-1.00) |" in lines[2]
+    (line,) = (line for line in report.by_loop(rows).splitlines() if "| TSM |" in line)
+    assert "50.0 %" in line
+    assert "| 1.0 % |" in report.by_invariant(rows)
+
+
+def test_what_the_prior_changes_is_paired_by_target() -> None:
+    draw = np.random.default_rng(0)
+    hard = draw.normal(size=50)  # targets differ much, the two methods little
+    rows = []
+    for prior, more in (("codes", 0.1), ("actions", 0.0)):
+        for metric, extra in (("return_true", 0.0), ("return_predicted", 2 * more)):
+            rows += [
+                dict(env=PUSH, model="tsm", prior=prior, planner="cem", condition=report.OPEN, metric=metric, target=i,
+                     value=value)
+                for i, value in enumerate(hard + more + extra)
+            ]  # fmt: skip
+    line = report.by_prior(rows).splitlines()[2]
+    assert line == f"| `{PUSH}` | TSM | CEM | 50 | +0.100 ± 0.000 | +0.200 ± 0.000 |"
+
+
+def test_the_shipped_rows_make_tables() -> None:
+    rows = study.table(dataclasses.replace(RUN, scale="laptop"), "05_control.csv")
+    if not rows:
+        pytest.skip("nothing is published")
+    for table in (report.report, report.by_planner, report.by_invariant, report.by_loop):
+        assert table(rows).count("\n") >= 1
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
+    task = some_task(REACHER, 2)
+    with pytest.raises(ValueError, match="not planned"):
+        report.strip(task, execute(task, zero_torques(task)), 0)

@@ -1,0 +1,161 @@
+"""What learned policies are worth: rows of their learning curves, and the input of figure 7 from such rows.
+
+A row's ``horizon`` is the optimiser iterations done; for the model-free policies of benchmarks/model_free, whose
+``prior`` is empty, the environment steps taken. All have the condition "learning".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from tsmlib.control import TOLERANCE, sim_of
+from tsmlib.policy_figures import Curves, LearningCurves
+from tsmlib.style import interval, name
+
+EXTRA = ("copy",)  # column beside the usual ones
+UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
+         "success": "share"}  # fmt: skip
+
+
+def learning_rows(
+    header: Mapping[str, Any], *, samples: int, train_seconds: float, n: int = 100
+) -> list[dict[str, Any]]:
+    """Rows of a learned policy, one per record, copy and metric; header: as ``study.learn`` returns it.
+
+    samples: environment steps in the data set of its model; train_seconds: of the model and the prior; n: the targets
+    it is measured on. Both are rows too, so that the table says what a policy has cost in all.
+    """
+    env, curve = header["fingerprint"]["env"], header["curve"]
+    common = dict(
+        env=env, sim=sim_of(env), task=header["made_from"]["task"], model=header["model"], planner="policy",
+        prior=header["prior"], condition="learning", seed=header["seed"], scale=header["scale"],
+    )  # fmt: skip
+    measured = {metric: np.asarray(values) for metric, values in curve["measured"].items()}  # (records, copies) each
+    measured["exploitation_gap"] = measured["return_predicted"] - measured["return_true"]
+    rows = [
+        dict(common, horizon=iteration, metric=metric, value=float(value), unit=unit, n=n, copy=copy)
+        for metric, unit in UNITS.items()
+        for iteration, values in zip(curve["iteration"], measured[metric], strict=True)
+        for copy, value in enumerate(values)
+    ]
+    rows += [
+        dict(common, horizon=iteration, metric="seconds", value=seconds, unit="s")
+        for iteration, seconds in zip(curve["iteration"], curve["seconds"], strict=True)
+    ]
+    for metric, value, unit in (("samples", samples, "steps"), ("train_seconds", train_seconds, "s")):
+        rows.append(dict(common, horizon=curve["iteration"][-1], metric=metric, value=value, unit=unit))
+    return rows
+
+
+def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
+    """The input of ``figures.figure7``: task -> label -> curves, from rows of learning; others are passed over.
+
+    Copies and seeds of a label are its k lines. Seconds are the processor's where a table has them, else the clock's,
+    which are more on a busy machine; training of the model is counted. ValueError where lines were not measured at the
+    same points, or where one task was learned in two environments.
+    """
+    methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in _one_env([row for row in rows if row["condition"] == "learning"]):
+        methods.setdefault((row["task"], f"{row['model']} {row['prior']}".strip()), []).append(row)
+    found: dict[str, dict[str, Curves]] = {}
+    for (task, label), own in methods.items():
+        try:
+            found.setdefault(task, {})[label] = _curves(own)
+        except ValueError as error:
+            raise ValueError(f"{task}, {label}: {error}") from None
+    return found
+
+
+def _curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
+    """The curves of one method."""
+    by_metric: dict[str, dict[tuple[int, Any], dict[int, float]]] = {}  # metric -> (seed, copy) -> horizon -> value
+    model_free = False
+    for row in rows:
+        line = by_metric.setdefault(row["metric"], {}).setdefault((row["seed"], row.get("copy", "")), {})
+        if row["horizon"] in line:
+            raise ValueError(f"{row['metric']} of seed {row['seed']} stands twice at {row['horizon']}")
+        line[row["horizon"]] = row["value"]
+        model_free = row["prior"] == ""
+    first = next(iter(by_metric["return_true"].values()))
+    at = np.array(sorted(first))
+
+    def stacked(metric: str) -> np.ndarray:
+        """(k, R)"""
+        for (seed, copy), line in by_metric[metric].items():
+            if sorted(line) != at.tolist():
+                raise ValueError(
+                    f"{metric} of seed {seed}{f', copy {copy}' if copy != '' else ''} was measured at "
+                    f"{len(line)} points up to {max(line)}, expected the {len(at)} up to {at[-1]} of the others"
+                )
+        return np.array([[line[x] for x in at.tolist()] for line in by_metric[metric].values()])
+
+    curves = {metric: stacked(metric) for metric in by_metric if metric in UNITS}
+    curves["seconds"] = stacked("cpu_seconds" if "cpu_seconds" in by_metric else "seconds").mean(0)
+    if model_free:
+        return curves | {"samples": at}
+    samples, before = (
+        np.mean([value for line in by_metric[metric].values() for value in line.values()])
+        for metric in ("samples", "train_seconds")
+    )
+    return curves | {
+        "iterations": at, "samples": np.full(len(at), samples), "seconds": curves["seconds"] + before
+    }  # fmt: skip
+
+
+def references(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Task -> label -> mean true return of the oracle's plans and of no torque, from rows of 05_control.csv.
+
+    ValueError where one task was done in two environments.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for row in _one_env([row for row in rows if row["metric"] == "return_true"]):
+        if row["model"] == "oracle" or row["planner"] == "zero":
+            label = "zero" if row["planner"] == "zero" else f"oracle {row['prior']} {row['planner']}"
+            found.setdefault(row["task"], {})[label] = row["value"]
+    return found
+
+
+def _one_env(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    envs: dict[str, str] = {}
+    for row in rows:
+        if envs.setdefault(row["task"], row["env"]) != row["env"]:
+            raise ValueError(
+                f"rows of task {row['task']} are of {envs[row['task']]} and of {row['env']}; give those of one of them"
+            )
+    return rows
+
+
+def samples_to_reach(curves: Curves, level: float) -> float | None:
+    """Environment steps after which the mean true return of model-free ``curves`` first reaches ``level``.
+
+    Between two records along the straight line; None where it never does.
+    """
+    mean, steps = curves["return_true"].mean(0), curves["samples"]
+    above = np.flatnonzero(mean >= level)
+    if not len(above):
+        return None
+    i = int(above[0])
+    if i == 0:
+        return float(steps[0])
+    share = (level - mean[i - 1]) / (mean[i] - mean[i - 1])
+    return float(steps[i - 1] + share * (steps[i] - steps[i - 1]))
+
+
+def report(curves: LearningCurves) -> str:
+    """The end of every learning curve as a Markdown table: means over copies and seeds, with half 95 % intervals."""
+    shown = {"return_true": "earned", "return_predicted": "promised", "final_distance": "final distance (m)",
+             "success": f"within {TOLERANCE} m"}  # fmt: skip
+    lines = [f"| task | policy | k | {' | '.join(shown.values())} | environment steps | seconds |"]
+    lines.append("|---" * (len(shown) + 5) + "|")
+    for task, methods in curves.items():
+        for label, own in methods.items():
+            cells = []
+            for metric in shown:
+                mean, half = interval(own[metric][:, -1]) if metric in own else (0.0, 0.0)
+                cells.append((f"{mean:.3f}" + (f" ± {half:.3f}" if half else "")) if metric in own else "")
+            cells += [f"{own[word][-1]:,.0f}" for word in ("samples", "seconds")]
+            lines.append(f"| {task} | {name(label)} | {len(own['return_true'])} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
