@@ -28,18 +28,19 @@ def counts(verdicts: Sequence[Verdict]) -> str:
 
 
 def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "") -> str:
-    """The ledger as a Markdown table, with the check that decides each verdict: the one furthest from holding.
+    """The ledger as a Markdown table. The deciding check is the one that is furthest from holding.
 
     ours: the same claims with ``claims.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
     """
-    head = "| | the paper says | verdict | with our model | check that decides | estimate [interval] | n | shown in |"
+    head = "| | the paper says | verdict | with our model | measured | deciding check | n | shown in |"
     lines = [head, "|---" * 8 + "|"]
     for verdict, other in zip(verdicts, ours, strict=True):
         claim, key, checks = verdict.claim, verdict.key, len(verdict.effects[""])
-        number = "" if key.value is None else figure(key).rpartition(", n = ")[0]
+        found = "no rows yet" if key.value is None else f"{figure(key).rpartition(', n = ')[0]}"
+        decides = f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}"
         lines.append(
             f"| {claim.id} | {claim.statement} ({claim.place}) | **{verdict.word}** | {other.word.lower()} "
-            f"| `{key.check.text}`{f', one of {checks}' * (checks > 1)} | {number} | {key.n} | {_links(claim, root)} |"
+            f"| {claim.statistic} | {decides} | {key.n} | {_links(claim, root)} |"
         )
     return "\n".join(lines)
 

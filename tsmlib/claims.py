@@ -71,12 +71,22 @@ class ClaimError(ValueError):
 class Check:
     """One inequality, ``expression op margin``, and the query of every term in it, by the term's text."""
 
-    text: str
     expression: str
     op: str
     margin: float
     level: float
     queries: Mapping[str, Query]
+
+    @property
+    def asked(self) -> str:
+        """The margin, and where: ``> 0.5 (ReacherPush contact)``."""
+        places = ", ".join(dict.fromkeys(filter(None, map(_place, self.queries.values()))))
+        return f"{self.op} {self.margin:g}" + f" ({places})" * bool(places)
+
+    @property
+    def text(self) -> str:
+        """All of it as it is read."""
+        return f"{self.expression} {self.asked}"
 
     def accepts(self, low: float, high: float) -> bool:
         """Whether all that lies between ``low`` and ``high`` is on the accepted side of the margin."""
@@ -220,7 +230,7 @@ def _checks(line: str, base: Query, words: Words) -> Iterator[Check]:
     names = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "=="}
     sides = [tree.left, *tree.comparators]
     for left, kind, right in zip(sides, tree.ops, sides[1:], strict=False):
-        op, queries = names[type(kind)], _queries(left, base, words) | _queries(right, base, words)
+        op, queries = names[type(kind)], _queries(ast.BinOp(left, ast.Sub(), right), base, words)
         if not _queries(left, base, words):
             left, right, op = right, left, op.translate(str.maketrans("<>", "><"))
         margin = 0.0
@@ -231,9 +241,7 @@ def _checks(line: str, base: Query, words: Words) -> Iterator[Check]:
         expression, level = ast.unparse(left), 0.95 if len(tree.ops) == 1 else 0.90
         with np.errstate(all="ignore"):  # what nobody can evaluate is found now
             _number(left, {term: np.ones(2) if query["trials"] else 1.0 for term, query in queries.items()})
-        places = ", ".join(dict.fromkeys(filter(None, map(_place, queries.values()))))
-        text = f"{expression} {op} {margin:g}" + f" ({places})" * bool(places)
-        yield Check(text, expression, op, margin, level, queries)
+        yield Check(expression, op, margin, level, queries)
 
 
 def _queries(node: ast.AST, base: Query, words: Words, trials: bool = False) -> dict[str, Query]:

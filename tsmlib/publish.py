@@ -74,10 +74,13 @@ def readme_claims(papers: list[claims.Verdict], ours: list[claims.Verdict]) -> s
     """What README says of the paper's claims: those that carry it, and how many of all got which verdict."""
     pairs = [pair for pair in zip(papers, ours, strict=True) if pair[0].claim.headline]
     table = claim_report.table([first for first, _ in pairs], [second for _, second in pairs])
-    return f"""Written by `python -m tsmlib run claims` from the rows in `data/results`. Of {len(papers)} claims:
-{claim_report.counts(papers)}. With `{claims.OURS}` in the place of the paper's model:
-{claim_report.counts(ours)}. Below are the {len(pairs)} that carry the paper; all of them, why each verdict is what
-it is, and what the paper leaves open are in `notebooks/08_claims.ipynb`.
+    return f"""Written by `python -m tsmlib run claims` from the rows in `data/results`.
+
+- The paper's model: {claim_report.counts(papers)}.
+- `{claims.OURS}` in its place: {claim_report.counts(ours)}.
+
+Below are the {len(pairs)} of {len(papers)} claims that carry the paper. All of them, why each verdict is what it is,
+and what the paper leaves open are in `notebooks/08_claims.ipynb`.
 
 {table}"""
 
