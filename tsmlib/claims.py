@@ -457,7 +457,7 @@ def measure(check: Check, rows: Tables) -> Effect:
         exact = float(_number(tree, {}))
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
     for (a, one), (b, two) in itertools.combinations(asked.items(), 2):
-        same = all(check.queries[a].get(column) == check.queries[b].get(column) for column in ("file", "env"))
+        same = all(check.queries[a].get(c) == check.queries[b].get(c) for c in ("file", "env", "condition"))
         if same and set(one) != set(two):  # elsewhere the seeds that both have count
             file = check.queries[a]["file"]
             raise ClaimError(
