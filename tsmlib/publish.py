@@ -15,16 +15,18 @@ README = ROOT / "README.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
+POOLED = ("03_predict", "04_latent", "07_action_prior")  # notebooks whose tables ship with the rows of every seed
 
 
 def publish(run: Run) -> None:
     """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what README says of them.
 
-    The table of 03_predict has the rows of the other seeds beside this run as well. Raises RunError, before anything is
+    The tables of POOLED have the rows of the other seeds beside this run as well. Raises RunError, before anything is
     written, unless the notebooks ran to their end and their results are as they left them.
     """
-    for notebook in ("01_collect", "02_train", "03_predict", "05_control"):
+    for notebook in ("01_collect", "02_train", "05_control", *POOLED):
         require(run, notebook)
+    tables = pooled(run)
     for source, pattern, target in (
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
@@ -36,12 +38,22 @@ def publish(run: Run) -> None:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 store.write_bytes(copy, path.read_bytes())
-    predicted = run.metrics / "03_predict.csv"
-    rows = study.evidence(replace(run, notebook="03_predict"), store.load_table(predicted))
-    store.save_table(RESULTS / predicted.name, rows)  # of every seed beside this run
+    for notebook, rows in tables.items():
+        store.save_table(RESULTS / f"{notebook}.csv", rows, extra=_extra(rows))
     store.write_manifest(ROOT / "data")
     _between(MARKS, readme_results())
     publish_claims()
+
+
+def pooled(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """Notebook -> the rows of this run and of every seed beside it. RunError where one did not come to its end."""
+    own = {notebook: store.load_table(run.metrics / f"{notebook}.csv") for notebook in POOLED}
+    return {notebook: study.evidence(replace(run, notebook=notebook), rows) for notebook, rows in own.items()}
+
+
+def _extra(rows: list[dict[str, Any]]) -> list[str]:
+    """Columns beyond those of every table."""
+    return [column for column in dict.fromkeys(c for row in rows for c in row) if column not in store.COLUMNS]
 
 
 def publish_claims() -> None:
