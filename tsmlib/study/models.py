@@ -55,8 +55,8 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
     error and KL, or by the energy score. tsm+energy+direct: more teacher forcing, and a head that sees the state itself
     over a narrower stack. tsm+teacher, tsm+direct: ablations, teacher forcing alone, and that head with the paper's
-    loss. CHOICES: as many updates as tsm. onestep, ensemble: one step ahead. multistep, lstm: free-running over 2 H steps. prior: free-running over two
-    segments, its own budget.
+    loss. CHOICES: as many updates as tsm. onestep, ensemble: one step ahead. multistep, lstm: free-running over 2 H
+    steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":
         return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
