@@ -62,7 +62,11 @@ def draw_policies(
     )  # fmt: skip
     if sharey:
         means = np.concatenate([row["return_true"].mean(0) for rows in checked.values() for row in rows.values()])
-        shared = limits(means, means, also=[level for own in references.values() for level in own.values()])
+        floors = [level for own in references.values() for level in own.values()]
+        low, high = limits(means, means, also=floors)
+        if floors:  # what falls far below doing nothing would squeeze the rest
+            low = max(low, min(floors) - 0.35 * (high - min(floors)))
+        shared = low, high
     banded = promised = False
     for column, (task, rows) in zip(grid.T, checked.items(), strict=True):
         levels = references.get(task, {})

@@ -48,7 +48,7 @@ def imperfect_episode(
     ax = axes[-1]
     ax.step(at[:-1], taken, where="post", color=COLOURS["onestep"], lw=1.0)
     ax.step(at[:-1], applied, where="post", color=COLOURS["data"], lw=1.1)
-    ax.set(title="shoulder torque (share of full)", xlabel="time (s)")
+    ax.set(title="torque (full: 1)", xlabel="time (s)")
     entries = [
         Line2D([], [], color=COLOURS["data"], label="true state; torque that arrives"),
         Line2D([], [], color=tint(COLOURS["tsm"], 0.6), ls="", marker=".", label="what the sensors say"),
