@@ -136,3 +136,21 @@ def test_what_does_not_fit_is_refused() -> None:
         figures.walk(DRAW, START, np.full((9, 30, 2), np.nan), {9: 0.1})
     with pytest.raises(ValueError, match="expected"):
         figures.code_grid(START, fan(3, 3), PATH, (-1, 1), "tsm")
+
+
+def test_a_turned_knob_draws_the_picture_anew() -> None:
+    seen: list[tuple[float, float]] = []
+
+    def draw(a: float, b: float) -> Figure:
+        seen.append((a, b))
+        figure = Figure(figsize=(1, 1))
+        figure.text(0.1, 0.5, f"{a} {b}")
+        return figure
+
+    first, second, picture = figures.knobs(draw, a=(-3.0, 3.0, 0.25), b=(1.0, 2.0, 0.5)).children
+    before = picture.value
+    first.value = 1.25
+    second.value = 2.0
+    assert seen == [(0.0, 1.0), (1.25, 1.0), (1.25, 2.0)]
+    assert before[:4] == picture.value[:4] == b"\x89PNG"
+    assert before != picture.value

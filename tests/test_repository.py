@@ -96,7 +96,7 @@ def uses() -> dict[str, set[str]]:
     return {name: needs - {name} for name, needs in found.items()}
 
 
-PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery"}
+PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery", "knobs"}
 PICTURES |= {"latent_figures", "plan_figures", "policy_figures", "predict_figures", "prior_figures", "robust_figures"}
 ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
 

@@ -4,8 +4,8 @@ Every function draws in the style of ``tsm.mplstyle`` and returns its ``Figure``
 the last line of a notebook cell it shows once, and ``save`` writes it. Here are the figures of data and of learning;
 those of predictions are in ``tsmlib.predict_figures``, of codes in ``tsmlib.latent_figures``, of plans and policies in
 ``tsmlib.plan_figures`` and ``tsmlib.policy_figures``, of the action prior in ``tsmlib.prior_figures``, the diagrams of
-the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, colours and labels in ``tsmlib.style``: all
-are reached from here.
+the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, sliders in ``tsmlib.knobs``, colours and
+labels in ``tsmlib.style``: all are reached from here.
 
 Letters in shapes: n episodes, T steps, S samples, dx state size, H and W pixels.
 """
@@ -29,6 +29,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from tsmlib.diagrams import figure1, figure2, figure3  # noqa: F401
 from tsmlib.film import embed, side_by_side, video  # noqa: F401
 from tsmlib.gallery import gallery  # noqa: F401
+from tsmlib.knobs import knobs  # noqa: F401
 from tsmlib.latent_figures import (  # noqa: F401
     around_touch,
     code_grid,
