@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import figures, robustness, study
+from tsmlib import figures, robust_report, robustness, study
 from tsmlib.baselines import OneStep
 from tsmlib.dynamics import rollout
 from tsmlib.envs import NOISE, imperfect
@@ -422,7 +422,7 @@ LEARNED = [
 
 
 def test_the_board_shows_the_last_record_that_counts() -> None:
-    head, _, ours, theirs = robustness.board(LEARNED, last=500).splitlines()
+    head, _, ours, theirs = robust_report.board(LEARNED, last=500).splitlines()
     assert head.startswith(
         "| policy | clean: earned | clean: final distance (m) | clean: within 0.05 m | noise: earned"
     )
@@ -431,17 +431,17 @@ def test_the_board_shows_the_last_record_that_counts() -> None:
         f"| TSM, codes | -4 ± {half:.2g} |  |  | -5 |  | 0.65 ± 0.64 | -7.5 ± 6.4 |  | 0.55 ± 0.64 |"
     )
     assert theirs == f"| LSTM, actions |  |  |  | -7 ± {half:.2g} |  |  |  |  |  |"
-    assert "| TSM, codes | -1 |" in robustness.board(LEARNED, last=660)
+    assert "| TSM, codes | -1 |" in robust_report.board(LEARNED, last=660)
 
 
 def test_what_is_lost_is_a_share_of_the_gain_over_random_torques() -> None:
-    assert robustness.lost(LEARNED, "tsm codes", "noise", 500, random=-14.0) == pytest.approx((-4 + 5) / (-4 + 14))
-    assert robustness.lost(LEARNED, "tsm codes", "delay", 500, random=-14.0) == pytest.approx((-4 + 7.5) / (-4 + 14))
-    assert robustness.lost(LEARNED, "tsm codes", "noise", 300, random=-15.0) == pytest.approx(0.1)  # -5 against -6
+    assert robust_report.lost(LEARNED, "tsm codes", "noise", 500, random=-14.0) == pytest.approx((-4 + 5) / (-4 + 14))
+    assert robust_report.lost(LEARNED, "tsm codes", "delay", 500, random=-14.0) == pytest.approx((-4 + 7.5) / (-4 + 14))
+    assert robust_report.lost(LEARNED, "tsm codes", "noise", 300, random=-15.0) == pytest.approx(0.1)  # -5 against -6
 
 
 def test_learning_curves_are_a_line_for_each_copy() -> None:
-    curves = robustness.learning_curves(LEARNED, last=500)
+    curves = robust_report.learning_curves(LEARNED, last=500)
     assert {condition: list(own) for condition, own in curves.items()} == {
         "clean": ["tsm codes"], "noise": ["tsm codes", "lstm actions"], "delay": ["tsm codes"],
     }  # fmt: skip
@@ -453,7 +453,7 @@ def test_learning_curves_are_a_line_for_each_copy() -> None:
 
 def test_two_seeds_of_a_copy_are_two_lines() -> None:
     more = [*LEARNED, *({**row, "seed": 1} for row in earned({"delay": [[-12, -7, -6]]}))]
-    assert robustness.learning_curves(more, last=500)["delay"]["tsm codes"]["return_true"].tolist() == [
+    assert robust_report.learning_curves(more, last=500)["delay"]["tsm codes"]["return_true"].tolist() == [
         [-12, -6, -8], [-12, -6, -7], [-12, -7, -6],
     ]  # fmt: skip
 
@@ -473,7 +473,7 @@ def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_empty_where_nothing_was_
         *scored("tsm", "noise, contact", [4.0], obstacle), *scored("lstm", "noise, contact", [5.0], obstacle),
         *scored("tsm", "clean", [9.0], obstacle), *scored("lstm", "clean", [0.0], obstacle),
     ]  # fmt: skip
-    found = robustness.advantage(rows, "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
+    found = robust_report.advantage(rows, "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
     none = np.nan
     assert list(found) == ["plain arm: minus one-step", "plain arm: minus LSTM",
                            "after contact: minus one-step", "after contact: minus LSTM"]  # fmt: skip
@@ -488,12 +488,12 @@ def test_rows_of_the_plain_arm_find_their_place_on_the_map_once_renamed() -> Non
     obstacle = "tsm/ReacherObstacle-v0"
     own = [*scored("tsm", "contact", [4.0], obstacle), *scored("lstm", "contact", [1.5], obstacle)]
     own += [{**row, "env": imperfect(obstacle, delay=5), "value": 2 * row["value"]} for row in own]
-    found = robustness.advantage(robustness.renamed(own), "tsm", ["lstm"], [0.0], [0, 5])
+    found = robust_report.advantage(robustness.renamed(own), "tsm", ["lstm"], [0.0], [0, 5])
     np.testing.assert_array_equal(found["after contact: minus LSTM"], [[2.5, 5.0]])
 
 
 def test_a_bar_is_reached_or_it_is_not() -> None:
-    found = robustness.bars(LEARNED, "tsm codes", 500, random=-14.0)
+    found = robust_report.bars(LEARNED, "tsm codes", 500, random=-14.0)
     assert list(found.values()) == [
         ("at most 20 %", "10.0%", True), ("at least 60 %", "65%", True),
         ("at most 20 %", "35.0%", False), ("at least 60 %", "55%", False),
