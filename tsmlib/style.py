@@ -46,7 +46,7 @@ COLOURS = {
     "random": "#7A7A7A",
     "zero": "#B0B0B0",
     "data": "#4A4A4A",
-    "filter": "#111111",
+    "filter": "#000000",
 }
 NAMES = {
     "tsm": "TSM",
