@@ -18,7 +18,7 @@ from tsmlib import control, rewards, study
 from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.control import Task, execute, random_torques, replan, zero_torques
-from tsmlib.envs import ENV_IDS
+from tsmlib.envs import DELAY, ENV_IDS, NOISE, imperfect, imperfections
 from tsmlib.nets import Noise
 from tsmlib.prior import ActionPrior
 from tsmlib.trajectory import Segment, Trajectories
@@ -188,6 +188,83 @@ def test_the_gap_is_predicted_minus_true() -> None:
         _ = plain.gap
 
 
+# Executing behind noisy sensors and with late actions -----------------------------------------------------------------
+
+
+def imperfect_task(env: str = REACHER, n: int = 4, **how: Any) -> Task:
+    """The plain arm's task, whose starts are true states."""
+    return dataclasses.replace(some_task(env, n), env=imperfect(env, **how))
+
+
+@pytest.mark.parametrize("env", [REACHER, "tsm/PymunkPush-v0"])
+def test_behind_noisy_sensors_a_trial_earns_what_the_true_states_earn(env: str) -> None:
+    noisy, clear, actions = imperfect_task(env, noise=NOISE), some_task(env), torques(4, 20)
+    trial, plain = execute(noisy, actions), execute(clear, actions)
+    assert torch.equal(trial.states, plain.states)
+    assert torch.equal(trial.true, plain.true)
+    assert torch.equal(trial.final_distance, plain.final_distance)
+    assert trial.observed is not None
+    assert trial.observed.shape == trial.states.shape
+    assert (trial.observed != trial.states).all()
+    assert plain.observed is None
+
+
+def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
+    seen: list[Segment] = []
+
+    def watching(past: Segment) -> Tensor:
+        seen.append(past)
+        return -0.02 * past.states[:, -1:, 2:4]  # a brake
+
+    task = imperfect_task(noise=NOISE)
+    trial = execute(task, watching)
+    assert trial.observed is not None
+    whole = Trajectories(
+        trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, ("",) * 6, ("",) * 6
+    ).padded(10)  # fmt: skip
+    assert len(seen) == 20
+    for t, past in enumerate(seen):
+        assert torch.equal(past.states, whole.states[:, t : t + 10])
+    assert torch.equal(trial.actions, (-0.02 * trial.observed[:, :-1, 2:4]).clamp(-1, 1))
+    np.testing.assert_array_equal(trial.states[:, 0], task.start)
+
+
+@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}, {"noise": NOISE, "delay": DELAY}])
+def test_a_trial_of_an_imperfect_arm_can_be_repeated(how: dict[str, Any]) -> None:
+    def brake(past: Segment) -> Tensor:
+        return -0.02 * past.states[:, -1:, 2:4]
+
+    first, again = (execute(imperfect_task(**how), brake) for _ in range(2))
+    assert torch.equal(first.states, again.states)
+    assert torch.equal(first.actions, again.actions)
+    assert ("noise" in how) is (first.observed is not None) is (again.observed is not None)
+    if first.observed is not None:
+        assert torch.equal(first.observed, again.observed)
+
+
+@pytest.mark.parametrize("env", [REACHER, "tsm/PymunkPush-v0"])
+def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> None:
+    task, actions = imperfect_task(env, delay=DELAY), torques(4, 20)
+    trial = execute(task, actions)
+    late = torch.cat([torch.zeros(4, DELAY, 2), actions], 1)[:, :20]
+    assert torch.equal(trial.states, execute(some_task(env), late).states)
+    assert torch.equal(trial.actions, actions)
+    at_once = execute(some_task(env), actions)
+    assert torch.equal(trial.states[:, : DELAY + 1], execute(some_task(env), 0 * actions).states[:, : DELAY + 1])
+    assert not torch.allclose(trial.states, at_once.states, atol=1e-3)
+
+
+def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_earns_what_is_true() -> None:
+    task, model = imperfect_task(noise=NOISE), Wrong()
+    trial = replan(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
+    assert trial.observed is not None
+    told = {past.states[:4, -1].contiguous().numpy().tobytes() for past in model.asked}
+    for now in (0, 10):
+        assert trial.observed[:, now].contiguous().numpy().tobytes() in told
+    expected = task.reward(trial.states[:, 1:], trial.actions).sum(-1)
+    torch.testing.assert_close(trial.true, expected)
+
+
 # Closed loop ---------------------------------------------------------------------------------------------------------
 
 as_it_is = partial(adam, iterations=0)  # the planner that leaves a plan as it is
@@ -327,6 +404,17 @@ def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number
 def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
     with pytest.raises(ValueError, match="choose a number from 1 to 100"):
         study.task(REACHER, "validation").take(n)
+
+
+@pytest.mark.parametrize("split", ["validation", "test"])
+@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
+def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
+    for env in (REACHER, PUSH):
+        plain, task = study.task(env, split), study.task(imperfect(env, **how), split)
+        assert (task.name, task.horizon, imperfections(task.env)[0]) == (plain.name, plain.horizon, env)
+        assert task.env != env
+        np.testing.assert_array_equal(task.start, plain.start)
+        assert torch.equal(task.target, plain.target)
 
 
 def test_pushing_without_an_object_is_refused() -> None:

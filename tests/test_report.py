@@ -11,6 +11,7 @@ import torch
 
 from tsmlib import control, report, runs, study
 from tsmlib.control import Task, Trial, execute, random_torques, zero_torques
+from tsmlib.envs import DELAY, NOISE, imperfect
 from tsmlib.trajopt import Plan
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
@@ -194,3 +195,23 @@ def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
     task = some_task(REACHER, 2)
     with pytest.raises(ValueError, match="not planned"):
         report.strip(task, execute(task, zero_torques(task)), 0)
+
+
+def test_a_film_of_an_arm_behind_noisy_sensors_shows_what_they_say_beside_what_it_did() -> None:
+    task = dataclasses.replace(some_task("tsm/PymunkReacher-v0", 2), horizon=3)
+    noisy = dataclasses.replace(task, env=imperfect(task.env, noise=NOISE))
+    trial = execute(noisy, torch.full((2, 3, 2), 0.3))
+    film = report.film(noisy, trial, 1)
+    seen, done = np.split(film, 2, axis=2)
+    assert len(film) == 4  # the start and three steps
+    assert (seen[:, 40:] != done[:, 40:]).any((1, 2, 3)).all()  # below the words, in every frame
+    perfect = dataclasses.replace(trial, observed=trial.states)
+    seen, again = np.split(report.film(noisy, perfect, 1), 2, axis=2)
+    np.testing.assert_array_equal(seen[:, 40:], again[:, 40:])
+    np.testing.assert_array_equal(again, done)
+
+
+def test_a_film_of_late_actions_that_nobody_planned_is_refused() -> None:
+    task = dataclasses.replace(some_task(REACHER, 2), env=imperfect(REACHER, delay=DELAY))
+    with pytest.raises(ValueError, match="not planned"):
+        report.film(task, execute(task, zero_torques(task)), 0)

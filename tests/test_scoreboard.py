@@ -62,6 +62,12 @@ def test_contact_rows_average_from_the_first_touch_on(found: list[dict]) -> None
     assert n.get(1, 0) == int(after[:, 0].sum())
 
 
+def test_what_touches_is_told_by_true_states() -> None:
+    noisy = study.random_data("tsm/ReacherPush-noise0.25-v0", 2, seed=0)
+    with pytest.raises(ValueError, match=r"noisy states of tsm/ReacherPush-noise0.25-v0 do not tell what touches"):
+        scoreboard.rows(noisy.env, "tsm", scores(2, T), scores(2 * len(scoreboard.SEGMENTS), 10), noisy, seed=0)
+
+
 def test_the_share_of_diverged_rollouts_is_a_row(found: list[dict]) -> None:
     assert scoreboard.values(found, "diverged", env=ENV)["tsm"] == pytest.approx([0.5 / N] * 3)
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import control, runs, study
+from tsmlib import control, runs, store, study
+from tsmlib.envs import DELAY, NOISE, imperfect
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import ParameterError, Run
 from tsmlib.store import StoreError
@@ -68,6 +69,21 @@ def test_data_are_a_function_of_the_seed_and_held_out_data_of_none(made: Run, tm
     assert not np.array_equal(splits[1], splits[2])
 
 
+@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
+@pytest.mark.parametrize("split", study.SPLITS)
+def test_data_of_an_imperfect_arm_are_the_plain_arms_episodes(made: Run, how: dict[str, Any], split: str) -> None:
+    env = imperfect(REACHER, **how)
+    plain, data = study.dataset(made, REACHER, split), study.dataset(made, env, split)
+    assert data.env == env
+    np.testing.assert_array_equal(data.actions, plain.actions)
+    if "noise" in how:
+        assert (data.states != plain.states).all()
+        assert np.corrcoef(data.states[..., 4].ravel(), plain.states[..., 4].ravel())[0, 1] > 0.8  # of the same motion
+    else:
+        np.testing.assert_array_equal(data.states[:, : DELAY + 1, :2].std(1) < 0.2, True)  # nothing pushes yet
+        assert (data.states[:, 0] == plain.states[:, 0]).all()
+
+
 def test_the_papers_sizes() -> None:
     paper = runs.resolve("01_collect", scale="paper")
     assert study.sizes(paper, REACHER) == {"train": 500, "validation": 200, "test": 1000}
@@ -108,6 +124,19 @@ def test_models_with_contacts_are_wider(env: str) -> None:
     wide = "Push" in env
     assert (config["channels"], config["head_channels"]) == ((64, 128) if wide else (32, 0))  # appendix A.1
     assert (config["segment_len"], config["latent_dim"]) == (10, 8)  # section 5.1
+
+
+def test_an_imperfect_arm_is_trained_as_long_as_the_plain_one_and_shares_its_prior(
+    made: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study.models, "fit", no_training)
+    prior, _ = study.load_or_train(made, REACHER, "prior")
+    for env in (imperfect(REACHER, noise=0.1), imperfect(REACHER, delay=DELAY)):
+        for scale in ("smoke", "paper"):
+            run = runs.resolve("02_train", scale=scale)
+            assert study.models.schedule(run, env, "tsm") == study.models.schedule(run, REACHER, "tsm")
+        shared, _ = study.load_or_train(made, env, "prior")
+        assert all(torch.equal(a, b) for a, b in zip(prior.parameters(), shared.parameters(), strict=True))
 
 
 def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,6 +304,30 @@ def test_a_model_of_another_environment_is_refused_naming_both(run: Run) -> None
     with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"):
         study.load_or_train(run, "tsm/PymunkReacher-v0", "tsm")
     assert there.read_bytes() == before
+
+
+@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
+def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place(run: Run, how: dict[str, Any]) -> None:
+    env = imperfect(REACHER, **how)
+    (model, header), there = study.load_or_train(run, REACHER, "tsm"), run.models / "Reacher" / "tsm.safetensors"
+    other = run.folder(f"models/{study.short(env)}") / "tsm.safetensors"
+    shutil.copy(there, other)
+    with pytest.raises(StoreError, match=f"env is '{REACHER}' in the file, expected '{env}'"):
+        study.load_or_train(run, env, "tsm")
+    kept = {key: header[key] for key in ("model", "seed", "scale", "curves", "seconds")}
+    store.save_model(other, model, kept | {"fingerprint": study.data.fingerprint(env)})
+    assert study.load_or_train(run, env, "tsm")[1]["fingerprint"]["env"] == env
+    shutil.copy(other, there)
+    with pytest.raises(StoreError, match=f"env is '{env}' in the file, expected '{REACHER}'"):
+        study.load_or_train(run, REACHER, "tsm")
+
+
+def test_data_of_a_plain_arm_are_refused_for_an_imperfect_one(run: Run) -> None:
+    env = imperfect(REACHER, noise=NOISE)
+    there = run.folder(f"data/{study.short(env)}") / "train.safetensors"
+    shutil.copy(run.data / "Reacher" / "train.safetensors", there)
+    with pytest.raises(StoreError, match=f"trajectories of {REACHER}, expected {env}"):
+        study.dataset(run, env, "train")
 
 
 def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:

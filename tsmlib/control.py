@@ -249,7 +249,7 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
 def _measured(task: Task, env: VectorEnv, seen: np.ndarray, actions: Tensor, plan: Plan | None) -> Trial:
     """The trial that just ended in ``env``, of which the sensors said ``seen`` (B, T + 1, dx)."""
     states = observed = torch.from_numpy(seen)
-    if isinstance(env, ImperfectArms):
+    if isinstance(env, ImperfectArms) and env.sigma:
         states = torch.from_numpy(env.truth).float()
     return Trial(
         actions=actions,

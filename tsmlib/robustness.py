@@ -43,12 +43,13 @@ def condition(env: str) -> str:
 def renamed(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of an imperfect environment as rows of the plain one, with what is imperfect as their condition.
 
-    The open loop's ``clean`` becomes ``noise``, say, ``segments`` becomes ``noise, segments``.
+    The open loop's ``clean`` becomes ``noise``, say, ``segments`` becomes ``noise, segments``. Those of the plain
+    arm stay as they are, but that ``learning`` becomes ``clean``.
     """
     found = []
     for row in rows:
         word, subset = condition(row["env"]), row["condition"]
-        kept = word if subset in ("clean", "learning") else f"{word}, {subset}"
+        kept = word if subset in ("clean", "learning") else subset if word == "clean" else f"{word}, {subset}"
         found.append({**row, "env": imperfections(row["env"])[0], "condition": kept})
     return found
 

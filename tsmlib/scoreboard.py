@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.control import sim_of
-from tsmlib.envs import has_block
+from tsmlib.envs import has_block, imperfections
 from tsmlib.evaluate import LEVELS, Scores, after_first, contact_steps, cut
 from tsmlib.style import interval
 from tsmlib.trajectory import Trajectories
@@ -78,7 +78,9 @@ def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:
 
 
 def touches(test: Trajectories, scores: Scores, starts: Sequence[int] = (10,)) -> Tensor:
-    """(N, T) bool in the order of ``scores``: the arm touches the obstacle or object."""
+    """(N, T) bool in the order of ``scores``: the arm touches the obstacle or object. ValueError for noisy states."""
+    if imperfections(test.env)[1]:
+        raise ValueError(f"noisy states of {test.env} do not tell what touches; give the same episodes without noise")
     return cut(contact_steps(test.states, test.env), starts, scores.pit.shape[1])
 
 

@@ -52,7 +52,8 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
     """
     if env_id not in ENV_IDS:
         raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}; noise and delay are added to one of these")
-    if not 0.0 <= noise <= 10.0 or round(noise, 4) != noise or not (isinstance(delay, int) and 0 <= delay <= 100):
+    whole = isinstance(delay, int) and not isinstance(delay, bool)
+    if not 0.0 <= noise <= 10.0 or round(noise, 4) != noise or not (whole and 0 <= delay <= 100):
         raise ValueError(
             f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four decimals, and a "
             "whole number of steps from 0 to 100"
@@ -70,8 +71,11 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
 
 
 def imperfections(env_id: str) -> tuple[str, float, int]:
-    """The plain arm behind an id, the noise of its sensors and the delay of its actions."""
-    arm, noise, delay = re.fullmatch(r"(.*?)(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v0", env_id).groups()  # type: ignore[union-attr]
+    """The plain arm behind an id, the noise of its sensors and the delay of its actions. ValueError for another id."""
+    parts = re.fullmatch(r"(.*?)(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v0", env_id)
+    arm, noise, delay = parts.groups() if parts else ("", None, None)
+    if f"{arm}-v0" not in ENV_IDS:
+        raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them")
     return f"{arm}-v0", float(noise or 0.0), int(delay or 0)
 
 

@@ -200,16 +200,7 @@ class ArmVectorEnv(VectorEnv, ABC):
         """
         if self._elapsed is None:
             raise gymnasium.error.ResetNeeded(f"{self.env_id}: call reset() before step() or rollout()")
-        actions = np.asarray(actions, np.float64)
-        if actions.ndim != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != 2:
-            raise ValueError(f"actions are {actions.shape}; {self.env_id} expected (N={self.num_envs}, T, 2)")
-        bad = np.argwhere(~np.isfinite(actions))
-        if len(bad):
-            episode, step, joint = bad[0]
-            raise ValueError(
-                f"{len(bad)} action(s) for {self.env_id} are not finite, the first in episode {episode}, step {step}, "
-                f"joint {joint}: {actions[episode, step, joint]}. Nothing was simulated."
-            )
+        actions = self.checked(actions)
         if actions.shape[1] == 0:
             return np.zeros((self.num_envs, 0, len(self.names)))
         try:
@@ -220,6 +211,20 @@ class ArmVectorEnv(VectorEnv, ABC):
         self._states = states[:, -1].copy()
         self._elapsed += actions.shape[1]
         return states
+
+    def checked(self, actions: np.ndarray) -> np.ndarray:
+        """``actions`` as floats; ValueError where they are not of this shape, or not finite."""
+        actions = np.asarray(actions, np.float64)
+        if actions.ndim != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != 2:
+            raise ValueError(f"actions are {actions.shape}; {self.env_id} expected (N={self.num_envs}, T, 2)")
+        bad = np.argwhere(~np.isfinite(actions))
+        if len(bad):
+            episode, step, joint = bad[0]
+            raise ValueError(
+                f"{len(bad)} action(s) for {self.env_id} are not finite, the first in episode {episode}, step {step}, "
+                f"joint {joint}: {actions[episode, step, joint]}. Nothing was simulated."
+            )
+        return actions
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and the targets."""

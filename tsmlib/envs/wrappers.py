@@ -114,7 +114,7 @@ class ImperfectArms(VectorWrapper):
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
         """Take actions (N, T, 2), apply those from tau steps ago, and give the noisy states (N, T, dx) after each."""
-        given = np.concatenate([self._on_the_way, np.asarray(actions, np.float64)], axis=1)
+        given = np.concatenate([self._on_the_way, self._arms.checked(actions)], axis=1)
         split = given.shape[1] - self.tau
         states = self._arms.rollout(given[:, :split])
         self._on_the_way = given[:, split:]
@@ -123,7 +123,7 @@ class ImperfectArms(VectorWrapper):
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """As the arms', with the noisy states; ``info["state"]`` (N, dx) holds the true ones."""
-        given = np.concatenate([self._on_the_way, np.asarray(actions, np.float64)[:, None]], axis=1)
+        given = np.concatenate([self._on_the_way, self._arms.checked(np.asarray(actions)[:, None])], axis=1)
         states, reward, terminated, truncated, info = self._arms.step(given[:, 0])
         self._on_the_way = given[:, 1:]
         self._seen.append(states[:, None])

@@ -1,0 +1,119 @@
+"""Arms with noisy sensors or delayed actions have names of their own, and are no other arms."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from tsmlib import study
+from tsmlib.envs import DELAY, ENV_IDS, NOISE, fingerprint, imperfect, imperfections
+from tsmlib.envs.base import HALF_RANGE
+
+REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_a_name_says_what_is_imperfect_and_nothing_else(env_id: str) -> None:
+    names = set()
+    for noise, delay in itertools.product([0.0, 0.0001, 0.1, NOISE, 1.0, 9.8765, 10.0], [0, 1, DELAY, 100]):
+        name = imperfect(env_id, noise=noise, delay=delay)
+        assert imperfections(name) == (env_id, noise, delay)
+        names.add(name)
+    assert len(names) == 28
+    assert imperfect(env_id) == env_id
+    assert imperfect(env_id, noise=0.25, delay=5) == env_id.replace("-v0", "-noise0.25-delay5-v0")
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_the_papers_imperfections_are_there_from_the_start(env_id: str) -> None:
+    for word in ("noise0.25", "delay5"):
+        assert env_id.replace("-v0", f"-{word}-v0") in gymnasium.registry
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_one_arm_and_many_are_made_by_name(env_id: str) -> None:
+    name = imperfect(env_id, noise=NOISE, delay=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one, many = gymnasium.make(name), gymnasium.make_vec(name, num_envs=2)
+    assert one.spec is not None
+    assert many.unwrapped.spec is not None
+    assert one.spec.id == many.unwrapped.spec.id == name
+    for env, state, push in ((one, ..., np.ones(2, np.float32)), (many, 0, np.ones((2, 2), np.float32))):
+        env.reset(seed=1)
+        moved: list[Any] = []
+        for _ in range(4):
+            seen, _, _, _, info = env.step(push)
+            assert (seen != info["state"]).all()
+            moved.append(info["state"][state][2:4])
+        assert abs(moved[0]).max() < 1 < abs(moved[3]).max()  # rad/s: full torque arrives with the third step
+    for _ in range(96):
+        _, _, _, late, _ = one.step(np.zeros(2, np.float32))
+    assert late
+    one.close()
+    many.close()
+
+
+def test_an_imperfect_arm_starts_where_the_plain_one_does() -> None:
+    for name in (imperfect(PUSH, noise=NOISE), imperfect(PUSH, delay=DELAY)):
+        plain, other = (gymnasium.make_vec(env, num_envs=4) for env in (PUSH, name))
+        (start, info), (_, other_info) = plain.reset(seed=3), other.reset(seed=3)
+        np.testing.assert_array_equal(info["target"], other_info["target"])
+        np.testing.assert_array_equal(start, other_info["state"])
+
+
+@pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf"), 10.5, 0.00001])
+def test_a_noise_that_makes_no_sense_is_refused(noise: float) -> None:
+    with pytest.raises(ValueError, match=rf"noise is {noise}.*expected a sigma from 0 to 10 with at most four"):
+        imperfect(REACHER, noise=noise)
+
+
+@pytest.mark.parametrize("delay", [-1, 1.5, 101, True, "5"])
+def test_a_delay_that_makes_no_sense_is_refused(delay: Any) -> None:
+    with pytest.raises(ValueError, match=rf"delay is {delay}; expected .*whole number of steps from 0 to 100"):
+        imperfect(REACHER, delay=delay)
+
+
+def test_only_a_plain_arm_is_made_imperfect() -> None:
+    for env_id in ("tsm/Nothing-v0", imperfect(REACHER, noise=NOISE), ""):
+        with pytest.raises(ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*added to one of these"):
+            imperfect(env_id, delay=DELAY)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "tsm/Nothing-noise0.25-v0", "tsm/Reacher-noise-v0",
+                                    "tsm/Reacher-delay5-noise0.25-v0", ""])  # fmt: skip
+def test_another_name_is_refused(env_id: str) -> None:
+    with pytest.raises(ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*nor what imperfect\(\) calls"):
+        imperfections(env_id)
+
+
+def test_data_of_other_imperfections_are_other_data() -> None:
+    ids = [REACHER, *(imperfect(REACHER, noise=noise, delay=delay) for noise, delay in
+                      [(NOISE, 0), (0.1, 0), (0.0, DELAY), (0.0, 4), (NOISE, DELAY)])]  # fmt: skip
+    prints = [fingerprint(env) for env in ids]
+    without_names = [{key: value for key, value in one.items() if key != "env"} for one in prints]
+    for one, other in itertools.combinations(without_names, 2):
+        assert one != other
+        assert one["simulator"] == other["simulator"]
+        assert {key for key in one if one[key] != other[key]} <= {"noise", "delay"}
+    assert (prints[-1]["noise"], prints[-1]["delay"]) == (NOISE, DELAY)
+
+
+@pytest.mark.parametrize("env_id", [REACHER, PUSH])
+def test_half_ranges_are_those_of_random_data(env_id: str) -> None:
+    states = study.random_data(env_id, 500, seed=4).states
+    share = (states.max((0, 1)) - states.min((0, 1)))[2:] / (2 * np.array(HALF_RANGE[2 : states.shape[-1]]))
+    assert np.abs(share[:6] - 1).max() < 0.25
+    assert ((share[6:] > 0.5) & (share[6:] < 1.25)).all()  # an object is rarely hit hard, in 5,000 episodes once
+
+
+def test_noise_is_in_half_ranges() -> None:
+    env: Any = gymnasium.make_vec(imperfect(PUSH, noise=0.5), num_envs=20)
+    env.reset(seed=0)
+    off = env.rollout(np.zeros((20, 50, 2))) - env.truth[:, 1:]
+    np.testing.assert_allclose(off.std((0, 1)), 0.5 * np.array(HALF_RANGE), rtol=0.08)  # 3 standard errors are 0.067

@@ -1,0 +1,250 @@
+"""Figures of noise and delay show the numbers they are given, on one scale, and say what they leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from tsmlib import style
+from tsmlib.robust_figures import advantage_map, figure8, filtering, imperfect_episode
+from tsmlib.style import interval
+
+STEPS, DT = 20, 0.02
+FLOOR = {"random": -13.5, "zero": -12.1}
+draw = np.random.default_rng(0)
+
+
+def learned(end: float, k: int = 3, records: int = 5) -> dict[str, np.ndarray]:
+    true = end + (-12 - end) * np.exp(-np.arange(records)) + 0.1 * draw.normal(size=(k, records))
+    return {"return_true": true, "iterations": 220.0 * np.arange(records)}
+
+
+CURVES = {
+    condition: {"tsm codes": learned(-4.0 - worse), "tsm actions": learned(-5.0 - worse), "lstm actions": learned(-7.0)}
+    for condition, worse in (("clean", 0.0), ("noise", 1.0), ("delay", 2.0))
+}
+CLEAN = np.cumsum(draw.normal(size=(STEPS + 1, 3)), 0)
+NOISY = CLEAN + 0.25 * draw.normal(size=CLEAN.shape)
+SENT = draw.uniform(-1, 1, STEPS)
+APPLIED = np.concatenate([np.zeros(5), SENT])[:STEPS]
+TITLES = ("joint1 (rad)", "joint0 vel (rad/s)", "tip x (m)")
+PARTS = ("whole state", "angles", "velocities", "fingertip")
+
+
+def ahead(level: float, k: int = 3) -> np.ndarray:
+    return level * (1 + 0.1 * np.arange(10)) + 0.002 * draw.normal(size=(k, 10))
+
+
+AHEAD = {part: {"tsm": ahead(0.1 + 0.02 * i), "lstm": ahead(0.15), "filter": ahead(0.08, k=1)}
+         for i, part in enumerate(PARTS)}  # fmt: skip
+NOW = {part: {"filter": 0.07, "exponential": 0.15} for part in PARTS}
+RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
+MAP = {
+    "plain arm: minus one-step": np.array([[-1.24, 0.3], [2.0, 8.0]]),
+    "after contact: minus LSTM": np.array([[0.5, np.nan], [-3.0, 1.0]]),
+}
+
+
+def episode(**changed: Any) -> Figure:
+    given: dict[str, Any] = dict(clean=CLEAN, noisy=NOISY, taken=SENT, applied=APPLIED, titles=TITLES, dt=DT)
+    return imperfect_episode(**given | changed)
+
+
+def grid(given: Any = MAP, noise: Any = (0.0, 0.25), delay: Any = (0, 5)) -> Figure:
+    return advantage_map(given, noise=noise, delay=delay, unit="nats per step")
+
+
+def lines(ax: Axes, label: str) -> list[Any]:
+    return [line for line in ax.lines if to_hex(line.get_color()).lower() == style.colour(label).lower()]
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+EVERY: dict[str, Callable[[], Figure]] = {
+    "figure 8": lambda: figure8(CURVES, FLOOR),
+    "figure 8, one condition": lambda: figure8({"noise": CURVES["noise"]}),
+    "an episode": episode,
+    "filtering": lambda: filtering(AHEAD, NOW, RAW),
+    "filtering, one part and one seed": lambda: filtering(
+        {"angles": {"tsm": ahead(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
+    ),
+    "a map": grid,
+    "a map of nothing": lambda: grid({"plain arm: minus LSTM": np.full((2, 2), np.nan)}),
+    "a map of one cell without a difference": lambda: grid({"plain arm": np.zeros((1, 1))}, [0.0], [0]),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", EVERY)
+def test_every_figure_is_laid_out_without_warnings_and_not_left_open(name: str) -> None:
+    figure = EVERY[name]()
+    figure.draw_without_rendering()
+    assert plt.get_fignums() == []
+    assert min(text.get_fontsize() for text in figure.findobj(plt.Text) if text.get_text()) >= 6.5
+
+
+@pytest.mark.parametrize("name", ["figure 8", "an episode", "filtering", "a map"])
+def test_titles_fit_beside_each_other(name: str) -> None:
+    figure = EVERY[name]()
+    figure.canvas.draw()
+    boxes = [ax._left_title.get_window_extent() for ax in figure.axes if ax.get_title(loc="left")]
+    assert boxes
+    assert max(box.x1 for box in boxes) <= figure.bbox.x1
+    for one, other in pairwise(boxes):
+        assert one.x1 < other.x0
+
+
+# Figure 8 ------------------------------------------------------------------------------------------------------------
+
+
+def test_figure_8_has_a_column_for_each_condition_and_one_scale_for_all() -> None:
+    figure = figure8(CURVES, FLOOR)
+    assert [ax.get_title(loc="left") for ax in figure.axes] == ["Clean", "Noise", "Delay"]
+    (scale,) = {ax.get_ylim() for ax in figure.axes}
+    assert scale[0] < -13.5
+    assert scale[1] > max(row["return_true"].mean(0).max() for rows in CURVES.values() for row in rows.values())
+
+
+def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in_every_panel() -> None:
+    for ax, (_, rows) in zip(figure8(CURVES, FLOOR).axes, CURVES.items(), strict=True):
+        (lstm,) = lines(ax, "lstm")
+        np.testing.assert_allclose(lstm.get_ydata(), rows["lstm actions"]["return_true"].mean(0))
+        np.testing.assert_array_equal(lstm.get_xdata(), rows["lstm actions"]["iterations"])
+        codes, actions = lines(ax, "tsm")
+        np.testing.assert_allclose(codes.get_ydata(), rows["tsm codes"]["return_true"].mean(0))
+        np.testing.assert_allclose(actions.get_ydata(), rows["tsm actions"]["return_true"].mean(0))
+        flat = {line.get_ydata()[0] for line in ax.lines if len(set(line.get_ydata())) == 1}
+        assert flat == set(FLOOR.values())
+        mean, half = interval(rows["tsm codes"]["return_true"][:, 3])
+        at_record = [part.get_paths()[0].vertices for part in ax.collections]
+        at_record = [np.round(v[v[:, 0] == 660.0, 1], 9) for v in at_record]
+        assert any(sorted(set(v)) == pytest.approx([mean - half, mean + half]) for v in at_record)
+
+
+# An episode ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_episode_shows_what_is_true_and_what_sensors_say_at_every_step() -> None:
+    axes = episode().axes
+    assert [ax.get_title(loc="left") for ax in axes[:3]] == list(TITLES)
+    for d, ax in enumerate(axes[:3]):
+        seen, truth = ax.lines
+        np.testing.assert_array_equal(seen.get_ydata(), NOISY[:, d])
+        np.testing.assert_array_equal(truth.get_ydata(), CLEAN[:, d])
+        np.testing.assert_allclose(truth.get_xdata(), DT * np.arange(STEPS + 1))
+        assert (seen.get_linestyle(), truth.get_linestyle()) == ("None", "-")
+
+
+def test_a_torque_is_held_from_its_step_on() -> None:
+    sent, applied = episode().axes[-1].lines
+    np.testing.assert_array_equal(sent.get_ydata(), SENT)
+    np.testing.assert_array_equal(applied.get_ydata(), APPLIED)
+    np.testing.assert_allclose(sent.get_xdata(), DT * np.arange(STEPS))
+    assert sent.get_drawstyle() == applied.get_drawstyle() == "steps-post"
+
+
+# Filtering -----------------------------------------------------------------------------------------------------------
+
+
+def test_errors_stand_at_their_steps_and_a_filter_begins_with_the_present() -> None:
+    figure = filtering(AHEAD, NOW, RAW)
+    for ax, part in zip(figure.axes, PARTS, strict=True):
+        (tsm,) = lines(ax, "tsm")
+        assert tsm.get_xdata().tolist() == list(range(1, 11))
+        np.testing.assert_allclose(tsm.get_ydata(), AHEAD[part]["tsm"].mean(0))
+        kalman, exponential = lines(ax, "filter")
+        assert kalman.get_xdata().tolist() == list(range(11))
+        np.testing.assert_allclose(kalman.get_ydata(), [0.07, *AHEAD[part]["filter"][0]])
+        assert (list(exponential.get_xdata()), list(exponential.get_ydata())) == ([0], [0.15])
+        (raw,) = lines(ax, "zero")
+        assert set(raw.get_ydata()) == {RAW[part]}
+    assert [ax.get_title(loc="left") for ax in figure.axes] == [part.capitalize() for part in PARTS]
+    assert legend(figure) == ["TSM", "LSTM", "Kalman filter", "exponential filter", "raw observation"]
+
+
+def test_all_parts_share_a_scale_in_which_the_raw_observation_is_seen() -> None:
+    figure = filtering(AHEAD, NOW, RAW | {"angles": 3.0})
+    (scale,) = {ax.get_ylim() for ax in figure.axes}
+    assert scale[0] == 0
+    assert scale[1] > 3.0
+
+
+def test_a_model_that_is_far_off_is_told_in_words() -> None:
+    rows = {part: dict(own) for part, own in AHEAD.items()}
+    rows["velocities"]["onestep"] = ahead(2.0)
+    figure = filtering(rows, NOW, RAW)
+    assert figure.axes[0].get_ylim()[1] < 1
+    told = [ax.get_xlabel().replace("\n", " ") for ax in figure.axes]
+    assert told[2] == f"steps ahead outside: one-step to {rows['velocities']['onestep'].mean(0).max():.3g}"
+    assert told[0] == told[1] == told[3] == "steps ahead"
+    assert len(lines(figure.axes[2], "onestep")) == 2  # the line and its arrow
+
+
+# The map -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_map_has_noise_upwards_delay_to_the_right_and_zero_in_the_middle_of_its_colours() -> None:
+    figure = grid()
+    for ax, (title, values) in zip(figure.axes, MAP.items(), strict=False):
+        (image,) = ax.images
+        np.testing.assert_array_equal(image.get_array().filled(np.nan), values)
+        assert image.origin == "lower"
+        assert ax.get_title(loc="left") == title.replace(": ", ":\n")
+        assert [text.get_text() for text in ax.get_xticklabels()] == ["0", "5"]
+        assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["0", "0.25"]
+    assert figure.axes[0].get_ylabel() == "noise (half ranges)"
+    assert figure.axes[-1].get_ylabel() == "nats per step"
+
+
+def test_every_cell_says_its_number_and_an_empty_one_nothing() -> None:
+    plain, contact = grid().axes[:2]
+    written = {ax: {text.get_position(): text.get_text() for text in ax.texts} for ax in (plain, contact)}
+    assert written[plain] == {(0, 0): "−1.2", (1, 0): "+0.3", (0, 1): "+2.0", (1, 1): "+8.0"}
+    assert written[contact] == {(0, 0): "+0.5", (1, 0): "", (0, 1): "−3.0", (1, 1): "+1.0"}
+    assert contact.patch.get_hatch()  # what shows through an empty cell
+
+
+# What cannot be drawn ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: figure8({}), "nothing to draw"),
+        (lambda: figure8({"noise": {"alien codes": learned(-4)}}), "starts with 'alien'"),
+        (lambda: figure8({"noise": {"tsm codes": learned(-4) | {"iterations": np.arange(4)}}}), r"expected \(5\)"),
+        (lambda: figure8({"noise": {"tsm codes": learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}),
+         "noise, tsm codes, return_true: 15 of 15"),
+        (lambda: figure8(CURVES, {"none": -12.0}), "starts with 'none'"),
+        (lambda: episode(titles=TITLES[:2]), r"clean has shape \(21, 3\), expected \(T, 2\)"),
+        (lambda: episode(noisy=NOISY[1:]), r"noisy has shape \(20, 3\), expected \(21, 3\)"),
+        (lambda: episode(taken=SENT[1:]), r"taken has shape \(19,\), expected \(20\)"),
+        (lambda: episode(applied=np.append(APPLIED, 0)), r"applied has shape \(21,\), expected \(20\)"),
+        (lambda: episode(clean=np.where(CLEAN > 0, CLEAN, np.inf)), "clean: .* values are not finite"),
+        (lambda: filtering({}, {}, {}), "nothing to draw"),
+        (lambda: filtering(AHEAD, NOW, {"angles": 0.25}), "raw has the panels angles; expected whole state, angles"),
+        (lambda: filtering(AHEAD, {}, RAW), "now has the panels ; expected whole state"),
+        (lambda: filtering({"angles": {"tsm": np.zeros(10)}}, {"angles": {}}, {"angles": 0.25}),
+         r"angles, tsm has shape \(10,\), expected \(k, K\)"),
+        (lambda: filtering({"angles": {"tsm": np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}),
+         "angles, tsm: 10 of 10 values are not finite"),
+        (lambda: filtering({"angles": {"alien": np.zeros((1, 10))}}, {"angles": {}}, {"angles": 0.25}), "'alien'"),
+        (lambda: grid({}), "nothing to draw"),
+        (lambda: grid(delay=(0, 5, 10)), r"minus one-step is \(2, 2\), expected \(2, 3\): noise by delay"),
+    ],
+)  # fmt: skip
+def test_input_that_cannot_be_drawn_is_refused_in_words(call: Callable[[], Figure], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+    assert plt.get_fignums() == []
