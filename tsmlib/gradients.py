@@ -5,16 +5,19 @@ Letters in shapes: B starts, S model samples, K segments, T horizon, dz and du s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tsmlib.control import Task
 from tsmlib.dynamics import DynamicsModel
 from tsmlib.prior import ActionPrior
+from tsmlib.style import interval, name
 from tsmlib.trajectory import Segment
 from tsmlib.trajopt import DirectActions, LatentActions, Space, expected_return, through_model
 
@@ -64,7 +67,7 @@ def of_return(task: Task, model: DynamicsModel, prior: ActionPrior, *, seed: int
             return expected_return(predict(actions), actions, task.reward).sum()
 
         word = "codes" if isinstance(space, LatentActions) else "torques"
-        return {name: max(relative_errors(value, some)) for name, some in {word: [point], **parts}.items()}
+        return {part: max(relative_errors(value, some)) for part, some in {word: [point], **parts}.items()}
 
     weights = {"model": _playing(net), "prior": _playing(prior)}
     return errors(LatentActions(prior, task.horizon), weights) | errors(DirectActions(task.horizon), {})
@@ -72,7 +75,7 @@ def of_return(task: Task, model: DynamicsModel, prior: ActionPrior, *, seed: int
 
 def _playing(net: Any) -> list[Tensor]:
     """The weights that a prediction depends on."""
-    return [p for name, p in net.named_parameters() if not name.startswith("encoder")]
+    return [p for key, p in net.named_parameters() if not key.startswith("encoder")]
 
 
 def signal(task: Task, model: DynamicsModel, space: Space, *, samples: int = 32, seed: int = 0) -> Tensor:
@@ -94,3 +97,21 @@ def signal(task: Task, model: DynamicsModel, space: Space, *, samples: int = 32,
     mean, deviation = drawn.mean(0).abs(), drawn.std(0)
     ratio = mean / torch.maximum(deviation, ROUNDING * mean).clamp_min(1e-300)
     return ratio.clamp_min(ROUNDING).log().mean(1).exp()
+
+
+def report(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Rows of ``gradient_snr`` as a Markdown table: the geometric mean over starts, and by how much that over codes is
+    larger than that over torques, with the 95 % t interval over starts (means over the seeds there are)."""
+    found: dict[tuple[str, str], dict[str, dict[int, list[float]]]] = {}
+    for row in rows:
+        if row["metric"] == "gradient_snr":
+            starts = found.setdefault((row["env"], row["model"]), {}).setdefault(row["prior"], {})
+            starts.setdefault(row["target"], []).append(math.log(row["value"]))
+    lines = ["| environment | model | n | over codes | over torques | codes / torques |", "|---" * 6 + "|"]
+    for (env, model), ways in found.items():
+        codes, actions = (np.array([np.mean(ways[way][i]) for i in sorted(ways[way])]) for way in ("codes", "actions"))
+        mean, half = interval(codes - actions)
+        cells = [f"{np.exp(value):.3g}" for value in (codes.mean(), actions.mean(), mean, mean - half, mean + half)]
+        ratio = f"{cells[2]} [{cells[3]}, {cells[4]}]"
+        lines.append(f"| `{env}` | {name(model)} | {len(codes)} | {cells[0]} | {cells[1]} | {ratio} |")
+    return "\n".join(lines)
