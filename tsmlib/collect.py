@@ -100,7 +100,8 @@ def cells_visited(points: np.ndarray, *, inner: float, outer: float, cells: int 
     are those whose centre is in the disc and not in its hole of radius ``inner``.
     """
     edges = np.linspace(-outer, outer, cells + 1)
-    visits, _, _ = np.histogram2d(*np.asarray(points, np.float64).reshape(-1, 2).T, bins=(edges, edges))
+    x, y = np.asarray(points, np.float64).reshape(-1, 2).T
+    visits, _, _ = np.histogram2d(x, y, bins=[edges, edges])
     centres = (edges[:-1] + edges[1:]) / 2
     radius = np.hypot(centres[:, None], centres)
     return float((visits > 0)[(radius >= inner) & (radius <= outer)].mean())

@@ -48,13 +48,13 @@ def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *,
     return found
 
 
-def of_return(task: Task, model: DynamicsModel, prior: ActionPrior, *, seed: int = 0) -> dict[str, float]:
+def of_return(task: Task, model: Any, prior: ActionPrior, *, seed: int = 0) -> dict[str, float]:
     """The largest of ``relative_errors`` of the expected return of ``task`` through model, prior and reward, by what
     it is a function of: random codes, random torques, the weights of the model, the weights of the prior.
 
     Of copies in float64, with two model samples. Weights that play no part, those of the encoders, are left out.
     """
-    net, prior = (deepcopy(part).double().requires_grad_() for part in (model, prior))  # type: ignore[attr-defined]
+    net, prior = deepcopy(model).double().requires_grad_(), deepcopy(prior).double().requires_grad_()
     past = Segment(*(part.double() for part in task.past(net.past_len)))
     predict = through_model(net, past, samples=2, seed=seed)
     draw = torch.Generator().manual_seed(seed)
