@@ -10,7 +10,7 @@ import torch
 from tsmlib.collect import smooth_torques
 from tsmlib.envs import closest_gap
 from tsmlib.envs.base import fingertip
-from tsmlib.invariants import broken, novelty, roughness, shares, worst
+from tsmlib.invariants import broken, novelty, roughness, shares, within, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
 
@@ -183,3 +183,12 @@ def test_the_nearest_segment_is_the_nearest() -> None:
     torch.testing.assert_close(novelty(plans, data, segment_len=3), torch.tensor(by_hand))
     with pytest.raises(ValueError, match="hold no segment of 10 steps"):
         novelty(plans, data)
+
+
+def test_the_range_of_the_data_holds_95_of_100_of_their_steps_and_none_of_what_is_larger() -> None:
+    data = smooth_torques(300, 60, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.2])
+    assert within(data, data).mean() == pytest.approx(0.95, abs=1e-4)
+    assert within(torch.zeros(2, 50, 2), data).tolist() == [1, 1]
+    plan = torch.zeros(1, 4, 2)
+    plan[0, 1, 0], plan[0, 3, 1] = 0.5, -0.15  # both far above a tenth, and a tenth of a fifth
+    assert within(plan, data).tolist() == [0.5]

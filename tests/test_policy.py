@@ -393,7 +393,12 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
         study.policies, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {})
     )
     task = study.task("tsm/Reacher-v0", "validation").take(3)
+    assert study.kept_budget(run, task, "tsm", prior) is None
     actor, header = study.learn(run, task, "tsm", prior, copies=2)
+    assert study.kept_budget(run, task, "tsm", prior) == {"copies": 2, "iterations": 4}
+    near = study.within_data(run, task, actor)
+    assert near.shape == (2,)
+    assert ((near >= 0) & (near <= 1)).all()
     assert header["curve"]["iteration"] == [0, 1, 2, 3, 4]
     for metric in ("return_true", "return_predicted", "final_distance", "success"):
         assert torch.tensor(header["curve"]["measured"][metric]).shape == (5, 2)

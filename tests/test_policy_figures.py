@@ -237,10 +237,51 @@ def test_seeds_that_stopped_early_are_left_out_of_a_growing_table() -> None:
 
 def test_samples_to_reach_a_level_are_read_off_the_mean_curve() -> None:
     curves = {"return_true": np.array([[-10.0, -6.0, -4.0], [-10.0, -8.0, -4.0]]), "samples": np.array([0, 100, 200])}
-    assert policy_report.samples_to_reach(curves, -10.0) == 0
-    assert policy_report.samples_to_reach(curves, -8.5) == 50
-    assert policy_report.samples_to_reach(curves, -5.5) == 150
-    assert policy_report.samples_to_reach(curves, -3.0) is None
+    assert policy_report.reached(curves, -10.0) == 0
+    assert policy_report.reached(curves, -8.5) == 50
+    assert policy_report.reached(curves, -5.5) == 150
+    assert policy_report.reached(curves, -3.0) is None
+
+
+def ended(*means: float, prior: bool = True) -> dict[str, np.ndarray]:
+    """Curves of two copies, 1 m apart, around means at records 100 iterations or samples apart."""
+    true = np.array(means)[None] + np.array([[-0.5], [0.5]])
+    at = 100.0 * np.arange(len(means))
+    return {"return_true": true, "samples": np.full(len(at), 5000.0) if prior else at, "seconds": 7 + at / 10} | (
+        {"iterations": at} if prior else {}
+    )
+
+
+def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all_come_to() -> None:
+    curves = {"tsm codes": ended(-12, -4, -3), "ppo": ended(-13, -8, -2, prior=False)}
+    curves |= {"trpo": ended(-13, -13, -9, prior=False)}
+    rows = policy_report.plateau_rows(curves, steps=50, env="tsm/Reacher-v0")  # from -12 to -3: 90 % is -3.9
+    found = {(row["model"], row["metric"]): row["value"] for row in rows}
+    assert found["tsm", "samples_to_90"] == pytest.approx(50 * 110)
+    assert found["tsm", "env_samples_to_90"] == 5000
+    assert found["tsm", "seconds_to_90"] == pytest.approx(18)
+    assert found["ppo", "samples_to_90"] == found["ppo", "env_samples_to_90"] == pytest.approx(100 + 410 / 6)
+    assert found["trpo", "samples_to_90"] == 200  # never: all that it took
+    assert {row["horizon"] for row in rows if "horizon" in row} == set()
+    assert len(policy_report.plateaus([row | {"task": "reach"} for row in rows]).splitlines()) == 5
+
+
+def test_policies_that_gain_nothing_have_no_plateau() -> None:
+    assert policy_report.plateau_rows({"tsm codes": ended(-4, -4.5), "ppo": ended(-9, -2, prior=False)}, steps=50) == []
+    assert policy_report.plateau_rows({}, steps=50) == []
+    assert policy_report.plateaus([]) == ""
+
+
+def test_what_belongs_to_no_point_of_a_curve_is_passed_over(tmp_path: Any) -> None:
+    more = [{**rows()[0], "metric": "samples_to_90", "horizon": ""}]
+    more += policy_report.learning_rows(header(), samples=50_000, train_seconds=100.0, within_data=[0.25, 0.75])
+    assert [(row["copy"], row["value"], row["horizon"]) for row in more if row["metric"] == "within_data"] == [
+        (0, 0.25, 440), (1, 0.75, 440),
+    ]  # fmt: skip
+    curves = policy_report.learning_curves(more)["reach"]["tsm codes"]
+    np.testing.assert_array_equal(
+        curves["return_true"], policy_report.learning_curves(rows())["reach"]["tsm codes"]["return_true"]
+    )
 
 
 def test_the_report_has_one_line_per_policy_with_its_last_record() -> None:

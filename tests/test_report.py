@@ -100,6 +100,20 @@ def test_plans_along_the_way_are_told_by_their_iteration() -> None:
     assert report.along_the_way(rows, PUSH) == {}
 
 
+def test_how_soon_a_plan_was_nearly_done_is_counted_target_by_target() -> None:
+    task = some_task(n=3)
+    plan = dreamt(task, zero_torques(task)).plan
+    assert plan is not None
+    curve = torch.arange(200.0)[:, None] * torch.tensor([0.0, 1.0, 1.0])
+    curve[60:, 2] = 199
+    rows = report.convergence(
+        task, dataclasses.replace(plan, curve=curve), RUN, model="tsm", planner="adam", prior="codes"
+    )
+    assert [(row["target"], row["value"]) for row in rows] == [(0, 0), (1, 190), (2, 60)]
+    assert {(row["condition"], row["horizon"], row["metric"]) for row in rows} == {("clean", 20, "iterations_to_95")}
+    assert "| 3 | 60 | 66.7 % | 66.7 % |" in report.by_convergence(rows)
+
+
 def test_seeds_are_averaged_target_by_target() -> None:
     rows = [
         dict(model="tsm", prior="codes", planner="cem", metric="return_true", target=i, seed=seed, value=i + seed)

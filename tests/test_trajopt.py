@@ -29,6 +29,7 @@ from tsmlib.trajopt import (
     cem,
     evaluate,
     expected_return,
+    iterations_to,
     mppi,
     sampled_starts,
     stopped,
@@ -261,6 +262,12 @@ def test_a_plan_can_be_had_as_it_was_along_the_way(planner: str) -> None:
     torch.testing.assert_close(stopped(plan, 6, predict, reward, space).actions, plan.actions)
     with pytest.raises(ValueError, match="took 6 iterations; there is no plan as of iteration 7"):
         stopped(plan, 7, predict, reward, space)
+
+
+def test_a_curve_is_nearly_done_when_it_has_95_of_100_of_its_gain() -> None:
+    curve = torch.tensor([[-10.0, -5.0, -1.0], [-2.0, -5.0, -1.0], [-0.4, -5.0, -1.0], [0.0, -5.0, 4.0]])
+    assert iterations_to(curve).tolist() == [2, 0, 3]
+    assert iterations_to(curve, 0.5).tolist() == [1, 0, 3]
 
 
 def test_mppi_at_a_low_temperature_takes_the_best_candidate_and_at_a_high_one_their_mean() -> None:

@@ -114,3 +114,14 @@ def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
         known = episodes.unfold(1, segment_len, 1).flatten(0, 1).flatten(1)
         nearest = torch.minimum(nearest, torch.cdist(segments.flatten(0, 1), known).amin(1))
     return nearest.reshape(segments.shape[:2]).mean(1) / segments.shape[2] ** 0.5
+
+
+def within(actions: Tensor, data: Tensor, *, share: float = 0.95) -> Tensor:
+    """Share of the steps of plans (B, T, du) whose torques are no larger than the training data's: (B,) (claim C16).
+
+    No larger means inside the box around zero that holds ``share`` of all steps of the data (N, T', du); its sides are
+    as the standard deviations of the data's torques.
+    """
+    std = data.flatten(0, 1).std(0)
+    size, known = ((torques / std).abs().amax(-1) for torques in (actions, data))
+    return (size <= known.flatten().quantile(share)).float().mean(1)

@@ -21,12 +21,13 @@ UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "
 
 
 def learning_rows(
-    header: Mapping[str, Any], *, samples: int, train_seconds: float, n: int = 100
+    header: Mapping[str, Any], *, samples: int, train_seconds: float, n: int = 100, within_data: Iterable[float] = ()
 ) -> list[dict[str, Any]]:
     """Rows of a learned policy, one per record, copy and metric; header: as ``study.learn`` returns it.
 
     samples: environment steps in the data set of its model; train_seconds: of the model and the prior; n: the targets
-    it is measured on. Both are rows too, so that the table says what a policy has cost in all.
+    it is measured on. Both are rows too, so that the table says what a policy has cost in all. within_data: of the
+    learned policy, one per copy (``study.within_data``).
     """
     env, curve = header["fingerprint"]["env"], header["curve"]
     common = dict(
@@ -45,9 +46,13 @@ def learning_rows(
         dict(common, horizon=iteration, metric="seconds", value=seconds, unit="s")
         for iteration, seconds in zip(curve["iteration"], curve["seconds"], strict=True)
     ]
+    common |= dict(horizon=curve["iteration"][-1])
     for metric, value, unit in (("samples", samples, "steps"), ("train_seconds", train_seconds, "s")):
-        rows.append(dict(common, horizon=curve["iteration"][-1], metric=metric, value=value, unit=unit))
-    return rows
+        rows.append(dict(common, metric=metric, value=value, unit=unit))
+    return rows + [
+        dict(common, metric="within_data", value=float(value), unit="share", n=n, copy=copy)
+        for copy, value in enumerate(within_data)
+    ]
 
 
 def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
@@ -58,7 +63,7 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     same points, or where one task was learned in two environments.
     """
     methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for row in _one_env([row for row in rows if row["condition"] == "learning"]):
+    for row in _one_env([row for row in rows if row["condition"] == "learning" and row["horizon"] != ""]):
         methods.setdefault((row["task"], f"{row['model']} {row['prior']}".strip()), []).append(row)
     found: dict[str, dict[str, Curves]] = {}
     for (task, label), own in methods.items():
@@ -141,20 +146,72 @@ def _one_env(rows: list[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return rows
 
 
-def samples_to_reach(curves: Curves, level: float) -> float | None:
-    """Environment steps after which the mean true return of model-free ``curves`` first reaches ``level``.
+def reached(curves: Curves, level: float, against: str = "samples") -> float | None:
+    """After how much of ``against`` (samples, iterations or seconds) the mean true return first reaches ``level``.
 
     Between two records along the straight line; None where it never does.
     """
-    mean, steps = curves["return_true"].mean(0), curves["samples"]
+    mean, spent = curves["return_true"].mean(0), curves[against]
     above = np.flatnonzero(mean >= level)
     if not len(above):
         return None
     i = int(above[0])
     if i == 0:
-        return float(steps[0])
+        return float(spent[0])
     share = (level - mean[i - 1]) / (mean[i] - mean[i - 1])
-    return float(steps[i - 1] + share * (steps[i] - steps[i - 1]))
+    return float(spent[i - 1] + share * (spent[i] - spent[i - 1]))
+
+
+def plateau_rows(
+    curves: Mapping[str, Curves], *, steps: int, share: float = 0.9, **common: Any
+) -> list[dict[str, Any]]:
+    """Rows of what each policy needed to come to ``share`` of the common plateau (claims C37 and C39), one task's.
+
+    curves: label -> curves of one seed, of the policies that are compared. Their common plateau is what those learned
+    inside models and the best of the model-free ones have all come to in the end; what counts is the gain over the
+    best of all before learning. There are no rows where that is none. A model-free policy that never comes there counts
+    with all that it took. steps: of its model that a policy takes per iteration.
+
+    ``samples_to_90``: steps of what it learned in, the model or else the environment; ``env_samples_to_90``: steps of
+    the environment, the data of its model included; ``seconds_to_90``: training of its model included.
+    """
+    means = {label: own["return_true"].mean(0) for label, own in curves.items()}
+    inside, free = ([mean[-1] for label, mean in means.items() if (" " in label) == way] for way in (True, False))
+    ends = [*inside, *([max(free)] if free else [])]
+    start = max((mean[0] for mean in means.values()), default=0.0)
+    if not ends or not min(ends) > start:
+        return []
+    level, rows = start + share * (min(ends) - start), []
+    for label, own in curves.items():
+        model, _, prior = label.partition(" ")
+        ways = {"samples_to_90": "iterations" if prior else "samples", "env_samples_to_90": "samples",
+                "seconds_to_90": "seconds"}  # fmt: skip
+        for metric, against in ways.items():
+            spent = reached(own, level, against)
+            value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
+            rows.append(dict(
+                common, model=model, planner="policy", prior=prior, condition="learning", metric=metric, value=value,
+                unit="s" if against == "seconds" else "steps", n=len(own["return_true"]),
+            ))  # fmt: skip
+    return rows
+
+
+SOONEST = {"samples_to_90": "steps of model or environment", "env_samples_to_90": "steps of the environment",
+           "seconds_to_90": "seconds"}  # fmt: skip
+
+
+def plateaus(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Rows of ``plateau_rows`` as a Markdown table: what each policy needed to come to 90 %, means over seeds."""
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for row in rows:
+        if row["metric"] in SOONEST:
+            label = f"{row['model']} {row['prior']}".strip()
+            found.setdefault((row["task"], label), {}).setdefault(row["metric"], []).append(row["value"])
+    lines = [f"| task | policy | {' | '.join(SOONEST.values())} |", "|---" * (len(SOONEST) + 2) + "|"]
+    for (task, label), own in found.items():
+        cells = " | ".join(f"{np.mean(own[metric]):,.0f}" for metric in SOONEST)
+        lines.append(f"| {task} | {name(label)} | {cells} |")
+    return "\n".join(lines) if found else ""
 
 
 def report(curves: LearningCurves) -> str:

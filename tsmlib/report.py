@@ -24,6 +24,7 @@ from tsmlib.envs.render import draw_scene
 from tsmlib.invariants import novelty, roughness, shares, worst
 from tsmlib.runs import Run
 from tsmlib.style import NAMES, interval, pretty
+from tsmlib.trajopt import Plan, iterations_to
 
 OPEN, CLOSED, ALONG = "clean", "closed loop", "along the way"
 ORACLE, NOTHING = label("oracle", "cem", "codes"), label("none", "zero", "")  # what earned returns are held against
@@ -115,6 +116,16 @@ def tables(
                 for i, value in enumerate(values)
             ]
     return summary, per_target
+
+
+def convergence(task: Task, plan: Plan, run: Run, **method: str) -> list[dict[str, Any]]:
+    """Rows of 05_control_rows.csv that say how soon a long optimisation was nearly done (claim C15): for each target,
+    the iterations until it promises 95 % of all that it gains. method: model, planner and prior."""
+    common = dict(
+        env=task.env, sim=sim_of(task.env), task=task.name, horizon=task.horizon, condition=OPEN, seed=run.seed,
+        scale=run.scale, metric="iterations_to_95", unit="iterations", n=1,
+    )  # fmt: skip
+    return [dict(common, **method, value=value, target=i) for i, value in enumerate(iterations_to(plan.curve).tolist())]
 
 
 def chosen(
@@ -285,6 +296,23 @@ def by_loop(rows: Rows) -> str:
             for key, own in after.items()
         ),
     )
+
+
+def by_convergence(rows: Rows) -> str:
+    """How many iterations planners took to 95 % of what they gain in the end, from rows with a ``target``."""
+    found: dict[tuple[str, str, str, str], list[float]] = {}
+    for row in rows:
+        if row["metric"] == "iterations_to_95":
+            method = (f"`{row['env']}`", *_words(row["model"], row["prior"], ""), pretty(row["planner"])[0])
+            found.setdefault(method, []).append(row["value"])
+    return _table(
+        ("environment", "model", "over", "planner", "n", "median", "within 100", "within 150"),
+        (
+            (*method, str(len(values)), f"{np.median(values):.0f}",
+             *(_percent(float(np.mean(np.array(values) <= bound))) for bound in (100, 150)))
+            for method, values in found.items()
+        ),
+    )  # fmt: skip
 
 
 def by_invariant(rows: Rows, *, planner: str = "cem") -> str:

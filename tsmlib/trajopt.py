@@ -384,6 +384,14 @@ def stopped(plan: Plan, iteration: int, predict: Predict, reward: Reward, space:
     return reassess(found, predict, reward)
 
 
+def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
+    """After how many iterations a plan's ``curve`` (iterations + 1, B) has ``share`` of all that it gains: (B,).
+
+    A curve that gains nothing is there from the start (claim C15).
+    """
+    return (curve >= curve[0] + share * (curve[-1] - curve[0])).int().argmax(0)
+
+
 @torch.no_grad()
 def sampled_starts(
     predict: Predict,

@@ -5,16 +5,20 @@ from __future__ import annotations
 import shutil
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from tsmlib import rewards, store
 from tsmlib.control import TOLERANCE, Task, execute
+from tsmlib.invariants import within
 from tsmlib.policy import OneStepPolicy, SegmentPolicy, controller, episodes_from, imagine, improve
 from tsmlib.runs import Run
 from tsmlib.study.data import dataset, fingerprint, short
 from tsmlib.study.models import load_or_train
+
+EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration (A.3)
 
 
 def learn(
@@ -37,8 +41,8 @@ def learn(
         )
     net, _ = load_or_train(run, task.env, model)
     nets = {"model": net} | ({"prior": load_or_train(run, task.env, "prior")[0]} if prior == "codes" else {})
-    name, cls = f"policy-{model}-{prior}.safetensors", SegmentPolicy if prior == "codes" else OneStepPolicy
-    own, shipped = run.folder(f"models/{short(task.env)}") / name, run.shipped / short(task.env) / name
+    cls, own = SegmentPolicy if prior == "codes" else OneStepPolicy, _path(run, task, model, prior)
+    shipped = run.shipped / short(task.env) / own.name
     weights = {word: store.digest(net.state_dict()) for word, net in nets.items()}
     made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
     budget = {"copies": copies, "iterations": iterations or run.pick(smoke=4, laptop=300, paper=2200)}
@@ -59,7 +63,7 @@ def learn(
     curve = improve(
         policy, net, rewards.reach if task.name == "reach" else rewards.push,
         episodes_from(torch.from_numpy(data.states[:, 0])), horizon=task.horizon, iterations=budget["iterations"],
-        episodes=run.pick(smoke=4, laptop=20, paper=20), seed=1000 * run.seed,
+        episodes=EPISODES[run.scale], seed=1000 * run.seed,
         record_every=max(1, budget["iterations"] // 10), measure=lambda p: assess(p, net, task, seed=run.seed + 1),
         checkpoint=checkpoint, progress=f"{short(task.env)} policy in {model} through {prior}",
     )  # fmt: skip
@@ -71,6 +75,26 @@ def learn(
     store.save_model(own, policy, header)
     shutil.rmtree(checkpoint)
     return policy, store.read_header(own)
+
+
+def kept_budget(run: Run, task: Task, model: str, prior: str) -> dict[str, int] | None:
+    """Copies and iterations of the policy that the run's folder holds, for ``learn`` to find it again; else None."""
+    path = _path(run, task, model, prior)
+    return dict(store.read_header(path)["budget"]) if path.exists() else None
+
+
+def _path(run: Run, task: Task, model: str, prior: str) -> Path:
+    return run.folder(f"models/{short(task.env)}") / f"policy-{model}-{prior}.safetensors"
+
+
+@torch.no_grad()
+def within_data(run: Run, task: Task, policy: Any) -> torch.Tensor:
+    """Share of the steps that a policy executes on a task whose torques are as the training data's (claim C16): (M,),
+    one per copy. See ``invariants.within``."""
+    many = task.times(policy.copies)
+    known = torch.from_numpy(dataset(run, task.env, "train").actions)
+    shares = within(execute(many, controller(policy, many.target)).actions, known)
+    return shares.unflatten(0, (policy.copies, -1)).mean(1)
 
 
 @torch.no_grad()
