@@ -32,6 +32,7 @@ from tsmlib.provenance import provenance
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
+LARGEST = 10_000  # number, or length of a list, among a model's arguments: what Python makes of them takes memory too
 MANIFEST, STATUS = "MANIFEST.json", "status.json"
 COLUMNS = (
     *("env", "sim", "task", "model", "planner", "prior", "horizon", "condition"),
@@ -253,6 +254,7 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
         raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_other('model')}")
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
+        _require_sizes(config)
         with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
             planned = layout(cls(**config).state_dict())
         differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
@@ -267,6 +269,17 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
+
+
+def _require_sizes(config: Mapping[str, Any]) -> None:
+    """Refuse a model's arguments, from a file, that would take memory before any array is planned."""
+    for name, value in config.items():
+        for item in (value, *value) if isinstance(value, list) else (value,):
+            size = len(item) if isinstance(item, list) else item
+            if isinstance(item, dict):
+                _require_sizes(item)
+            elif isinstance(size, int) and size > LARGEST:
+                raise ValueError(f"{name} is {value!s:.80}, expected sizes of at most {LARGEST}")
 
 
 def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_stated: bool = False) -> list[str]:
