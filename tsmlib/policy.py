@@ -278,6 +278,7 @@ class LearningCurve:
     resumed: list[str] = field(default_factory=list)
 
 
+@torch.enable_grad()  # see train.fit
 def improve(
     policy: Any,
     model: DynamicsModel,
