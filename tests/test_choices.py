@@ -10,9 +10,15 @@ import pytest
 
 from tsmlib import runs, store
 
-TINY = {
-    "samples": ["--samples", "2", "4", "--episodes", "4"],
-    "learning_rates": ["--models", "onestep", "--share", "0.1"],
+ARM = ["--env", "tsm/Reacher-v0"]
+TINY = {  # options, the columns that tell tries apart, and the tries
+    "samples": ([*ARM, "--samples", "2", "4", "--episodes", "4"], ("samples",), [(2,), (4,)]),
+    "learning_rates": ([*ARM, "--models", "onestep", "--share", "0.1"], ("rate",), [(2e-3,), (4e-3,), (8e-3,)]),
+    "starts": (
+        ["--targets", "2", "--iterations", "1", "--weights", "1"],
+        ("prior", "start"),
+        [("actions", 0), ("actions", 0.1), ("actions", 0.5), ("codes", 1)],
+    ),
 }
 
 
@@ -22,9 +28,9 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
 ) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
     script, table = runs.ROOT / "benchmarks" / "choices" / f"{name}.py", tmp_path / "table.csv"
-    options = ["--env", "tsm/Reacher-v0", "--scale", "smoke", "--out", str(table), *TINY[name]]
-    subprocess.run([sys.executable, script, *options], capture_output=True, text=True, check=True)
-    column, tries = {"samples": ("samples", [2, 4]), "learning_rates": ("rate", [2e-3, 4e-3, 8e-3])}[name]
+    options, columns, tries = TINY[name]
+    command = [sys.executable, script, "--scale", "smoke", "--out", str(table), *options]
+    subprocess.run(command, capture_output=True, text=True, check=True)
     rows = store.load_table(table)
-    assert sorted({row[column] for row in rows}) == tries
+    assert sorted({tuple(row[column] for column in columns) for row in rows}) == tries
     assert len({row["metric"] for row in rows}) * len(tries) == len(rows)

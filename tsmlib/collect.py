@@ -34,14 +34,15 @@ def collect(
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
     start, _ = env.reset(seed=seed, options=None if states is None else {"states": states})
-    arm: Any = env.unwrapped  # an ArmVectorEnv: it has rollout, dt, names, units and angles
+    arms: Any = env  # they have rollout
+    arm: Any = env.unwrapped  # an ArmVectorEnv: it has dt, names, units and angles
     past = initial_past(torch.from_numpy(start).float(), past_len, arm.single_action_space.shape[0])
     seen, done, taken = [start[:, None]], [], 0
     while taken < horizon:
         actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
         if actions.shape[1] < 1:
             raise ValueError(f"the controller gave no actions when asked at step {taken} of {horizon}")
-        reached = arm.rollout(actions.numpy())
+        reached = arms.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)
         done.append(actions.numpy())

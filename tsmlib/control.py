@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -19,11 +20,13 @@ from tsmlib import rewards
 from tsmlib.collect import Controller, collect, once, smooth_torques
 from tsmlib.dynamics import DynamicsModel
 from tsmlib.envs.base import BLOCK_RADIUS, LINK_LENGTHS, WALL
+from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 from tsmlib.trajopt import Plan, Planner, Space, reassess, through_model, through_simulator
 
 TOLERANCE = 0.03  # metres: a trial that ends within it is a success
+SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be repeated
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,8 @@ class Trial:
     """Actions executed in the true simulator.
 
     actions (B, T, du); states (B, T + 1, dx) from the start on; true (B,): undiscounted return executed;
-    final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan.
+    final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan;
+    observed (B, T + 1, dx): what the sensors said, where they are noisy.
     """
 
     actions: Tensor
@@ -131,6 +135,7 @@ class Trial:
     true: Tensor
     final_distance: Tensor
     plan: Plan | None = None
+    observed: Tensor | None = None
 
     @property
     def gap(self) -> Tensor:
@@ -141,16 +146,19 @@ class Trial:
 
 
 def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
-    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say."""
+    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say.
+
+    A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
+    """
     actions = plan.actions if isinstance(plan, Plan) else plan
     env = gymnasium.make_vec(task.env, num_envs=len(task))
     if isinstance(actions, Tensor):
-        seen = collect(env, once(actions), horizon=actions.shape[1], states=task.start)
+        seen = collect(env, once(actions), horizon=actions.shape[1], seed=SENSORS, states=task.start)
     else:
-        seen = collect(env, actions, horizon=task.horizon, states=task.start)
+        seen = collect(env, actions, horizon=task.horizon, seed=SENSORS, states=task.start)
         actions = torch.from_numpy(seen.actions)
     env.close()
-    return _measured(task, torch.from_numpy(seen.states), actions, plan if isinstance(plan, Plan) else None)
+    return _measured(task, env, seen.states, actions, plan if isinstance(plan, Plan) else None)
 
 
 def replan(
@@ -210,7 +218,7 @@ def replan(
         return made.actions[:, :steps]
 
     env = gymnasium.make_vec(task.env, num_envs=len(task))
-    seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, states=task.start)
+    seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
     env.close()
     bar.close()
     actions = torch.from_numpy(seen.actions)
@@ -218,7 +226,7 @@ def replan(
         actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted=promises[0],
         curve=torch.stack(promises), seconds=time.perf_counter() - began,
     )  # fmt: skip
-    return _measured(task, torch.from_numpy(seen.states), actions, made)
+    return _measured(task, env, seen.states, actions, made)
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
@@ -238,14 +246,18 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
     return total
 
 
-def _measured(task: Task, states: Tensor, actions: Tensor, plan: Plan | None) -> Trial:
-    """The trial that went through ``states`` (B, T + 1, dx)."""
+def _measured(task: Task, env: VectorEnv, seen: np.ndarray, actions: Tensor, plan: Plan | None) -> Trial:
+    """The trial that just ended in ``env``, of which the sensors said ``seen`` (B, T + 1, dx)."""
+    states = observed = torch.from_numpy(seen)
+    if isinstance(env, ImperfectArms):
+        states = torch.from_numpy(env.truth).float()
     return Trial(
         actions=actions,
         states=states,
         true=rewarded(task.reward, states[:, 1:], actions).sum(-1),
         final_distance=rewards.final_distance(states, task.target, task.position),
         plan=plan,
+        observed=None if states is observed else observed,
     )
 
 

@@ -2,9 +2,10 @@
 
 Every function draws in the style of ``tsm.mplstyle`` and returns its ``Figure`` with nothing left open in pyplot: as
 the last line of a notebook cell it shows once, and ``save`` writes it. Here are the figures of data and of learning;
-those of predictions are in ``tsmlib.predict_figures``, of plans and policies in ``tsmlib.plan_figures`` and
-``tsmlib.policy_figures``, the diagrams of the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, and
-colours and labels in ``tsmlib.style``: all are reached from here.
+those of predictions are in ``tsmlib.predict_figures``, of codes in ``tsmlib.latent_figures``, of plans and policies in
+``tsmlib.plan_figures`` and ``tsmlib.policy_figures``, of the action prior in ``tsmlib.prior_figures``, the diagrams of
+the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, colours and labels in ``tsmlib.style``: all
+are reached from here.
 
 Letters in shapes: n episodes, T steps, S samples, dx state size, H and W pixels.
 """
@@ -28,6 +29,18 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from tsmlib.diagrams import figure1, figure2, figure3  # noqa: F401
 from tsmlib.film import embed, side_by_side, video  # noqa: F401
 from tsmlib.gallery import gallery  # noqa: F401
+from tsmlib.latent_figures import (  # noqa: F401
+    around_touch,
+    code_grid,
+    code_use,
+    contact_recall,
+    deflection_intervals,
+    embedding,
+    figure9,
+    one_code,
+    spread_against_error,
+    walk,
+)
 from tsmlib.plan_figures import (  # noqa: F401
     along_the_way,
     figure6,
@@ -39,6 +52,8 @@ from tsmlib.plan_figures import (  # noqa: F401
 )
 from tsmlib.policy_figures import figure7  # noqa: F401
 from tsmlib.predict_figures import against_horizon, calibration, differences, figure5  # noqa: F401
+from tsmlib.prior_figures import cost_of_prior, figure10, prior_walks, spectra  # noqa: F401
+from tsmlib.robust_figures import advantage_map, figure8, filtering, imperfect_episode  # noqa: F401
 from tsmlib.style import (  # noqa: F401
     COLOURS,
     WIDTH,

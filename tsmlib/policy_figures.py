@@ -43,7 +43,13 @@ def figure7(
     whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of it.
     Seconds are on a logarithmic axis from 1 s.
     """
-    references = references or {}
+    return draw_policies(curves, references or {}, against)
+
+
+def draw_policies(
+    curves: LearningCurves, references: Mapping[str, Mapping[str, float]], against: Sequence[str], sharey: bool = False
+) -> Figure:
+    """``figure7``; sharey: one scale of returns for all columns."""
     known("against", against, list(AXES))
     known("references", references, list(curves))
     checked = {task: {label: _checked(f"{task}, {label}", given) for label, given in rows.items()}
@@ -52,15 +58,18 @@ def figure7(
         label for rows in checked.values() for label in rows).items()}  # fmt: skip
     figure, grid = plt.subplots(
         len(against), len(checked), figsize=(WIDTH if len(checked) > 1 else 3.8, 1.75 * len(against) + 0.1),
-        squeeze=False, sharey="col",
+        squeeze=False, sharey=True if sharey else "col",
     )  # fmt: skip
+    if sharey:
+        means = np.concatenate([row["return_true"].mean(0) for rows in checked.values() for row in rows.values()])
+        shared = limits(means, means, also=[level for own in references.values() for level in own.values()])
     banded = promised = False
     for column, (task, rows) in zip(grid.T, checked.items(), strict=True):
         levels = references.get(task, {})
         ends = [mean + sign * half for row in rows.values() for mean, half in [_band(row["return_true"])]
                 for sign in (-1, 1)]  # fmt: skip
         means = np.concatenate([row["return_true"].mean(0) for row in rows.values()])
-        low, high = limits(means, np.concatenate(ends), also=list(levels.values()))
+        low, high = shared if sharey else limits(means, np.concatenate(ends), also=list(levels.values()))
         column[0].set_ylim(low, high)
         for ax, word in zip(column, against, strict=True):
             _levels(ax, levels)
@@ -92,8 +101,8 @@ def figure7(
             ax.grid(axis="y", color="#EEEEEE", lw=0.6)
             foot(ax, AXES[word], notes, WIDTH / len(checked) - 0.5)
         column[0].set_title(task.capitalize())
-    for row in grid:
-        row[0].set_ylabel("true return")
+    for axes in grid:
+        axes[0].set_ylabel("true return")
     entries = [Line2D([], [], **look, label=name(label)) for label, look in look_of.items()]
     used = {words(label)[0] for levels in references.values() for label in levels}
     entries += [

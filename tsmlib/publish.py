@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from tsmlib import policy_report, scoreboard, store, study
+from tsmlib import claim_report, claims, policy_report, scoreboard, store, study
 from tsmlib.report import by_loop, report
 from tsmlib.runs import ROOT, Run, require
 from tsmlib.study import RESULTS
@@ -14,16 +14,19 @@ from tsmlib.study import RESULTS
 README = ROOT / "README.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
+CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
+POOLED = ("03_predict", "04_latent", "07_action_prior")  # notebooks whose tables ship with the rows of every seed
 
 
 def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite README's results.
+    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what README says of them.
 
-    The table of 03_predict has the rows of the other seeds beside this run as well. Raises RunError, before anything is
+    The tables of POOLED have the rows of the other seeds beside this run as well. Raises RunError, before anything is
     written, unless the notebooks ran to their end and their results are as they left them.
     """
-    for notebook in ("01_collect", "02_train", "03_predict", "05_control"):
+    for notebook in ("01_collect", "02_train", "05_control", *POOLED):
         require(run, notebook)
+    tables = pooled(run)
     for source, pattern, target in (
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
@@ -35,14 +38,64 @@ def publish(run: Run) -> None:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 store.write_bytes(copy, path.read_bytes())
-    predicted = run.metrics / "03_predict.csv"
-    rows = study.evidence(replace(run, notebook="03_predict"), store.load_table(predicted))
-    store.save_table(RESULTS / predicted.name, rows)  # of every seed beside this run
+    for notebook, rows in tables.items():
+        store.save_table(RESULTS / f"{notebook}.csv", rows, extra=_extra(rows))
     store.write_manifest(ROOT / "data")
-    before, _, rest = README.read_text().partition(MARKS[0])
-    after = rest.partition(MARKS[1])[2]
-    text = "\n".join([before + MARKS[0], "", readme_results(), "", MARKS[1] + after])
-    store.write_bytes(README, text.encode())
+    _between(MARKS, readme_results())
+    publish_claims()
+
+
+def pooled(run: Run) -> dict[str, list[dict[str, Any]]]:
+    """Notebook -> the rows of this run and of every seed beside it. RunError where one did not come to its end."""
+    own = {notebook: store.load_table(run.metrics / f"{notebook}.csv") for notebook in POOLED}
+    return {notebook: study.evidence(replace(run, notebook=notebook), rows) for notebook, rows in own.items()}
+
+
+def _extra(rows: list[dict[str, Any]]) -> list[str]:
+    """Columns beyond those of every table."""
+    return [column for column in dict.fromkeys(c for row in rows for c in row) if column not in store.COLUMNS]
+
+
+def publish_claims() -> None:
+    """Judge every claim from the tables that ship: data/results/08_claims.csv, and README's table. Idempotent."""
+    papers, ours = (shipped_verdicts(model) for model in (claims.PAPERS, claims.OURS))
+    rows = [
+        row
+        for model, verdicts in ((claims.PAPERS, papers), (claims.OURS, ours))
+        for row in claims.as_rows(verdicts, model=model, scale="paper")
+    ]
+    store.save_table(RESULTS / "08_claims.csv", rows, extra=claims.EXTRA)
+    store.write_manifest(ROOT / "data")
+    _between(CLAIM_MARKS, readme_claims(papers, ours))
+
+
+def shipped_verdicts(model: str = claims.PAPERS) -> list[claims.Verdict]:
+    """The verdicts that follow from the tables that ship."""
+    ledger = claims.read(subject=model)
+    rows = claims.tables(ledger)
+    return [claims.judge(claim, rows) for claim in ledger]
+
+
+def _between(marks: tuple[str, str], written: str) -> None:
+    """Put ``written`` between two marks of README."""
+    before, _, rest = README.read_text().partition(marks[0])
+    after = rest.partition(marks[1])[2]
+    store.write_bytes(README, "\n".join([before + marks[0], "", written, "", marks[1] + after]).encode())
+
+
+def readme_claims(papers: list[claims.Verdict], ours: list[claims.Verdict]) -> str:
+    """What README says of the paper's claims: those that carry it, and how many of all got which verdict."""
+    pairs = [pair for pair in zip(papers, ours, strict=True) if pair[0].claim.headline]
+    table = claim_report.table([first for first, _ in pairs], [second for _, second in pairs])
+    return f"""Written by `python -m tsmlib run claims` from the rows in `data/results`.
+
+- The paper's model: {claim_report.counts(papers)}.
+- `{claims.OURS}` in its place: {claim_report.counts(ours)}.
+
+Below are the {len(pairs)} of {len(papers)} claims that carry the paper. All of them, why each verdict is what it is,
+and what the paper leaves open are in `notebooks/08_claims.ipynb`.
+
+{table}"""
 
 
 def readme_results() -> str:

@@ -339,13 +339,20 @@ def verdicts(found: Mapping[str, tuple[str, str, bool]]) -> str:
 
 
 def film(task: Task, trial: Trial, target: int) -> np.ndarray:
-    """Frames (T, height, width, 3) of one target: what the model dreamt beside what the arm did."""
-    dreamt, done = _dreamt_and_done(trial, target)
+    """Frames (T, height, width, 3) of one target: what the model dreamt beside what the arm did.
+
+    Of a trial behind noisy sensors that was not planned: what the sensors said beside what the arm did.
+    """
+    title = "what the model dreamt"
+    if trial.plan is None and trial.observed is not None:
+        title, dreamt, done = "what the sensors say", trial.observed[target].numpy(), trial.states[target].numpy()
+    else:
+        dreamt, done = _dreamt_and_done(trial, target)
     env: Any = gymnasium.make_vec(task.env, num_envs=1).unwrapped
     goal = task.target[target].numpy()
     left, right = (np.stack([env.image(state, goal) for state in states]) for states in (dreamt, done))
     env.close()
-    return figures.side_by_side(left, right, ("what the model dreamt", "what the arm did"))
+    return figures.side_by_side(left, right, (title, "what the arm did"))
 
 
 def strip(task: Task, trial: Trial, target: int, *, frames: int = 6) -> Figure:

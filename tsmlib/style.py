@@ -46,6 +46,7 @@ COLOURS = {
     "random": "#7A7A7A",
     "zero": "#B0B0B0",
     "data": "#4A4A4A",
+    "filter": "#111111",
 }
 NAMES = {
     "tsm": "TSM",
@@ -62,6 +63,7 @@ NAMES = {
     "trpo": "TRPO",
     "random": "random torques",
     "zero": "zero torque",
+    "filter": "Kalman filter",
 }
 JOINTS = ("shoulder", "elbow")
 
@@ -146,13 +148,16 @@ def shaped(field: str, values: ArrayLike, shape: str) -> np.ndarray:
     return array
 
 
-def interval(values: np.ndarray) -> tuple[float, float]:
-    """Mean of ``values`` (n,) and half its 95 % t interval (0 for one value)."""
+def interval(values: np.ndarray, level: float = 0.95) -> tuple[float, float]:
+    """Mean of ``values`` (n,) and half its t interval of ``level``, 0.95 or 0.90 (0 for one value)."""
     dof = len(values) - 1
     if dof < 1:
         return float(values.mean()), 0.0
-    few = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571}
-    t = few.get(dof, 1.960 + 2.372 / dof + 2.823 / dof**2 + 2.556 / dof**3)  # Cornish and Fisher's expansion
+    few, normal, a, b, c = {  # the first five quantiles, and Cornish and Fisher's expansion
+        0.95: ((12.706, 4.303, 3.182, 2.776, 2.571), 1.960, 2.372, 2.823, 2.556),
+        0.90: ((6.314, 2.920, 2.353, 2.132, 2.015), 1.645, 1.524, 1.421, 0.984),
+    }[level]
+    t = few[dof - 1] if dof <= len(few) else normal + a / dof + b / dof**2 + c / dof**3
     return float(values.mean()), float(t * values.std(ddof=1) / np.sqrt(len(values)))
 
 

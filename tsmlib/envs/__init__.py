@@ -2,21 +2,27 @@
 
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose ``rollout`` simulates
 whole action sequences at once. The state is the observation, and its layout is the same in both simulators.
+``imperfect`` names the same arms with noisy sensors or delayed actions (section 5.3.3).
 """
 
+import re
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from tsmlib.envs.base import (
     DT,
+    HALF_RANGE,
     STATE_NAMES,
     STATE_UNITS,
     ArmEnv,
     ArmVectorEnv,
     SimulationUnstable,
     closest_gap,
+    task_of,
 )
+from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise
 
 MUJOCO_IDS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
 PYMUNK_IDS = ("tsm/PymunkReacher-v0", "tsm/PymunkObstacle-v0", "tsm/PymunkPush-v0")
@@ -35,30 +41,82 @@ for _id in ENV_IDS:
         )
 
 
+NOISE, DELAY = 0.25, 5  # section 5.3.3: sigma on data scaled to [-1, 1]; steps
+
+
+def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
+    """The id of the same arm behind `SensorNoise` and `ActionDelay`, registered where it is not yet.
+
+    noise: sigma, in units of data scaled to [-1, 1] (``base.HALF_RANGE``). delay: tau in steps. Both of the paper's,
+    ``NOISE`` and ``DELAY``, are registered for every arm. ValueError where they make no sense.
+    """
+    if env_id not in ENV_IDS:
+        raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}; noise and delay are added to one of these")
+    if not 0.0 <= noise <= 10.0 or round(noise, 4) != noise or not (isinstance(delay, int) and 0 <= delay <= 100):
+        raise ValueError(
+            f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four decimals, and a "
+            "whole number of steps from 0 to 100"
+        )
+    if not noise and not delay:
+        return env_id
+    words = f"{f'-noise{noise:g}' if noise else ''}{f'-delay{delay}' if delay else ''}"
+    name = f"{env_id.removesuffix('-v0')}{words}-v0"
+    if name not in gymnasium.registry:
+        gymnasium.register(
+            name, entry_point="tsmlib.envs:_imperfect_arm", vector_entry_point="tsmlib.envs:_imperfect_arms",
+            kwargs={"env_id": env_id, "noise": noise, "delay": delay}, max_episode_steps=100,
+        )  # fmt: skip
+    return name
+
+
+def imperfections(env_id: str) -> tuple[str, float, int]:
+    """The plain arm behind an id, the noise of its sensors and the delay of its actions."""
+    arm, noise, delay = re.fullmatch(r"(.*?)(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v0", env_id).groups()  # type: ignore[union-attr]
+    return f"{arm}-v0", float(noise or 0.0), int(delay or 0)
+
+
+def _imperfect_arm(env_id: str, noise: float, delay: int, **kwargs: Any) -> gymnasium.Env:
+    arm = gymnasium.make(env_id, disable_env_checker=True, **kwargs).unwrapped
+    return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
+
+
+def _imperfect_arms(num_envs: int, env_id: str, noise: float, delay: int, **kwargs: Any) -> ImperfectArms:
+    arms = gymnasium.make_vec(env_id, num_envs=num_envs, **kwargs)
+    return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
+
+
+def _half_range(env_id: str) -> np.ndarray:
+    return np.array(HALF_RANGE[: 10 if has_block(env_id) else 6])
+
+
 def has_block(env: str) -> bool:
     """Whether there is an obstacle or object, and so something that the arm can touch."""
-    return "Reacher-v0" not in env
+    return task_of(env) != "reacher"
 
 
-def fingerprint(env_id: str, *, noise: float = 0.0, delay: int = 0) -> dict[str, Any]:
-    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit.
-
-    noise: sigma of `SensorNoise`; delay: tau of `ActionDelay`, steps.
-    """
-    if env_id in PYMUNK_IDS:
+def fingerprint(env_id: str) -> dict[str, Any]:
+    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit."""
+    arm, noise, delay = imperfections(env_id)
+    if arm in PYMUNK_IDS:
         from tsmlib.envs.pymunk_arm import physics_hash
     else:
         from tsmlib.envs.mujoco_arm import physics_hash
     dx = 10 if has_block(env_id) else 6
     return {
         "env": env_id, "dt": DT, "names": list(STATE_NAMES[:dx]), "units": list(STATE_UNITS[:dx]), "angles": [0, 1],
-        "noise": noise, "delay": delay, "simulator": physics_hash(env_id),
+        "noise": noise, "delay": delay, "simulator": physics_hash(arm),
     }  # fmt: skip
 
 
+for _id in ENV_IDS:
+    imperfect(_id, noise=NOISE)
+    imperfect(_id, delay=DELAY)
+
 __all__ = [
+    "DELAY",
     "ENV_IDS",
     "MUJOCO_IDS",
+    "NOISE",
     "PYMUNK_IDS",
     "ArmEnv",
     "ArmVectorEnv",
@@ -66,4 +124,6 @@ __all__ = [
     "closest_gap",
     "fingerprint",
     "has_block",
+    "imperfect",
+    "imperfections",
 ]

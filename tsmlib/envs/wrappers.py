@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
 
 NOISE_STREAM = 1  # keeps the noise apart from the draws that the environment makes from the same seed
 
@@ -79,3 +80,57 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
         self._on_the_way.append(np.array(action))
         state, reward, terminated, truncated, info = self.env.step(self._on_the_way.popleft())
         return state, float(reward), terminated, truncated, info
+
+
+class ImperfectArms(VectorWrapper):
+    """What `SensorNoise` and `ActionDelay` do to one arm, done to N of them, with ``rollout`` for whole sequences.
+
+    sigma, scale (dx,): noise of the observed states; tau: delay of the actions, steps. The noise of episode i is a
+    function of the seed given to ``reset`` and of i, so it does not depend on N. The reward is that of the true states.
+    """
+
+    def __init__(self, env: VectorEnv, *, sigma: float, scale: np.ndarray, tau: int) -> None:
+        super().__init__(env)
+        self.sigma, self.scale, self.tau = sigma, np.asarray(scale, np.float64), tau
+        self._arms: Any = env.unwrapped
+        self._noise = [np.random.default_rng() for _ in range(env.num_envs)]
+        self._seen: list[np.ndarray] = []
+        self._on_the_way = np.zeros((env.num_envs, tau, 2))
+
+    @property
+    def truth(self) -> np.ndarray:
+        """The true states (N, t + 1, dx) since the last reset."""
+        return np.concatenate(self._seen, axis=1)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """As the arms', with noisy states; actions still on the way are forgotten."""
+        if seed is not None:
+            self._noise = [np.random.default_rng([seed, NOISE_STREAM, i]) for i in range(self.num_envs)]
+        states, info = self._arms.reset(seed=seed, options=options)
+        self._seen, self._on_the_way = [states[:, None]], np.zeros_like(self._on_the_way)
+        return self._observed(states[:, None])[:, 0], info | {"state": states}
+
+    def rollout(self, actions: np.ndarray) -> np.ndarray:
+        """Take actions (N, T, 2), apply those from tau steps ago, and give the noisy states (N, T, dx) after each."""
+        given = np.concatenate([self._on_the_way, np.asarray(actions, np.float64)], axis=1)
+        split = given.shape[1] - self.tau
+        states = self._arms.rollout(given[:, :split])
+        self._on_the_way = given[:, split:]
+        self._seen.append(states)
+        return self._observed(states)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """As the arms', with the noisy states; ``info["state"]`` (N, dx) holds the true ones."""
+        given = np.concatenate([self._on_the_way, np.asarray(actions, np.float64)[:, None]], axis=1)
+        states, reward, terminated, truncated, info = self._arms.step(given[:, 0])
+        self._on_the_way = given[:, 1:]
+        self._seen.append(states[:, None])
+        return self._observed(states[:, None])[:, 0], reward, terminated, truncated, info | {"state": states}
+
+    def _observed(self, states: np.ndarray) -> np.ndarray:
+        if not self.sigma:
+            return states.copy()
+        drawn = np.stack([generator.standard_normal(states.shape[1:]) for generator in self._noise])
+        return states + self.sigma * self.scale * drawn

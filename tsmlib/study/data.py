@@ -20,8 +20,8 @@ HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for eve
 
 
 def short(env: str) -> str:
-    """Folder name of an environment: ReacherPush for tsm/ReacherPush-v0."""
-    return env.partition("/")[2].partition("-")[0]
+    """Folder name of an environment: ReacherPush for tsm/ReacherPush-v0, Reacher-delay5 for tsm/Reacher-delay5-v0."""
+    return env.partition("/")[2].removesuffix("-v0")
 
 
 def chosen(parameter: str, text: str, known: Sequence[str]) -> list[str]:

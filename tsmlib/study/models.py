@@ -13,7 +13,7 @@ import torch
 
 from tsmlib import store
 from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.envs import has_block
+from tsmlib.envs import has_block, imperfections
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import Run
 from tsmlib.study.data import dataset, fingerprint, short
@@ -55,7 +55,7 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     """
     if model == "prior":
         return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
-    seconds = BUDGET[short(env)] * run.pick(smoke=0.0, laptop=0.5, paper=1.0)
+    seconds = BUDGET[short(imperfections(env)[0])] * run.pick(smoke=0.0, laptop=0.5, paper=1.0)
     wide = has_block(env)
 
     def stage(loss: str, rate: float, share: float = 1.0, **options: Any) -> Stage:

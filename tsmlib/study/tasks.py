@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import torch
@@ -9,6 +11,7 @@ import torch
 import tsmlib.envs
 from tsmlib import store
 from tsmlib.control import Task
+from tsmlib.envs import imperfections
 from tsmlib.runs import ROOT
 from tsmlib.study.data import short
 
@@ -17,7 +20,13 @@ FROZEN = ROOT / "data" / "tasks"
 
 
 def task(env: str, split: str = "test") -> Task:
-    """100 starts and targets of an environment's task. ``test`` ones are frozen in data/tasks and choose nothing."""
+    """100 starts and targets of an environment's task. ``test`` ones are frozen in data/tasks and choose nothing.
+
+    The same with noisy sensors or delayed actions as without; starts are the true states.
+    """
+    arm, _, _ = imperfections(env)
+    if arm != env:
+        return replace(task(arm, split), env=env)
     path = FROZEN / f"{short(env)}.safetensors"
     if split == "test" and path.exists():
         tensors, header = store.load(path, kind="task")

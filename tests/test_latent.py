@@ -1,0 +1,270 @@
+"""What codes do is measured against closed forms, and planted effects are found."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tsmlib import evaluate, latent, study
+from tsmlib.envs import closest_gap
+from tsmlib.envs.base import BLOCK_RADIUS, WALL, fingertip
+from tsmlib.latent import Deflections, Seen
+from tsmlib.nets import Features, kl_from_standard_normal
+from tsmlib.trajectory import Segment, Trajectories, Window
+from tsmlib.tsm import TSM
+
+PUSH = "tsm/ReacherPush-v0"
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(scope="module")
+def test_data() -> Trajectories:
+    return study.random_data(PUSH, 40, seed=3)
+
+
+@pytest.fixture(scope="module")
+def model(test_data: Trajectories) -> TSM:
+    torch.manual_seed(0)
+    net = TSM(10, 2, channels=8, latent_dim=3)
+    net.features.fit(torch.from_numpy(test_data.states))
+    return net
+
+
+class Shifts:
+    """A model whose future is the last state plus ``reach`` times the code, in every step."""
+
+    segment_len, past_len, latent_dim = 10, 10, 3
+    reach = torch.tensor([0.5, 0.1, 0.0])
+
+    def __init__(self) -> None:
+        self.features = Features(3, ())
+
+    def decode(self, past: Segment, actions: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        return (past.states[:, -1] + self.reach * z)[:, None].expand(-1, actions.shape[1], -1)
+
+
+def still_window(n: int, steps: int = 10) -> Window:
+    return Window(
+        Segment(torch.zeros(n, 10, 3), torch.zeros(n, 10, 2)),
+        Segment(torch.zeros(n, steps, 3), torch.zeros(n, steps, 2)),
+    )
+
+
+def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> Seen:
+    """An arm at rest along x and an object at rest, for the truth and for two samples."""
+    state = torch.zeros(10)
+    state[4:6], state[6:8] = torch.from_numpy(fingertip(np.zeros(2))).float(), torch.tensor(block)
+    states = state.expand(n, steps, -1).clone()
+    window = Window(
+        Segment(state.expand(n, 10, -1).clone(), torch.zeros(n, 10, 2)), Segment(states, torch.zeros(n, steps, 2))
+    )
+    return Seen(PUSH, window, states.expand(2, -1, -1, -1).clone())
+
+
+def test_the_divergence_of_a_gaussian_is_the_textbook_s_and_adds_up_over_dimensions() -> None:
+    mean, log_variance = torch.randn(5, 4, generator=rng()), torch.randn(5, 4, generator=rng(1))
+    found = latent.kl_by_dimension(mean, log_variance)
+    torch.testing.assert_close(found, 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance))
+    torch.testing.assert_close(found.sum(1), kl_from_standard_normal(mean, log_variance))
+
+
+def test_units_count_as_active_from_a_variance_of_a_hundredth_on() -> None:
+    mean = torch.randn(20000, 3, generator=rng()) * torch.tensor([0.09, 0.11, 1.0])
+    assert latent.active_units(mean).tolist() == [False, True, True]
+
+
+def test_each_dimension_of_a_linear_decoder_matters_by_its_own_weight() -> None:
+    shifts: Any = Shifts()
+    found = latent.importance(shifts, still_window(20000), rng())
+    torch.testing.assert_close(found, shifts.reach / math.sqrt(3), rtol=0.03, atol=1e-6)  # one of three features moves
+
+
+def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder_listens(
+    model: TSM, test_data: Trajectories
+) -> None:
+    seen = latent.look(model, test_data, samples=2, horizon=10)
+    with torch.no_grad():
+        for weight in model.decoder.codes.parameters():
+            kept = weight.clone()
+            weight.zero_()
+        errors = latent.reconstruction(model, seen.window, rng())
+        weight.copy_(kept)
+    assert torch.equal(errors["posterior"], errors["prior"])
+    assert torch.equal(errors["posterior"], errors["zero"])
+
+
+def test_windows_hold_the_states_that_scores_are_taken_from(model: TSM, test_data: Trajectories) -> None:
+    seen = latent.look(model, test_data, samples=2, horizon=30)
+    whole = test_data.padded(0)
+    assert torch.equal(seen.window.future.states, evaluate.cut(whole.states, latent.STARTS, 30))
+    assert torch.equal(seen.window.past.states[1], whole.states[0, 30:40])  # the second window of the first episode
+    assert seen.samples.shape == (2, 120, 30, 10)
+    touched = evaluate.cut(evaluate.contact_steps(test_data.states, PUSH), latent.STARTS, 30)
+    assert torch.equal(seen.touched, touched)
+    assert touched.any()
+
+
+def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(model: TSM, test_data: Trajectories) -> None:
+    seen, episodes = latent.about_to_touch(model, test_data, samples=2, horizon=20)
+    assert 3 <= len(episodes) < len(test_data)
+    near = closest_gap(seen.window.future.states.numpy(), PUSH) < latent.NEAR
+    assert near[:, latent.LEAD - 1].all()
+    assert not near[:, : latent.LEAD - 1].any()
+    with pytest.raises(ValueError, match="none of the 40 episodes"):
+        latent.about_to_touch(model, test_data, samples=1, horizon=90)
+
+
+def test_every_step_counts_alike_however_often_it_occurs() -> None:
+    squares = torch.tensor([[1.0, 4.0], [1.0, 100.0], [1.0, 100.0]])
+    where = torch.tensor([[True, True], [True, False], [True, False]])
+    assert latent.root_mean(squares, where) == pytest.approx(math.sqrt(2.5))
+    assert math.isnan(latent.root_mean(squares, torch.zeros(3, 2, dtype=torch.bool)))
+
+
+def test_ranks_agree_disagree_or_say_nothing() -> None:
+    x = torch.tensor([3.0, 1.0, 2.0, 5.0])
+    assert latent.spearman(x, x**3) == pytest.approx(1)
+    assert latent.spearman(x, -x) == pytest.approx(-1)
+    assert latent.spearman(x, torch.ones(4)) == 0
+
+
+def test_groups_are_sorted_by_spread() -> None:
+    variance = torch.arange(40.0)[torch.randperm(40, generator=rng())][:, None]
+    spread, error = latent.by_spread(variance, 4 * variance)
+    assert len(spread) == 10
+    assert (np.diff(spread) > 0).all()
+    np.testing.assert_allclose(error, 2 * spread)
+
+
+def test_a_planted_spread_after_contact_is_found() -> None:
+    seen = scene(50)
+    seen.window.future.states[:25, 6:, 6:8] = torch.tensor([0.15, 0.02])  # the object lies at the arm from step 6 on
+    noise = torch.randn(64, 50, 10, 10, generator=rng())
+    size = torch.full((50, 10), 0.02)
+    size[:25, 6:] = 0.1
+    seen = Seen(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
+    net: Any = SimpleNamespace(
+        segment_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
+    )
+    rows = latent.code_rows(net, seen, rng(), model="tsm+energy", seed=0, scale="smoke")
+    value = {(row["metric"], row["condition"]): row["value"] for row in rows}
+    assert value["spread_ratio", "segments"] == pytest.approx(5, rel=0.05)
+    assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
+    assert value["importance", "segments"] == 0
+    assert not any(metric.startswith(("kl", "error_")) for metric, _ in value)  # of no encoder that was trained for it
+
+
+def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> None:
+    seen = scene(1)
+    future = seen.window.future.states
+    future[0, 4:7, 6:8] = torch.tensor([0.15, 0.02])  # at the arm for three steps
+    limit = WALL - BLOCK_RADIUS
+    future[0, 7, 6:10] = torch.tensor([limit - 0.02, 0.2, 1.5, 0.0])  # 2 cm from the wall, fast
+    future[0, 8:, 6:10] = torch.tensor([limit - 0.015, 0.2, -0.6, 0.0])  # and already on its way back
+    true, samples = latent.contacts(seen)["object"]
+    assert true[0].nonzero().flatten().tolist() == [4]
+    assert not samples.any()
+    assert latent.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
+
+
+def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
+    truth = torch.zeros(2, 20, dtype=torch.bool)
+    truth[0, 5] = truth[1, 15] = True
+    samples = torch.zeros(4, 2, 20, dtype=torch.bool)
+    samples[0, 0, 5] = samples[1, 0, 7] = samples[2, 0, 8] = samples[0, 1, 13] = True
+    everything = latent.recall(truth, samples, range(20))
+    assert everything == {"n": 2, "recall": 3 / 8, "majority": 0.5, "precision": 3 / 4}
+    assert latent.recall(truth, samples, range(10))["recall"] == 0.5
+    assert math.isnan(latent.recall(truth, samples, range(16, 20))["recall"])
+
+
+def test_a_planted_deflection_is_read_off_in_degrees() -> None:
+    seen = scene(2, steps=30)
+    step = latent.LEAD - 1 + latent.AHEAD
+    seen.window.future.states[:, step:, 6] += 0.05  # along x
+    way = 0.05 * torch.tensor([math.cos(math.radians(30)), math.sin(math.radians(30))])
+    seen.samples[:, 0, step:, 6:8] += way
+    seen.samples[0, 1, step:, 7] += 0.1  # one sample to the left and twice as far, the other stays
+    found = latent.deflections(seen)
+    torch.testing.assert_close(torch.rad2deg(found.off[:, 0]), torch.tensor([30.0, 30.0]))
+    assert torch.rad2deg(found.off[0, 1]) == pytest.approx(90)
+    assert found.still == 0.25
+    torch.testing.assert_close(found.error, torch.tensor([30.0, 90.0]))
+    torch.testing.assert_close(found.travels[:, 1], torch.tensor([0.1, 0.0]))
+    assert not found.inside().any()
+
+
+def test_intervals_of_honest_directions_hold_the_truth_as_often_as_they_should() -> None:
+    drawn = 0.4 * torch.randn(201, 400, generator=rng())
+    found = Deflections(
+        drawn[1:] - drawn[0],  # truth and samples alike
+        torch.ones(400),
+        torch.ones(200, 400),
+    )
+    assert found.inside(0.8).float().mean() == pytest.approx(0.8, abs=0.05)
+    assert found.spread.median() == pytest.approx(math.degrees(0.4), rel=0.05)
+
+
+def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:
+    first, second = torch.randn(2, 5000, 8, generator=rng())
+    codes = latent.between(first, second, 5)
+    assert torch.equal(codes[0], first)
+    assert torch.equal(codes[-1], second)
+    torch.testing.assert_close(codes.square().mean((1, 2)), torch.ones(5), atol=0.03, rtol=0)
+    with pytest.raises(ValueError, match="at least 2"):
+        latent.between(first, second, 1)
+
+
+def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(model: TSM, test_data: Trajectories) -> None:
+    seen = latent.look(model, test_data.take(slice(1)), samples=1, horizon=30)
+    window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
+    z = torch.randn(1, 3, generator=rng())
+    once = latent.futures(model, window, z, 30)
+    assert torch.equal(once, latent.futures(model, window, z, 30))
+    assert torch.equal(once[:, :10], latent.futures(model, window, z, 10))
+    torch.testing.assert_close(latent.futures(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1))
+    near = latent.futures(model, window, z + 1e-3, 30)
+    assert 0 < (near - once).abs().max() < 0.1
+
+
+def test_the_directions_that_move_an_outcome_are_found() -> None:
+    codes = torch.randn(500, 6, generator=rng())
+    outcome = torch.stack([3 * codes[:, 2], codes[:, 4]], 1) + 0.01 * torch.randn(500, 2, generator=rng(1))
+    found, explained = latent.directions(codes, outcome)
+    torch.testing.assert_close(found.abs(), torch.eye(6)[[2, 4]], atol=0.01, rtol=0)
+    assert explained > 0.99
+    assert latent.directions(codes, torch.randn(500, 2, generator=rng(2)))[1] < 0.1
+
+
+def test_the_plane_of_largest_variance_is_found() -> None:
+    codes = torch.randn(4000, 4, generator=rng()) * torch.tensor([0.1, 2.0, 0.1, 1.0])
+    points, share = latent.principal(codes)
+    torch.testing.assert_close(points.var(0), torch.tensor([4.0, 1.0]), rtol=0.1, atol=0)
+    assert share.sum() > 0.98
+
+
+def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() -> None:
+    row = dict(env=PUSH, model="tsm", condition="object", metric="recall", horizon=10)
+    rows = [dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, horizon=h)
+            for k in (0, 1) for m in ("recall", "precision", "chance") for h in (10, 20, 30)]  # fmt: skip
+    found = latent.recall_panels(rows, PUSH)
+    assert list(found) == ["arm touches object"]
+    np.testing.assert_allclose(found["arm touches object"]["tsm"]["recall"], [[0.5] * 3, [0.6] * 3])
+    assert latent.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
+    kl = dict(env=PUSH, model="tsm", condition="segments contact", metric="kl", seed=0, value=2.0)
+    assert latent.use_panels([kl], [PUSH])["KL per segment"]["Push, with a touch"]["tsm"].tolist() == [2.0]
+
+
+def test_bars_stand_beside_the_mean_over_seeds() -> None:
+    row = dict(metric="kl", condition="segments", env="tsm/Reacher-v0", model="tsm")
+    table = latent.reached([dict(row, value=0.02), dict(row, value=0.04), dict(row, model="lstm", value=9.0)], ["tsm"])
+    assert "| `tsm/Reacher-v0`: kl | at most 0.1 | 0.03 |" in table
+    assert "9" not in table.replace("0.9", "")

@@ -1,0 +1,341 @@
+"""What noise of the sensors and delay of the actions do (section 5.3.3), beyond the scores of 03_predict.
+
+Errors to the clean state count in the units in which the noise does, data scaled to [-1, 1] (``envs.base.HALF_RANGE``),
+so that the raw observation's error is the noise's sigma. Angles are compared on the circle.
+
+Against a model stands an extended Kalman filter that is told more than any model here: clean states to fit its
+dynamics on, the arm's kinematics, and the noise. Its process noise is tuned on validation episodes. An exponential
+filter, tuned in the same way, is what an engineer would try first.
+
+Letters in shapes: N episodes, T steps, K steps predicted, dx = 6 state size of the plain arm, du action size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tsmlib.control import sim_of
+from tsmlib.dynamics import DynamicsModel
+from tsmlib.envs import DELAY, NOISE, imperfect, imperfections
+from tsmlib.envs.base import HALF_RANGE, LINK_LENGTHS, fingertip
+from tsmlib.evaluate import cut, sample_states
+from tsmlib.nets import Noise
+from tsmlib.scoreboard import paired
+from tsmlib.style import interval, name
+from tsmlib.trajectory import Segment, Trajectories
+
+STARTS = range(10, 100, 10)  # of the segments that are predicted from the noisy past
+PARTS = {"angles": slice(0, 2), "velocities": slice(2, 4), "fingertip": slice(4, 6)}
+
+
+def condition(env: str) -> str:
+    """How tables name an environment's imperfections: clean; noise, delay, or both, with numbers unless the paper's."""
+    _, noise, delay = imperfections(env)
+    words = [word if value == paper else f"{word} {value:g}"
+             for word, value, paper in (("noise", noise, NOISE), ("delay", delay, DELAY)) if value]  # fmt: skip
+    return ", ".join(words) or "clean"
+
+
+def renamed(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of an imperfect environment as rows of the plain one, with what is imperfect as their condition.
+
+    The open loop's ``clean`` becomes ``noise``, say, ``segments`` becomes ``noise, segments``.
+    """
+    found = []
+    for row in rows:
+        word, subset = condition(row["env"]), row["condition"]
+        kept = word if subset in ("clean", "learning") else f"{word}, {subset}"
+        found.append({**row, "env": imperfections(row["env"])[0], "condition": kept})
+    return found
+
+
+class WithoutPastActions:
+    """A model that is shown zeros for the past actions U-: what they were worth (section 3)."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.segment_len, self.past_len, self.features = model.segment_len, model.past_len, model.features
+        self.stochastic = getattr(model, "stochastic", True)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """As the model's, see ``DynamicsModel``."""
+        return self.model.predict_segment(Segment(past.states, 0 * past.actions), actions, generator=generator)
+
+
+# Errors to the clean state -------------------------------------------------------------------------------------------
+
+
+def errors(predicted: np.ndarray, clean: np.ndarray) -> np.ndarray:
+    """Differences (..., dx) of two states (..., dx) in units of data scaled to [-1, 1], angles on the circle."""
+    difference = np.array(predicted, np.float64) - clean
+    difference[..., :2] = (difference[..., :2] + np.pi) % (2 * np.pi) - np.pi
+    return difference / HALF_RANGE[: difference.shape[-1]]
+
+
+def rmse(difference: np.ndarray) -> float:
+    """Root mean square of all errors."""
+    return float(np.sqrt(np.square(difference).mean()))
+
+
+def model_errors(
+    model: DynamicsModel, noisy: Trajectories, clean: Trajectories, *, samples: int = 32, progress: str = ""
+) -> np.ndarray:
+    """Errors (N, K, dx) of a model's mean to the clean states, over K = 10 steps after noisy pasts (``STARTS``).
+
+    clean: the same episodes without noise. ValueError where their torques differ.
+    """
+    _require_same(noisy, clean)
+    mean = sample_states(model, noisy, samples=samples, horizon=10, starts=STARTS, progress=progress).mean(0)
+    return errors(mean.numpy(), _segments(clean.states[:, 1:]))
+
+
+def filter_errors(estimate: KalmanFilter, noisy: Trajectories, clean: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the filter at ``STARTS``: of the present state (N, dx), and of the K = 10 predicted ones (N, K, dx)."""
+    _require_same(noisy, clean)
+    means = estimate.means(noisy)
+    now = np.stack([means[:, start] for start in STARTS], 1).reshape(-1, 4)
+    truth = np.stack([clean.states[:, start] for start in STARTS], 1).reshape(len(now), -1)
+    actions, ahead = _segments(noisy.actions), []
+    x = now
+    for step in range(10):
+        x = estimate.ahead(x, actions[:, step])
+        ahead.append(_with_tip(x))
+    return errors(_with_tip(now), truth), errors(np.stack(ahead, 1), _segments(clean.states[:, 1:]))
+
+
+def exponential_errors(keep: float, noisy: Trajectories, clean: Trajectories) -> np.ndarray:
+    """Errors (N, dx) of m_t = keep m_{t-1} + (1 - keep) x_t, the exponential filter, to the present at ``STARTS``."""
+    _require_same(noisy, clean)
+    mean, found = noisy.states[:, 0].astype(np.float64), []
+    for step in range(max(STARTS) + 1):
+        mean = keep * mean + (1 - keep) * noisy.states[:, step]
+        if step in STARTS:
+            found.append(errors(mean, clean.states[:, step]))
+    return np.concatenate(found)
+
+
+def tuned_exponential(noisy: Trajectories, clean: Trajectories) -> float:
+    """The best ``keep`` of eleven for validation episodes."""
+    return min(np.linspace(0, 0.9, 11), key=lambda keep: rmse(exponential_errors(keep, noisy, clean)))
+
+
+@dataclass(frozen=True)
+class KalmanFilter:
+    """Extended Kalman filter of angles and velocities s (4,) of the plain arm, behind noisy sensors.
+
+    s' = A [s, u, 1] + N(0, Q), fitted by least squares on clean states; it observes s and the fingertip, whose
+    position follows from the angles. weight: what Q is multiplied with. sigma: the sensors' noise.
+    """
+
+    transition: np.ndarray  # (7, 4)
+    process: np.ndarray  # (4, 4)
+    sigma: float
+    weight: float = 1.0
+
+    @classmethod
+    def fitted(cls, clean: Trajectories, sigma: float) -> KalmanFilter:
+        """The filter whose dynamics are fitted to clean episodes."""
+        before = clean.states[:, :-1, :4].reshape(-1, 4)
+        inputs = np.concatenate(
+            [before, clean.actions.reshape(len(before), -1), np.ones((len(before), 1))], 1, dtype=np.float64
+        )
+        after = clean.states[:, 1:, :4].reshape(-1, 4).astype(np.float64)
+        transition = np.linalg.lstsq(inputs, after, rcond=None)[0]
+        return cls(transition, np.cov((after - inputs @ transition).T), sigma)
+
+    def tuned(self, noisy: Trajectories, clean: Trajectories) -> KalmanFilter:
+        """The filter with the weight of its process noise that is best on validation episodes."""
+        tried = [KalmanFilter(self.transition, self.process, self.sigma, w) for w in (0.1, 0.3, 1.0, 3.0, 10.0)]
+        return min(tried, key=lambda one: rmse(filter_errors(one, noisy, clean)[0]))
+
+    def ahead(self, x: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The mean (N, 4) one step after x (N, 4) under actions (N, du)."""
+        return np.concatenate([x, actions, np.ones((len(x), 1))], 1) @ self.transition
+
+    def means(self, noisy: Trajectories) -> np.ndarray:
+        """What it takes each present state for, given all observations until then: (N, T + 1, 4)."""
+        noise = np.diag(np.square(self.sigma * np.array(HALF_RANGE[:6])))
+        x, covariance = noisy.states[:, 0, :4].astype(np.float64), np.tile(noise[:4, :4], (len(noisy), 1, 1))
+        found = [x]
+        a = self.transition[:4].T
+        for step in range(noisy.horizon):
+            x = self.ahead(x, noisy.actions[:, step])
+            covariance = a @ covariance @ a.T + self.weight * self.process
+            h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), _tip_jacobian(x)], 1)  # (N, 6, 4)
+            seen = noisy.states[:, step + 1] - _with_tip(x)
+            gain = covariance @ h.mT @ np.linalg.inv(h @ covariance @ h.mT + noise)
+            x = x + (gain @ seen[..., None])[..., 0]
+            covariance = covariance - gain @ h @ covariance
+            found.append(x)
+        return np.stack(found, 1)
+
+
+def _with_tip(x: np.ndarray) -> np.ndarray:
+    """Angles and velocities (..., 4) and the fingertip (..., 6) that they imply."""
+    return np.concatenate([x, fingertip(x[..., :2])], -1)
+
+
+def _tip_jacobian(x: np.ndarray) -> np.ndarray:
+    """Derivative of the fingertip by angles and velocities: (N, 4) -> (N, 2, 4)."""
+    both = x[:, 0] + x[:, 1]
+    second = LINK_LENGTHS[1] * np.stack([-np.sin(both), np.cos(both)], 1)
+    first = LINK_LENGTHS[0] * np.stack([-np.sin(x[:, 0]), np.cos(x[:, 0])], 1)
+    return np.stack([first + second, second, 0 * second, 0 * second], 2)
+
+
+def _segments(steps: np.ndarray) -> np.ndarray:
+    """(N, T, ...) -> the K = 10 steps after each of ``STARTS``, in the order of ``sample_states``."""
+    return cut(torch.from_numpy(np.ascontiguousarray(steps)), STARTS, 10).numpy()
+
+
+def _require_same(noisy: Trajectories, clean: Trajectories) -> None:
+    if not np.array_equal(noisy.actions, clean.actions):
+        raise ValueError(
+            f"the episodes of {noisy.env} and of {clean.env} hold other torques; draw both from one seed, so that they "
+            "are the same episodes with and without noise"
+        )
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def error_rows(
+    env: str, model: str, ahead: np.ndarray | None, now: np.ndarray | None = None, **common: Any
+) -> list[dict[str, Any]]:
+    """Rows ``rmse_clean``: of the steps ahead (N, K, dx) and over all of them (no horizon), and of now (horizon 0).
+
+    Beside the whole state also angles, velocities and fingertip apart, in metrics of their own.
+    """
+    base, _, _ = imperfections(env)
+    common = dict(
+        env=base, sim=sim_of(env), model=model, planner="none", condition=condition(env), unit="half range", **common
+    )
+    rows = []
+    for part, dims in {"": slice(None), **PARTS}.items():
+        metric = f"rmse_clean_{part}".removesuffix("_")
+        if now is not None:
+            rows.append(dict(common, metric=metric, horizon=0, value=rmse(now[..., dims]), n=len(now)))
+        if ahead is not None:
+            rows.append(dict(common, metric=metric, value=rmse(ahead[..., dims]), n=len(ahead)))
+            rows += [
+                dict(common, metric=metric, horizon=k + 1, value=rmse(ahead[:, k, dims]), n=len(ahead))
+                for k in range(ahead.shape[1])
+            ]
+    return rows
+
+
+def policy_rows(header: Mapping[str, Any], distances: Tensor, *, level: float = 0.05) -> list[dict[str, Any]]:
+    """Rows ``success50`` of a learned policy, one per copy: the share of targets within ``level`` metres at the end.
+
+    distances (copies, targets): final distances in metres.
+    """
+    env = header["fingerprint"]["env"]
+    common = dict(
+        env=imperfections(env)[0], sim=sim_of(env), task=header["made_from"]["task"], model=header["model"],
+        planner="policy", prior=header["prior"], condition=condition(env), horizon=header["curve"]["iteration"][-1],
+        n=distances.shape[1], seed=header["seed"], scale=header["scale"], metric=f"success{1000 * level:.0f}",
+        unit="share",
+    )  # fmt: skip
+    return [dict(common, value=float((own < level).float().mean()), copy=copy) for copy, own in enumerate(distances)]
+
+
+def board(rows: Iterable[Mapping[str, Any]], last: int) -> str:
+    """What policies earn in each condition, and what is lost against the clean arm, as a Markdown table.
+
+    Means over copies with half their 95 % t interval, at the last record of at most ``last`` iterations.
+    """
+    found: dict[tuple[str, str, str], dict[int, list[float]]] = {}
+    for row in rows:
+        if row["planner"] == "policy" and row["horizon"] <= last:
+            key = (f"{row['model']} {row['prior']}", row["condition"], row["metric"])
+            found.setdefault(key, {}).setdefault(row["horizon"], []).append(row["value"])
+    ends = {key: np.array(line[max(line)]) for key, line in found.items()}
+    conditions = list(dict.fromkeys(key[1] for key in ends))
+    shown = {"return_true": "earned", "final_distance": "final distance (m)", "success50": "within 0.05 m"}
+    heads = [f"{condition}: {title}" for condition in conditions for title in shown.values()]
+    lines = [f"| policy | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|"]
+    for label in dict.fromkeys(key[0] for key in ends):
+        cells = []
+        for column in conditions:
+            for metric in shown:
+                values = ends.get((label, column, metric))
+                mean, half = interval(values) if values is not None else (0.0, 0.0)
+                cells.append("" if values is None else f"{mean:.3g}" + (f" ± {half:.2g}" if half else ""))
+        lines.append(f"| {name(label)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def lost(rows: Iterable[Mapping[str, Any]], label: str, word: str, last: int, random: float) -> float:
+    """Share of a policy's gain over random torques on the clean arm that ``word`` (noise or delay) takes away."""
+    earned: dict[str, dict[int, list[float]]] = {}
+    for row in rows:
+        if row["metric"] == "return_true" and f"{row['model']} {row['prior']}" == label and row["horizon"] <= last:
+            earned.setdefault(row["condition"], {}).setdefault(row["horizon"], []).append(row["value"])
+    clean, other = (float(np.mean(earned[part][max(earned[part])])) for part in ("clean", word))
+    return (clean - other) / (clean - random)
+
+
+def learning_curves(rows: Iterable[Mapping[str, Any]], last: int) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """The input of ``figures.figure8``: condition -> label -> curves, a line per copy, of up to ``last`` iterations."""
+    found: dict[str, dict[str, dict[Any, dict[int, float]]]] = {}
+    for row in rows:
+        if row["planner"] == "policy" and row["metric"] == "return_true" and row["horizon"] <= last:
+            lines = found.setdefault(row["condition"], {}).setdefault(f"{row['model']} {row['prior']}", {})
+            lines.setdefault((row["seed"], row.get("copy", "")), {})[row["horizon"]] = row["value"]
+    return {
+        condition: {
+            label: {
+                "iterations": np.array(sorted(next(iter(lines.values())))),
+                "return_true": np.array([[line[at] for at in sorted(line)] for line in lines.values()]),
+            }
+            for label, lines in methods.items()
+        }
+        for condition, methods in found.items()
+    }
+
+
+def advantage(
+    rows: Sequence[Mapping[str, Any]],
+    subject: str,
+    rivals: Sequence[str],
+    noises: Sequence[float],
+    delays: Sequence[int],
+) -> dict[str, np.ndarray]:
+    """``subject`` minus each rival in ``ll_horizon``, nats per step, over noise and delay: the input of the map.
+
+    Panel -> (noises, delays); pairs of training seeds averaged; NaN where there are no rows. Beside the plain arm the
+    one with the obstacle, from the first touch on.
+    """
+    found = {}
+    for env, touched in (("tsm/Reacher-v0", ""), ("tsm/ReacherObstacle-v0", "contact")):
+        for rival in rivals:
+            grid = np.full((len(noises), len(delays)), np.nan)
+            for i, noise in enumerate(noises):
+                for j, delay in enumerate(delays):
+                    word = condition(imperfect(env, noise=noise, delay=delay))
+                    word = {"clean": touched}.get(word, f"{word}, {touched}") if touched else word
+                    pairs = paired(rows, subject, "ll_horizon", env=env, condition=word)
+                    if rival in pairs:
+                        grid[i, j] = pairs[rival].mean()
+            found[f"{'after contact' if touched else 'plain arm'}: minus {name(rival)}"] = grid
+    return found
+
+
+def bars(rows: Sequence[Mapping[str, Any]], label: str, last: int, random: float) -> dict[str, tuple[str, str, bool]]:
+    """What a policy (``label``: model and prior) is to reach: what -> (bar, measured, whether it was reached)."""
+    found = {}
+    for word in ("noise", "delay"):
+        share = lost(rows, label, word, last, random)
+        found[f"{word}: lost of the clean gain over random torques"] = ("at most 20 %", f"{share:.1%}", share <= 0.2)
+        reached = [row["value"] for row in rows if row["metric"] == "success50" and row["condition"] == word
+                   and f"{row['model']} {row['prior']}" == label]  # fmt: skip
+        found[f"{word}: targets reached within 0.05 m"] = (
+            "at least 60 %", f"{np.mean(reached):.0%}", bool(np.mean(reached) >= 0.6)
+        )  # fmt: skip
+    return found
