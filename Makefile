@@ -5,7 +5,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
-.PHONY: help collect train predict latent control action_prior claims test torture lint clean
+.PHONY: help collect train predict latent control robustness action_prior claims test torture lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
@@ -13,6 +13,7 @@ help:
 	@echo "make train     train the models  (notebooks/02_train.ipynb)"
 	@echo "make predict   who predicts best    (notebooks/03_predict.ipynb)"
 	@echo "make latent    what the codes mean  (notebooks/04_latent.ipynb)"
+	@echo "make robustness   noisy sensors and delayed actions (notebooks/06_robustness.ipynb)"
 	@echo "make action_prior   what the action prior does to a plan (notebooks/07_action_prior.ipynb)"
 	@echo "make claims    what the paper claims, judged from the rows that ship (notebooks/08_claims.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
@@ -20,7 +21,7 @@ help:
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
-collect train predict latent control action_prior claims: $(READY)
+collect train predict latent control robustness action_prior claims: $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)

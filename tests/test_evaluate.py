@@ -161,10 +161,26 @@ def test_the_same_seed_draws_the_same_samples() -> None:
     assert not torch.equal(first[0], first[1])
 
 
-@pytest.mark.parametrize("options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(2,))])
+@pytest.mark.parametrize("options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(0,))])
 def test_a_horizon_that_does_not_fit_is_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"Linear observes {PAST} steps first, and episodes have {T}"):
+    with pytest.raises(ValueError, match=f"at least one step is observed first, and episodes have {T}"):
         evaluate.predict(Linear(), FEATURES, episodes(3), samples=1, **options)
+
+
+def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_repeated() -> None:
+    class Recorder(Linear):
+        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Any = None) -> Tensor:
+            seen.append(past)
+            return super().predict_segment(past, actions, generator=generator)
+
+    seen: list[Segment] = []
+    data = episodes(3)
+    evaluate.predict(Recorder(), FEATURES, data, samples=1, horizon=5, starts=(2,))
+    states, actions = seen[0]
+    assert torch.equal(states[:3, : PAST - 2], torch.from_numpy(data.states[:, :1]).expand(-1, PAST - 2, -1))
+    assert torch.equal(states[:3, PAST - 2 :], torch.from_numpy(data.states[:, 1:3]))
+    assert not actions[:3, : PAST - 2].any()
+    assert torch.equal(actions[:3, PAST - 2 :], torch.from_numpy(data.actions[:, :2]))
 
 
 @pytest.mark.parametrize(

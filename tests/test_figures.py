@@ -81,7 +81,8 @@ def test_every_figure_function_is_tested() -> None:
     elsewhere = {
         name
         for name, value in drawn.items()
-        if value.__module__[7:] in ("predict_figures", "policy_figures", "latent_figures", "prior_figures", "gallery")
+        if value.__module__[7:]
+        in ("predict_figures", "policy_figures", "latent_figures", "prior_figures", "robust_figures", "gallery")
     }
     assert set(drawn) - elsewhere == set(EVERY)  # those have their own test file
 

@@ -97,7 +97,7 @@ def uses() -> dict[str, set[str]]:
 
 
 PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery"}
-PICTURES |= {"latent_figures", "plan_figures", "policy_figures", "predict_figures", "prior_figures"}
+PICTURES |= {"latent_figures", "plan_figures", "policy_figures", "predict_figures", "prior_figures", "robust_figures"}
 ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
 
 
@@ -112,12 +112,13 @@ def test_figures_know_nothing_but_figures() -> None:
         assert needs[name] == {"style"}, name
     for name in ("predict_figures", "gallery", "latent_figures", "prior_figures"):
         assert needs[name] == {"axes", "style"}, name
+    assert needs["robust_figures"] == {"axes", "policy_figures", "style"}
     assert needs["figures"] <= PICTURES
 
 
 def test_what_computes_draws_nothing() -> None:
     for name, needs in uses().items():
-        if name not in PICTURES | {"report", "scoreboard", "policy_report", "claims", "claim_report"}:
+        if name not in PICTURES | {"report", "scoreboard", "policy_report", "robust_report", "claims", "claim_report"}:
             assert not needs & PICTURES, name
 
 

@@ -214,15 +214,18 @@ def _rollouts(
     progress: str,
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Blocks of trajectories: states (S, n, T, dx) and truth (n, T, dx). Blocks are independent."""
-    if not (starts and min(starts) >= model.past_len and 1 <= horizon <= data.horizon - max(starts)):
+    if not (starts and min(starts) >= 1 and 1 <= horizon <= data.horizon - max(starts)):
         raise ValueError(
-            f"starts {list(starts)} and horizon {horizon} do not fit: {type(model).__name__} observes "
-            f"{model.past_len} steps first, and episodes have {data.horizon}"
+            f"starts {list(starts)} and horizon {horizon} do not fit: at least one step is observed first, and "
+            f"episodes have {data.horizon}"
         )
-    whole, stochastic = data.padded(0), getattr(model, "stochastic", True)
-    past = Segment(*(torch.cat([part[:, s - model.past_len : s] for s in starts], 1) for part in whole))
+    before = max(0, model.past_len - min(starts))  # steps that the model looks back beyond the first one
+    whole, stochastic = data.padded(before), getattr(model, "stochastic", True)
+    past = Segment(
+        *(torch.cat([part[:, before + s - model.past_len : before + s] for s in starts], 1) for part in whole)
+    )
     past = Segment(*(part.reshape(-1, model.past_len, part.shape[-1]) for part in past))
-    actions, truth = (cut(part, starts, horizon) for part in (whole.actions, whole.states))
+    actions, truth = (cut(part[:, before:], starts, horizon) for part in (whole.actions, whole.states))
     rows = torch.arange(len(truth))
     if not stochastic:
         point = torch.cat([rollout(model, Segment(*(p[b] for p in past)), actions[b]) for b in rows.split(ROWS)])

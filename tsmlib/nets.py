@@ -68,8 +68,9 @@ class GatedLayer(nn.Module):
     all positions at once (B, P, C) and a single position (B, C), which is what keeps the two decoding paths equal.
     """
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, *, residual: bool = True, skip: bool = True) -> None:
         super().__init__()
+        self.residual, self.skip = residual, skip  # without them only for an ablation (section 3.1)
         self.taps = nn.Linear(2 * channels, 2 * channels)  # W_f and W_g
         self.out = nn.Linear(channels, 2 * channels)  # 1x1: residual and skip
 
@@ -77,7 +78,7 @@ class GatedLayer(nn.Module):
         """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
         filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
         residual, skip = self.out(gated(filtered, gate)).chunk(2, dim=-1)
-        return now + residual, skip
+        return now + residual if self.residual else residual, skip if self.skip else torch.zeros_like(skip)
 
 
 Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (B, C), oldest first
@@ -100,11 +101,15 @@ class CausalDecoder(nn.Module):
         head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
         direct_channels: int = 0,  # two 1x1 layers that see the inputs beside the stack's output, in its place; 0: none
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
+        plain: bool = False,  # neither residual nor skip connections: the last layer's output alone
     ) -> None:
         super().__init__()
         self.inlet = nn.Linear(input_dim, channels)
         self.dilations = dilations
-        self.layers = nn.ModuleList(GatedLayer(channels) for _ in dilations)
+        self.layers = nn.ModuleList(
+            GatedLayer(channels, residual=not plain, skip=not plain or last)
+            for last in [*[False] * (len(dilations) - 1), True]
+        )
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
         self.direct = bool(direct_channels)
         if direct_channels:

@@ -22,6 +22,7 @@ ENVS = tuple(f"tsm/{arm}-v0" for arm in ("Reacher", "ReacherObstacle", "ReacherP
 MODELS = (
     *("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "tsm+direct", "prior"),
     *("onestep", "multistep", "lstm", "ensemble", "ensemble+mse"),
+    *("tsm+full", "tsm+plain", "tsm+z4", "tsm+z16", "tsm+h1", "tsm+h20"),
 )
 LONGEST = 1000  # characters
 _RESTORE = "Restore it: git checkout -- notebooks"

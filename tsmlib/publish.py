@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from tsmlib import claim_report, claims, policy_report, scoreboard, store, study
+from tsmlib.envs import DELAY, ENV_IDS, NOISE, imperfect
 from tsmlib.report import by_loop, report
 from tsmlib.runs import ROOT, Run, require
 from tsmlib.study import RESULTS
@@ -15,7 +17,12 @@ README = ROOT / "README.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
-POOLED = ("03_predict", "04_latent", "07_action_prior")  # notebooks whose tables ship with the rows of every seed
+POOLED = (
+    "03_predict",
+    "04_latent",
+    "06_robustness",
+    "07_action_prior",
+)  # notebooks whose tables ship with the rows of every seed
 
 
 def publish(run: Run) -> None:
@@ -34,7 +41,7 @@ def publish(run: Run) -> None:
         (run.figures, "*.*", ROOT / "figures"),
     ):
         for path in sorted(source.glob(pattern)):
-            if ".checkpoint" not in path.name:
+            if _ships(path):
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 store.write_bytes(copy, path.read_bytes())
@@ -43,6 +50,13 @@ def publish(run: Run) -> None:
     store.write_manifest(ROOT / "data")
     _between(MARKS, readme_results())
     publish_claims()
+
+
+def _ships(path: Path) -> bool:
+    """Not checkpoints, nor models that only a table needs: of the paper's choices, and of the map of imperfect arms."""
+    arms = {imperfect(arm, **how) for arm in ENV_IDS for how in ({}, {"noise": NOISE}, {"delay": DELAY})}
+    table_only = path.stem in study.CHOICES or path.parent.name not in {study.short(arm) for arm in arms}
+    return ".checkpoint" not in path.name and not (path.parents[1].name == "models" and table_only)
 
 
 def pooled(run: Run) -> dict[str, list[dict[str, Any]]]:

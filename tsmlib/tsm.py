@@ -35,6 +35,7 @@ class TSM(nn.Module):
     channels, head_channels: 32 and 0 on the basic arm, 64 and 128 where there are contacts (appendix A.1).
     direct_channels: above 0, a head of that width that sees state and torque themselves, beyond the paper.
     beta: weight of the KL divergence against the summed squared error in standardised units.
+    full_encoder, plain: ablations, Q(Z | X+, X-, U-, U+) in place of Q(Z | X+), and no residual or skip connections.
     """
 
     def __init__(
@@ -50,21 +51,27 @@ class TSM(nn.Module):
         direct_channels: int = 0,
         dilations: tuple[int, ...] = (1, 2, 4, 8, 4),  # receptive field 20 = 2 H
         beta: float = 1.0,
+        full_encoder: bool = False,
+        plain: bool = False,
     ) -> None:
         super().__init__()
         self._config = dict(
             state_dim=state_dim, action_dim=action_dim, angles=list(angles), segment_len=segment_len,
             latent_dim=latent_dim, channels=channels, head_channels=head_channels, direct_channels=direct_channels,
-            dilations=list(dilations), beta=beta,
+            dilations=list(dilations), beta=beta, **({"full_encoder": True} if full_encoder else {}),
+            **({"plain": True} if plain else {}),
         )  # fmt: skip
         self.segment_len = self.past_len = segment_len
         self.latent_dim = latent_dim
         self.beta = beta
         self.features = Features(state_dim, tuple(angles))
-        self.encoder = Encoder(self.features.dim, segment_len, latent_dim)
+        self.full_encoder = full_encoder
+        seen = (self.features.dim + action_dim, 2 * segment_len) if full_encoder else (self.features.dim, segment_len)
+        self.encoder = Encoder(*seen, latent_dim)
         self.decoder = CausalDecoder(
             self.features.dim + action_dim, state_dim, latent_dim,
             channels=channels, head_channels=head_channels, direct_channels=direct_channels, dilations=tuple(dilations),
+            plain=plain,
         )  # fmt: skip
 
     def config(self) -> dict[str, Any]:
@@ -96,6 +103,13 @@ class TSM(nn.Module):
         """Q(Z | X+): (B, H, dx) -> mean and log variance (B, dz)."""
         return self.encoder(self.features(states))
 
+    def posterior(self, past: Segment, future: Segment) -> tuple[Tensor, Tensor]:
+        """``encode`` of the future states; of the ablation's encoder, which sees past and actions too, its own."""
+        if not self.full_encoder:
+            return self.encode(future.states)
+        whole = past.last(self.segment_len).then(future)
+        return self.encoder(self._inputs(whole.states, whole.actions))
+
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error plus beta KL per segment, free-running through every segment that the window holds.
 
@@ -104,7 +118,7 @@ class TSM(nn.Module):
         """
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
-            mean, log_variance = self.encode(future.states)
+            mean, log_variance = self.posterior(past, future)
             predicted = self.decode(past, future.actions, sample_posterior(mean, log_variance, generator))
             loss = loss + self._elbo(predicted, future.states, mean, log_variance)
             past = past.then(Segment(predicted, future.actions)).last(self.past_len)
@@ -114,7 +128,7 @@ class TSM(nn.Module):
         """Squared error of one-step increments plus beta KL, with true states as inputs."""
         loss, past = window.past.states.new_zeros(()), window.past
         for future in self._segments(window.future):
-            mean, log_variance = self.encode(future.states)
+            mean, log_variance = self.posterior(past, future)
             z = sample_posterior(mean, log_variance, generator)
             error = self.features.increments(self.decode_teacher_forced(Window(past, future), z), future.states)
             kl = kl_from_standard_normal(mean, log_variance)

@@ -6,15 +6,27 @@ with a progress bar. Only here is it known how much of everything each scale use
 
 from tsmlib.envs import has_block
 from tsmlib.study.data import HELD_OUT_SEED, SPLITS, chosen, dataset, fingerprint, random_data, short, sizes
-from tsmlib.study.models import BUDGET, CLASSES, DYNAMICS, MODELS, OURS, Stage, fresh, load_or_train, schedule, train
+from tsmlib.study.models import (
+    BUDGET,
+    CHOICES,
+    CLASSES,
+    DYNAMICS,
+    MODELS,
+    OURS,
+    Stage,
+    fresh,
+    load_or_train,
+    schedule,
+    train,
+)
 from tsmlib.study.plans import along_the_way, plan, trial
 from tsmlib.study.policies import assess, learn
 from tsmlib.study.predictions import RESULTS, evidence, scores, table
 from tsmlib.study.tasks import FROZEN, TASK_SEED, draw_task, freeze_tasks, task
 
 __all__ = [
-    "BUDGET", "CLASSES", "DYNAMICS", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS", "SPLITS", "TASK_SEED",
-    "Stage", "along_the_way", "assess", "chosen", "dataset", "draw_task", "evidence", "fingerprint",
+    "BUDGET", "CHOICES", "CLASSES", "DYNAMICS", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS", "SPLITS",
+    "TASK_SEED", "Stage", "along_the_way", "assess", "chosen", "dataset", "draw_task", "evidence", "fingerprint",
     "freeze_tasks", "fresh", "has_block", "learn", "load_or_train", "plan", "random_data", "schedule", "scores",
     "short", "sizes", "table", "task", "train", "trial",
 ]  # fmt: skip

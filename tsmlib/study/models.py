@@ -25,8 +25,13 @@ CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows
     "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
 }  # fmt: skip
 DYNAMICS = ("tsm", "tsm+energy", "tsm+energy+direct", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
-MODELS = (*DYNAMICS, "tsm+teacher", "tsm+direct", "prior")  # the two in the middle are ablations
-OURS = tuple(word for word in MODELS if word.startswith(("tsm", "prior")))  # what 02 trains and looks at
+OURS = ("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "tsm+direct", "prior")  # what 02 looks at
+CHOICES: dict[str, dict[str, Any]] = {  # the paper's choices, one changed at a time
+    "tsm+full": {"full_encoder": True}, "tsm+plain": {"plain": True}, "tsm+z4": {"latent_dim": 4},
+    "tsm+z16": {"latent_dim": 16}, "tsm+h1": {"segment_len": 1},
+    "tsm+h20": {"segment_len": 20, "dilations": (1, 2, 4, 8, 16, 8)},  # receptive field 2 H again
+}  # fmt: skip
+MODELS = (*dict.fromkeys((*DYNAMICS, *OURS, *CHOICES)),)
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80, "ReacherObstacle": 120, "ReacherPush": 290,
     "PymunkReacher": 40, "PymunkObstacle": 40, "PymunkPush": 60,
@@ -50,8 +55,8 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     tsm, tsm+energy: teacher forcing for a quarter of the time, then free-running over two chained segments by squared
     error and KL, or by the energy score. tsm+energy+direct: more teacher forcing, and a head that sees the state itself
     over a narrower stack. tsm+teacher, tsm+direct: ablations, teacher forcing alone, and that head with the paper's
-    loss. onestep, ensemble: one step ahead. multistep, lstm: free-running over 2 H steps. prior: free-running over two
-    segments, its own budget.
+    loss. CHOICES: as many updates as tsm. onestep, ensemble: one step ahead. multistep, lstm: free-running over 2 H
+    steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":
         return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
@@ -65,8 +70,11 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     teacher = stage("teacher_forced_loss", 20 if wide else 30, 0.25, future_len=10)
     longer = stage("teacher_forced_loss", 26, 0.4, future_len=10)
     free: dict[str, Any] = dict(share=0.75, lr=2e-3, batch=128)
+    paper = [teacher, stage("loss", 10.5 if wide else 16, **free)]
+    if model in CHOICES:
+        return [replace(teacher, future_len=20), paper[1]] if model == "tsm+h20" else paper
     return {
-        "tsm": [teacher, stage("loss", 10.5 if wide else 16, **free)],
+        "tsm": paper,
         "tsm+energy": [teacher, stage("energy_loss", 6.9 if wide else 11, **free)],
         "tsm+direct": [longer, stage("loss", 11, **{**free, "share": 0.6})],
         "tsm+energy+direct": [longer, stage("energy_loss", 8, **{**free, "share": 0.6})],
@@ -162,6 +170,7 @@ def _new(model: str, data: Trajectories) -> Any:
         options = dict(channels=32, direct_channels=200)
     elif kind == "tsm" and has_block(data.env):
         options = dict(channels=64, head_channels=128)  # appendix A.1
+    options |= CHOICES.get(model, {})
     net = CLASSES[kind](states.shape[2], actions.shape[2], angles=data.angles, **options)
     net.features.fit(torch.from_numpy(states))
     return net
