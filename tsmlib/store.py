@@ -104,7 +104,7 @@ def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Arrays, not yet known to be finite, and everything that the ``tsmlib`` entry says."""
     data, about = _read_checked(path, kind)
     try:
-        return safetensors.torch.load(data), about
+        return dict(sorted(safetensors.torch.load(data).items())), about  # they come in any order
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(path, kind)}") from error
 
