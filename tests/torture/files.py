@@ -405,7 +405,8 @@ def hostile_texts() -> list[str]:
     """At least 150 values that no parameter may have, typed on a command line."""
     texts = ["../x", "../../etc/passwd", "a/../../b", "..", "~", "~root", "~/x", "a\0b", "\0", "a\nb", "\n", "\r", "\t",
              "a\u202eb", "\u200bx", "\ufeffx", "\u2028x", "\x1b[31mred", "\x7f", "\ud800x", " x", "x ", "CON", "con",
-             "nul.txt", "aux/x", "a/PRN", "com1", "LPT9.x", "x" * 300, "x" * 1001, "x" * 100_000]  # fmt: skip
+             "nul.txt", "aux/x", "a/PRN", "com1", "LPT9.x", "../..", "a/..", "x/../../..", "/../x", "~x", "Nul", "PRN",
+             "com7/x", "x" * 300, "x" * 1001, "x" * 100_000]  # fmt: skip
     texts += [
         f"{text}{tail}" for text in ("../", "~", "a\0", "a\n", "\u202e") for tail in ("1", "smoke", "tsm", "x" * 20)
     ]
