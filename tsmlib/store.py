@@ -27,6 +27,7 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from tsmlib.disk import PathLike, StoreError, write_bytes
 from tsmlib.provenance import provenance
@@ -265,7 +266,11 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
         _require_sizes(config)
-        with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
+        limit = LARGEST + sum(tensor.numel() for tensor in tensors.values())
+        with (
+            torch.device("meta"),
+            _AtMost(limit),
+        ):  # a plan of the model, without memory, however large the file says it is
             planned = layout(cls(**config).state_dict())
         differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
     except Exception as error:  # what the file says goes to a constructor, which may fail in any way
@@ -281,6 +286,19 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
+
+
+class _AtMost(TorchFunctionMode):
+    """So many operations of torch, so that no number of layers in a file keeps a processor busy."""
+
+    def __init__(self, operations: int) -> None:
+        self.operations = operations
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.operations -= 1
+        if self.operations < 0:
+            raise ValueError("it would be much larger than its file")
+        return func(*args, **(kwargs or {}))
 
 
 def _require_sizes(config: Mapping[str, Any]) -> None:
