@@ -452,10 +452,24 @@ def test_an_artefact_states_what_made_it(saved: Path) -> None:
 def test_a_model_as_large_as_a_forger_likes_is_refused_without_making_it(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     forged = Line(inputs=3)
-    forged.inputs = 10**12
-    store.save_model(path, forged)
-    with pytest.raises(StoreError, match=r"linear.weight is 'float32 \[1, 3\]' in the file, expected .*1000000000000"):
-        store.load_model(path, Line)
+    for inputs, said in (
+        (9999, r"linear.weight is 'float32 \[1, 3\]' in the file, expected .*9999"),
+        (10**12, "inputs is 1000000000000, expected sizes of at most 10000"),
+    ):
+        forged.inputs = inputs
+        store.save_model(path, forged)
+        with pytest.raises(StoreError, match=said):
+            store.load_model(path, Line)
+
+
+@pytest.mark.parametrize(
+    ("where", "options"), [("paper/seed2/models/Reacher", " --scale paper --seed 2"), ("elsewhere", "")]
+)
+def test_a_missing_file_names_the_command_that_makes_it_for_its_own_run(
+    tmp_path: Path, where: str, options: str
+) -> None:
+    with pytest.raises(StoreError, match=f"does not exist. Make it: python -m tsmlib run train{options}$"):
+        store.load_model(tmp_path / where / "tsm.safetensors", Line)
 
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def _bench(name: str) -> int:
     for word in present if name == "all" else [name]:
         status = subprocess.run([sys.executable, str(present[word])], check=False).returncode  # its memory is its own
         if status:
-            raise runs.RunError(f"the benchmark {word} ended with status {status}.")
+            raise runs.RunError(f"the benchmark {word} ended with status {status}; what went wrong stands above.")
     return 0
 
 

@@ -153,7 +153,9 @@ def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, An
         try:
             tensors, header = store.load(path, kind="checkpoint")
             if f"{header.get('generation'):09}" != path.stem:
-                raise StoreError(f"{path} is stale: it holds generation {header.get('generation')!r:.80}.")
+                raise StoreError(
+                    f"{path} is stale: it holds generation {header.get('generation')!r:.80}, expected its name's."
+                )
         except (StoreError, TypeError, ValueError) as error:
             refused.append(str(error))
             continue

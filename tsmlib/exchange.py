@@ -63,7 +63,8 @@ def load_minari(
     if len({states.shape for states, _ in episodes}) > 1 or len({actions.shape for _, actions in episodes}) > 1:
         lengths = sorted({len(actions) for _, actions in episodes})
         raise StoreError(
-            f"{file} holds episodes of {lengths[0]} to {lengths[-1]} steps; expected equally long ones. Cut them."
+            f"{file} holds episodes of {lengths[0]} to {lengths[-1]} steps; expected equally long ones. Cut them to "
+            "one length."
         )
     try:
         return Trajectories(
@@ -71,7 +72,7 @@ def load_minari(
             env, dt, names, units, angles,
         )  # fmt: skip
     except TrajectoryError as error:
-        raise StoreError(f"{file} holds no usable trajectories: {error}") from error
+        raise StoreError(f"{file} does not hold what env, names and units say: {error}") from error
 
 
 def _episode(h5py: Any, file: Path, root: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +81,10 @@ def _episode(h5py: Any, file: Path, root: Any, name: str) -> tuple[np.ndarray, n
     for part in ("observations", "actions"):
         data = root[name].get(part)
         if not isinstance(data, h5py.Dataset) or len(data.shape) != 2 or data.dtype.kind not in "fi":
-            raise StoreError(f"{file}: {name}/{part} is {data!r:.80}, expected numbers of shape (steps, size).")
+            raise StoreError(
+                f"{file}: {name}/{part} is {data!r:.80}, expected numbers of shape (steps, size). "
+                "Record flat vectors, no dictionaries."
+            )
         arrays.append(np.asarray(data[()], np.float32))
     return arrays[0], arrays[1]
 

@@ -25,6 +25,7 @@ MODELS = (
     *("tsm+full", "tsm+plain", "tsm+z4", "tsm+z16", "tsm+h1", "tsm+h20"),
 )
 LONGEST = 1000  # characters
+_RESTORE = "Restore it: git checkout -- notebooks"
 
 
 class ParameterError(ValueError):
@@ -123,11 +124,9 @@ def declared(notebook: Path) -> dict[str, Any]:
         tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
         sources = ["".join(cell["source"]) for cell in tagged]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ParameterError(
-            f"{notebook} is not a notebook: {error!r:.200}. Restore it: git checkout -- notebooks"
-        ) from error
+        raise ParameterError(f"{notebook} is not a notebook: {error!r:.200}. {_RESTORE}") from error
     if len(sources) != 1:
-        raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one.")
+        raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one. {_RESTORE}")
     found: dict[str, Any] = {}
     try:
         for statement in ast.parse(sources[0]).body:
@@ -139,7 +138,9 @@ def declared(notebook: Path) -> dict[str, Any]:
                 case _:
                     raise ValueError(f"line {statement.lineno} is not 'name = literal'")
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
-        raise ParameterError(f"{notebook.name}, parameters cell: {error}; expected 'name = literal' only.") from error
+        raise ParameterError(
+            f"{notebook.name}, parameters cell: {error}; expected 'name = literal' only. {_RESTORE}"
+        ) from error
     return found
 
 

@@ -50,7 +50,9 @@ def _returns(results: Results) -> dict[str, dict[str, tuple[np.ndarray, np.ndarr
             given = row.get("predicted")
             predicted = None if given is None else shaped(f"results['{task}']['{label}']['predicted']", given, "n")
             if predicted is not None and len(predicted) != len(true):
-                raise ValueError(f"{task}, {label}: {len(true)} true and {len(predicted)} predicted returns")
+                raise ValueError(
+                    f"{task}, {label}: {len(true)} true and {len(predicted)} predicted returns, expected equally many"
+                )
             for word, array in (("true", true), ("predicted", predicted)):
                 if array is not None and not np.isfinite(array).all():
                     raise ValueError(
@@ -274,7 +276,7 @@ def plan_paths(
     """
     dreamt, done = shaped("dreamt", dreamt, "n T 2"), shaped("done", done, "n T 2")
     if len(dreamt) != len(done):
-        raise ValueError(f"dreamt holds {len(dreamt)} paths and done {len(done)}")
+        raise ValueError(f"dreamt holds {len(dreamt)} paths and done {len(done)}, expected equally many")
     columns, dark, main = min(4, len(done)), COLOURS["data"], colour(label)
     rows = -(-len(done) // columns)
     figure, grid = plt.subplots(

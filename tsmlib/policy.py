@@ -278,6 +278,7 @@ class LearningCurve:
     resumed: list[str] = field(default_factory=list)
 
 
+@torch.enable_grad()  # see train.fit
 def improve(
     policy: Any,
     model: DynamicsModel,
@@ -422,7 +423,9 @@ def _require_fit(policy: Any, past: Segment, target: Tensor) -> None:
             f"the past holds {steps} steps, {name} needs {policy.past_len}; collect with past_len={policy.past_len}"
         )
     if rows % policy.copies:
-        raise ValueError(f"{rows} episodes do not divide among {policy.copies} copies of the policy")
+        raise ValueError(
+            f"{rows} episodes do not divide among {policy.copies} copies of the policy; expected a multiple"
+        )
     if target.shape != (rows, policy.target_dim):
         raise ValueError(f"targets are {tuple(target.shape)}, expected one per episode, ({rows}, {policy.target_dim})")
 

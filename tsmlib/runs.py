@@ -102,7 +102,7 @@ def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "",
         schema.check(name, value, default=defaults.get(name, value))
     try:
         if base.exists() and not base.is_dir():
-            raise ParameterError(f"run_dir is {base}, which is a file; expected a folder.")
+            raise ParameterError(f"run_dir is {base}, which is a file; expected a folder. Name another.")
     except (OSError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
@@ -210,6 +210,7 @@ def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
 
 def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool) -> Path:
     import papermill
+    from nbclient.exceptions import DeadKernelError
     from traitlets.config import Config
 
     output = run.dir / notebook.name
@@ -231,7 +232,9 @@ def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool)
             failure = "it stopped before its last cell"
     except papermill.PapermillExecutionError as error:
         failure = f"cell {error.exec_count}: {error.ename}: {error.evalue}"
-    except Exception as error:  # a dead kernel, a full disk, ...
+    except DeadKernelError:
+        failure = "its kernel died, perhaps for want of memory. Run it again: trainings go on where they were"
+    except Exception as error:  # no kernel, a full disk, ...
         failure = f"{type(error).__name__}: {error}"
     finally:
         if unfinished.exists() and _is_whole(unfinished):

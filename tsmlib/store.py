@@ -17,6 +17,7 @@ import hashlib
 import io
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -26,12 +27,14 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from tsmlib.disk import PathLike, StoreError, write_bytes
 from tsmlib.provenance import provenance
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
+LARGEST = 10_000  # number, or length of a list, among a model's arguments: what Python makes of them takes memory too
 MANIFEST, STATUS = "MANIFEST.json", "status.json"
 COLUMNS = (
     *("env", "sim", "task", "model", "planner", "prior", "horizon", "condition"),
@@ -40,7 +43,7 @@ COLUMNS = (
 
 _ZEROS = "0" * 64
 _MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
-_REMEDY = {"trajectories": "python -m tsmlib run collect", "model": "python -m tsmlib run train"}
+_MAKES = {"trajectories": "collect", "model": "train"}  # kind -> notebook; for others, all of them
 
 
 class Model(Protocol):
@@ -102,7 +105,7 @@ def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Arrays, not yet known to be finite, and everything that the ``tsmlib`` entry says."""
     data, about = _read_checked(path, kind)
     try:
-        return safetensors.torch.load(data), about
+        return dict(sorted(safetensors.torch.load(data).items())), about  # they come in any order
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(path, kind)}") from error
 
@@ -137,7 +140,7 @@ def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str,
             f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
         )
     if kind is not None and found != kind:
-        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_other(kind)}")
+        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_other(path, kind)}")
     return data, about
 
 
@@ -162,19 +165,26 @@ def _require_finite(path: Path, tensors: Mapping[str, Tensor], remedy: str) -> N
 def _again(path: Path, kind: str | None = None) -> str:
     """What to do about a file that is damaged."""
     if path.name == STATUS:
-        return "Delete it and run the notebooks again: python -m tsmlib run all"
+        return f"Delete it and run the notebooks again: {_command(path)}"
     if any((folder / MANIFEST).is_file() for folder in path.absolute().parents):
         return "Restore it: git checkout -- data, where it came with the repository."
     if kind == "checkpoint":
         return "Delete it: training goes on from the one before it."
-    command = _REMEDY.get(kind or "")
-    return f"Delete it and make it again: {command}" if command else "Delete it and run the notebook that makes it."
+    what = "make it again" if kind in _MAKES else "run the notebook that makes it, or all of them"
+    return f"Delete it and {what}: {_command(path, kind)}"
 
 
-def _other(kind: str | None) -> str:
+def _other(path: Path, kind: str) -> str:
     """What to do about a whole file that is not the one that was asked for."""
-    command = _REMEDY.get(kind or "")
-    return "Name another file" + (f", or delete it and make one that fits: {command}" if command else ".")
+    instead = f", or delete it and make one that fits: {_command(path, kind)}" if kind in _MAKES else "."
+    return f"Name another file{instead}"
+
+
+def _command(path: Path, kind: str | None = None) -> str:
+    """What makes a file, with the scale and the seed of the run that it lies in."""
+    run = re.search(r"/(smoke|laptop|paper)/seed(\d+)/", path.absolute().as_posix())
+    options = f" --scale {run[1]} --seed {run[2]}" if run else ""
+    return f"python -m tsmlib run {_MAKES.get(kind or '', 'all')}{options}"
 
 
 # Trajectories and models ---------------------------------------------------------------------------------------------
@@ -205,7 +215,7 @@ def load_trajectories(
         words = [fields["env"], *fields["names"], *fields["units"]]
         size = tensors["states"].shape[-1]
         if not all(isinstance(word, str) for word in words) or not 0 < fields["dt"] < math.inf:
-            raise TypeError(f"env, names, units or dt make no sense: {fields!r:.200}")
+            raise TypeError(f"expected texts as env, names and units and a dt above 0, found {fields!r:.200}")
         if not all(type(index) is int and 0 <= index < size for index in fields["angles"]):
             raise TypeError(f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions")
         found = Trajectories(
@@ -221,9 +231,9 @@ def load_trajectories(
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
         raise StoreError(f"{path} holds no usable trajectories: {error}. {_again(path, 'trajectories')}") from error
     if env is not None and found.env != env:
-        raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_other('trajectories')}")
+        raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_other(path, 'trajectories')}")
     if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other('trajectories')}")
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other(path, 'trajectories')}")
     return found
 
 
@@ -250,23 +260,56 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None
     _require_finite(path, tensors, _again(path, "model"))
     header = about["header"]
     if header.get("class") != cls.__name__:
-        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_other('model')}")
+        raise StoreError(
+            f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_other(path, 'model')}"
+        )
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
-        with torch.device("meta"):  # a plan of the model, without memory, however large the file says it is
+        _require_sizes(config)
+        limit = LARGEST + sum(tensor.numel() for tensor in tensors.values())
+        with (
+            torch.device("meta"),
+            _AtMost(limit),
+        ):  # a plan of the model, without memory, however large the file says it is
             planned = layout(cls(**config).state_dict())
         differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
     except Exception as error:  # what the file says goes to a constructor, which may fail in any way
         raise StoreError(
-            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_other('model')}"
+            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_other(path, 'model')}"
         ) from error
     if differs:
-        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_other('model')}")
+        raise StoreError(
+            f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_other(path, 'model')}"
+        )
     if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other('model')}")
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other(path, 'model')}")
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
+
+
+class _AtMost(TorchFunctionMode):
+    """So many operations of torch, so that no number of layers in a file keeps a processor busy."""
+
+    def __init__(self, operations: int) -> None:
+        self.operations = operations
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.operations -= 1
+        if self.operations < 0:
+            raise ValueError("it would be much larger than its file")
+        return func(*args, **(kwargs or {}))
+
+
+def _require_sizes(config: Mapping[str, Any]) -> None:
+    """Refuse a model's arguments, from a file, that would take memory before any array is planned."""
+    for name, value in config.items():
+        for item in (value, *value) if isinstance(value, list) else (value,):
+            size = len(item) if isinstance(item, list) else item
+            if isinstance(item, dict):
+                _require_sizes(item)
+            elif isinstance(size, int) and size > LARGEST:
+                raise ValueError(f"{name} is {value!s:.80}, expected sizes of at most {LARGEST}")
 
 
 def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_stated: bool = False) -> list[str]:
@@ -300,10 +343,16 @@ def save_table(path: PathLike, rows: Sequence[Mapping[str, Any]], *, extra: Sequ
     path, columns = Path(path), (*COLUMNS, *extra)
     for i, row in enumerate(rows):
         if unknown := sorted(set(row) - set(columns)):
-            raise StoreError(f"row {i} for {path} has unknown columns {unknown}, expected some of {list(columns)}.")
+            raise StoreError(
+                f"row {i} for {path} has unknown columns {unknown}, expected some of {list(columns)}. "
+                "Name others as extra."
+            )
         for name, value in row.items():
             if isinstance(value, float | np.floating) and not math.isfinite(value):
-                raise StoreError(f"row {i} for {path} holds {name} = {value}, expected a finite number: {dict(row)}")
+                raise StoreError(
+                    f"row {i} for {path} holds {name} = {value}, expected a finite number; leave it out, or count "
+                    f"what diverged: {dict(row)}"
+                )
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
@@ -444,7 +493,9 @@ def verify(path: PathLike) -> list[Path]:
     """
     path = Path(path)
     if not path.exists():
-        raise StoreError(f"{path} does not exist. Expected an artefact (*.safetensors) or a folder of them.")
+        raise StoreError(
+            f"{path} does not exist. Expected an artefact (*.safetensors) or a folder of them: check the name."
+        )
     problems: dict[str, None] = {}  # in order, each once
     checked: dict[Path, None] = {}
 
@@ -527,8 +578,12 @@ def _read(path: Path, kind: str | None = None) -> bytes:
             raise OSError("it is a folder or a device, expected a file")
         return path.read_bytes()
     except FileNotFoundError:
-        command = _REMEDY.get(kind or "")
-        raise StoreError(f"{path} does not exist. {f'Make it: {command}' if command else 'Check the name.'}") from None
+        remedy = (
+            f"Make it: {_command(path, kind)}"
+            if kind in _MAKES
+            else "Check the name, or run the notebook that makes it."
+        )
+        raise StoreError(f"{path} does not exist. {remedy}") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"cannot read {path}: {error}. Check its name and permissions.") from error
 

@@ -23,6 +23,7 @@ __all__ = ["Curve", "TrainingStopped", "fit", "fixed_windows", "schedule", "vali
 Loss = Callable[[Window, torch.Generator], Tensor]
 
 
+@torch.enable_grad()  # an interrupt within torch.no_grad, in a notebook, may leave gradients off
 def fit(
     model: nn.Module,
     loss: Loss,
@@ -67,6 +68,8 @@ def fit(
         past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator,
     )  # fmt: skip
     with contextlib.ExitStack() as stack:
+        torch.set_autocast_enabled("cpu", False)  # or this on
+        stack.callback(torch.set_autocast_enabled, "cpu", False)
         if checkpoint is not None:
             stack.enter_context(only_writer(checkpoint, f"training, seed {seed}"))
             state.load(checkpoint, identity)
@@ -80,6 +83,7 @@ def fit(
             generator.manual_seed(seed * 1_000_003 + step)
             for group in optimizer.param_groups:
                 group["lr"] = schedule(step, steps, lr, lr_final, warmup)
+            torch.clear_autocast_cache()  # which one left on would never clear
             with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
                 value = loss(next(draw), generator)
             if not torch.isfinite(value):

@@ -75,7 +75,8 @@ class Trajectories:
             )
         if not len(self.names) == len(self.units) == states.shape[2]:
             raise TrajectoryError(
-                f"{self.env}: {states.shape[2]} state dimensions, {len(self.names)} names, {len(self.units)} units"
+                f"{self.env}: {states.shape[2]} state dimensions, {len(self.names)} names, {len(self.units)} units; "
+                "expected one name and one unit per dimension"
             )
         for field, array, columns in (("states", states, self.names), ("actions", actions, None)):
             bad = np.argwhere(~np.isfinite(array))

@@ -189,6 +189,7 @@ def through_simulator(env_id: str, start: np.ndarray) -> Predict:
     return predict
 
 
+@torch.enable_grad()  # see train.fit
 def adam(
     predict: Predict,
     reward: Reward,

@@ -20,11 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from torture.world import TRAIN, Child, Outcome, artefacts, folder, forged, in_child, new_model, rng
+from torture.world import TRAIN, Child, Outcome, artefacts, folder, forged, in_child, new_model, refusal, rng
 from tsmlib import parameters, runs, store
+from tsmlib.baselines import LSTM, Ensemble, OneStep
 from tsmlib.envs import ENV_IDS, fingerprint
 from tsmlib.exchange import load_minari
 from tsmlib.parameters import ParameterError
+from tsmlib.policy import OneStepPolicy, SegmentPolicy
+from tsmlib.prior import ActionPrior
 from tsmlib.runs import RunError
 from tsmlib.store import StoreError
 from tsmlib.trajectory import TrajectoryError
@@ -47,9 +50,7 @@ def damage(trials: int) -> Outcome:
         for kind, (path, load) in kinds.items():
             good, value = Child(lambda: damaged(kind, path, load, trials)).result()  # noqa: B023
             if good:
-                found.of += value.of
-                found.right += value.right
-                found.wrong += value.wrong
+                found.add(value)
             else:
                 found.count(False, f"{kind}: the child died: {value}")
         found.note = f"{len(kinds)} kinds of file"
@@ -58,8 +59,7 @@ def damage(trials: int) -> Outcome:
 
 def damaged(kind: str, path: Path, load: Callable[[], Any], trials: int) -> Outcome:
     """Every damage to one file. The name of the file must be in the message."""
-    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (now + 4 * 2**30, resource.RLIM_INFINITY))
+    little_memory()
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # a hang is a death
     warnings.simplefilter("ignore")
     found, data = Outcome(), path.read_bytes()
@@ -83,6 +83,12 @@ def damaged(kind: str, path: Path, load: Callable[[], Any], trials: int) -> Outc
     path.write_bytes(data)
     load()
     return found
+
+
+def little_memory() -> None:
+    """Let this process take 4 GB more than it has."""
+    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (now + 4 * 2**30, resource.RLIM_INFINITY))
 
 
 def spoils(data: bytes, trials: int) -> Iterator[tuple[str, bytes]]:
@@ -399,7 +405,8 @@ def hostile_texts() -> list[str]:
     """At least 150 values that no parameter may have, typed on a command line."""
     texts = ["../x", "../../etc/passwd", "a/../../b", "..", "~", "~root", "~/x", "a\0b", "\0", "a\nb", "\n", "\r", "\t",
              "a\u202eb", "\u200bx", "\ufeffx", "\u2028x", "\x1b[31mred", "\x7f", "\ud800x", " x", "x ", "CON", "con",
-             "nul.txt", "aux/x", "a/PRN", "com1", "LPT9.x", "x" * 300, "x" * 1001, "x" * 100_000]  # fmt: skip
+             "nul.txt", "aux/x", "a/PRN", "com1", "LPT9.x", "../..", "a/..", "x/../../..", "/../x", "~x", "Nul", "PRN",
+             "com7/x", "x" * 300, "x" * 1001, "x" * 100_000]  # fmt: skip
     texts += [
         f"{text}{tail}" for text in ("../", "~", "a\0", "a\n", "\u202e") for tail in ("1", "smoke", "tsm", "x" * 20)
     ]
@@ -551,7 +558,38 @@ def fuzz(trials: int) -> Outcome:
                 found.count(bool(str(error)))
             except BaseException as error:
                 found.count(False, f"trial {trial}: {error!r:.300}")
-    found.note = f"{refusals} refused, {found.of - refusals} accepted"
+        found.note = f"{refusals} refused, {found.of - refusals} accepted"
+        claims = in_child(lambda: greedy(place))
+        found.add(claims)
+        found.note += f", {claims.of} that claim memory"
+    return found
+
+
+def greedy(place: Path) -> Outcome:
+    """Models of a few kilobytes, one of whose sizes is a thousand million: refused before they take memory."""
+    found, path = Outcome(), place / "greedy.safetensors"
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    little_memory()
+    prior = ActionPrior(2, segment_len=4, channels=8, dilations=(1, 2))
+    models = [new_model(), OneStep(3, 2, hidden=8), LSTM(3, 2, hidden=8), Ensemble(3, 2, hidden=8), prior,
+              OneStepPolicy(3, 2, hidden=8), SegmentPolicy(3, prior, channels=8)]  # fmt: skip
+
+    def ask(model: Any, **changed: Any) -> str:
+        header = {"class": type(model).__name__, "config": {**model.config(), **changed}}
+        forged(path, model.state_dict(), kind="model", header=header)
+        return refusal(lambda: store.load_model(path, type(model)))
+
+    for model in models:
+        found.count(not ask(model), f"{type(model).__name__} was not read")
+        for name in model.config():
+            for huge in (10**9, [10**9], [1] * 20_000, {"action_dim": 10**9}):
+                said = ask(model, **{name: huge})
+                grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+                good = path.name in said and "at most" in said and grown < 100
+                found.count(good, f"{type(model).__name__}, {name} {huge!r:.30}: {grown:.0f} MB, {said}")
+    began = time.process_time()
+    said = ask(models[3], members=10_000, layers=10_000)
+    found.count("larger than its file" in said and time.process_time() - began < 2, said)
     return found
 
 

@@ -33,6 +33,7 @@ from torture.world import (
     learn,
     new_model,
     reference,
+    refusal,
     rng,
     tiny,
     train,
@@ -333,15 +334,6 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
     return found
 
 
-def refusal(work: Callable[[], Any], kind: type[Exception] = store.StoreError) -> str:
-    """The message of the error that ``work`` must raise; '' where it raises none."""
-    try:
-        work()
-    except kind as error:
-        return str(error)
-    return ""
-
-
 # One writer ----------------------------------------------------------------------------------------------------------
 
 
@@ -436,6 +428,10 @@ def interrupted_in_a_cell(trials: int) -> Outcome:
         began = time.monotonic()
         run(client, "train(None)")
         seconds, slowest, stopped = time.monotonic() - began, 0.0, 0
+        half = run(client, "train(None, bf16=True)")
+        run(client, "torch.set_grad_enabled(False); torch.set_autocast_enabled('cpu', True)")  # as an interrupt may
+        run(client, "torch.autocast_increment_nesting()")
+        found.count(run(client, "train(None, bf16=True)") == half != "", "other bits in a kernel that was interrupted")
         for trial in range(trials):
             with folder() as place:
                 cell = f"digest = train(Path({str(place / 'run')!r})); digest"

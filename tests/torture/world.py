@@ -51,6 +51,10 @@ class Outcome:
         if not good:
             self.wrong.append(what)
 
+    def add(self, other: Outcome) -> None:
+        """Take over the trials of another."""
+        self.of, self.right, self.wrong = self.of + other.of, self.right + other.right, self.wrong + other.wrong
+
     def check(self) -> Outcome:
         """Fail unless all trials went as they should."""
         assert self.of, "nothing was tried"
@@ -242,6 +246,15 @@ def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
         "table of a run": (result, lambda: store.load_table(result)),
         "status": (run.dir / store.STATUS, lambda: require(run, "05_control")),
     }
+
+
+def refusal(work: Callable[[], Any], kind: type[Exception] = store.StoreError) -> str:
+    """The message of the error that ``work`` must raise; '' where it raises none."""
+    try:
+        work()
+    except kind as error:
+        return str(error)
+    return ""
 
 
 def rng(*seed: int) -> random.Random:

@@ -176,7 +176,7 @@ def _kept(path: Path, task: Task, wanted: dict[str, Any]) -> Plan | None:
     if not path.exists():
         return None
     tensors, header = store.load(path, kind="plan")
-    n, made_from = len(task), header["made_from"]
+    n, made_from = len(task), header.get("made_from", {})
     if any(made_from.get(word) != value for word, value in wanted.items()):
         return None
     if not np.array_equal(tensors["start"][:n], task.start) or not torch.equal(tensors["target"][:n], task.target):

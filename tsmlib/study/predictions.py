@@ -37,18 +37,16 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
         **{split: store.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})
            for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
-    if path.exists() and store.read_header(path)["made_from"] == made_from:
-        tensors, _ = store.load(path, kind="scores")
-        return _unpacked(tensors)
-    found = evaluate.score(
-        net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
-        progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
-    )  # fmt: skip
-    tensors = {f"values.{metric}": value for metric, value in found.values.items()}
-    tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
-    tensors |= {"pit": found.pit, "outside": found.outside}
-    store.save(path, tensors, kind="scores", header={"made_from": made_from})
-    return found
+    if not path.exists() or store.read_header(path).get("made_from") != made_from:
+        found = evaluate.score(
+            net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
+            progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
+        )  # fmt: skip
+        tensors = {f"values.{metric}": value for metric, value in found.values.items()}
+        tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
+        tensors |= {"pit": found.pit, "outside": found.outside}
+        store.save(path, tensors, kind="scores", header={"made_from": made_from})
+    return _unpacked(store.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
 
 
 def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict[str, Any]]:
