@@ -188,7 +188,8 @@ def require(run: Run, notebook: str) -> dict[str, Any]:
     if state == "complete" and {"files", "sha256"} & set(entry) and not store.intact(entry):  # older ones have neither
         state = "damaged"
     if state != "complete":
-        raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. Run it: {command}")
+        what = "Wait for it, or run it again" if state == "running" else "Run it"
+        raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. {what}: {command}")
     try:
         changed = [
             name
