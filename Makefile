@@ -17,7 +17,7 @@ help:
 	@echo "make action_prior   what the action prior does to a plan (notebooks/07_action_prior.ipynb)"
 	@echo "make claims    what the paper claims, judged from the rows that ship (notebooks/08_claims.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
-	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (half an hour)"
+	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (an hour of one processor)"
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
