@@ -49,7 +49,7 @@ def test_one_arm_and_many_are_made_by_name(env_id: str) -> None:
         moved: list[Any] = []
         for _ in range(4):
             seen, _, _, _, info = env.step(push)
-            assert (seen != info["state"]).all()
+            assert (seen != info["state"])[..., :8].all()
             moved.append(info["state"][state][2:4])
         assert abs(moved[0]).max() < 1 < abs(moved[3]).max()  # rad/s: full torque arrives with the third step
     for _ in range(96):
@@ -110,6 +110,14 @@ def test_half_ranges_are_those_of_random_data(env_id: str) -> None:
     share = (states.max((0, 1)) - states.min((0, 1)))[2:] / (2 * np.array(HALF_RANGE[2 : states.shape[-1]]))
     assert np.abs(share[:6] - 1).max() < 0.25
     assert ((share[6:] > 0.5) & (share[6:] < 1.25)).all()  # an object is rarely hit hard, in 5,000 episodes once
+
+
+def test_an_obstacle_is_not_seen_to_move() -> None:
+    env: Any = gymnasium.make_vec(imperfect("tsm/ReacherObstacle-v0", noise=0.5), num_envs=2)
+    env.reset(seed=0)
+    off = env.rollout(np.zeros((2, 5, 2))) - env.truth[:, 1:]
+    assert not off[..., 8:].any()
+    assert off[..., :8].all()
 
 
 def test_noise_is_in_half_ranges() -> None:

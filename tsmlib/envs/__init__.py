@@ -90,6 +90,8 @@ def _imperfect_arms(num_envs: int, env_id: str, noise: float, delay: int, **kwar
 
 
 def _half_range(env_id: str) -> np.ndarray:
+    if task_of(env_id) == "obstacle":  # it does not move, and nobody measures how fast
+        return np.array([*HALF_RANGE[:8], 0.0, 0.0])
     return np.array(HALF_RANGE[: 10 if has_block(env_id) else 6])
 
 

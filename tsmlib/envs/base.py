@@ -48,7 +48,7 @@ STATE_NAMES = (
     "joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y", "block_x", "block_y", "block_vx", "block_vy",
 )  # fmt: skip
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
-HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.25, 0.25, 3.5, 3.0)  # of random data; of angles, of cosine and sine
+HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.25, 0.25, 3.5, 3.0)  # in random data; angles: of cosine, sine
 
 
 class SimulationUnstable(RuntimeError):
