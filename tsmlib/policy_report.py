@@ -63,7 +63,7 @@ def learning_curves(rows: Iterable[Mapping[str, Any]]) -> LearningCurves:
     same points, or where one task was learned in two environments.
     """
     methods: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for row in _one_env([row for row in rows if row["condition"] == "learning" and row["horizon"] != ""]):
+    for row in _one_env([row for row in rows if row["condition"] == "learning" and row.get("horizon", "") != ""]):
         methods.setdefault((row["task"], f"{row['model']} {row['prior']}".strip()), []).append(row)
     found: dict[str, dict[str, Curves]] = {}
     for (task, label), own in methods.items():
