@@ -278,6 +278,7 @@ def test_what_belongs_to_no_point_of_a_curve_is_passed_over(tmp_path: Any) -> No
     assert [(row["copy"], row["value"], row["horizon"]) for row in more if row["metric"] == "within_data"] == [
         (0, 0.25, 440), (1, 0.75, 440),
     ]  # fmt: skip
+    more.append({column: value for column, value in more[0].items() if column != "horizon"})  # not yet from a table
     curves = policy_report.learning_curves(more)["reach"]["tsm codes"]
     np.testing.assert_array_equal(
         curves["return_true"], policy_report.learning_curves(rows())["reach"]["tsm codes"]["return_true"]
