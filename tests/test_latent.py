@@ -162,6 +162,19 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     assert not any(metric.startswith(("kl", "error_")) for metric, _ in value)  # of no encoder that was trained for it
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> None:
+    seen, draw = scene(8), rng()
+    still = torch.zeros(8, 1)
+    net: Any = SimpleNamespace(
+        segment_len=10, latent_dim=1, features=Features(10, ()), encode=lambda states: (still, still),
+        decode=lambda past, u, z: past.states + noise * torch.randn(past.states.shape, generator=draw),
+    )  # fmt: skip
+    rows = latent.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
+    [variance] = [row["value"] for row in rows if row["metric"] == "fixed_code_variance"]
+    assert variance == pytest.approx(noise**2 / 2, rel=0.2)  # of two, about their mean
+
+
 def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> None:
     seen = scene(1)
     future = seen.window.future.states

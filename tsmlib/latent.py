@@ -379,6 +379,9 @@ def code_rows(model: TSM, seen: Seen, generator: torch.Generator, /, **common: A
     if common["model"] == "tsm":
         with torch.no_grad():
             mean, log_variance = model.encode(seen.window.future.states)
+            past, actions = seen.window.past, seen.window.future.actions
+            futures = torch.stack([model.decode(past, actions, mean) for _ in range(2)])
+        add("fixed_code_variance", float(futures.var(0, correction=0).mean()))
         kl = kl_by_dimension(mean, log_variance)
         add("active_units", float(active_units(mean).sum()))
         for i, value in enumerate(kl.mean(0)):
