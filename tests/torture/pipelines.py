@@ -170,7 +170,7 @@ for seed in range(int(sys.argv[4])):
     print("made", json.dumps({
         "data": data, "weights": store.digest(net.state_dict()), "plan": store.digest({"u": trial.actions}),
         "losses": [curve["train"], curve["validation"]], "validation": curve["validation"][-1],
-        "true": trial.true.mean().item(),
+        "promised": trial.plan.predicted.mean().item(),
     }))
 """
 
@@ -220,14 +220,15 @@ def threads(trials: int) -> Outcome:
     for count in (1, 2):
         with folder() as place:
             made = whole(place, threads=count, seeds=trials)
-            values.append(np.array([[one["validation"], one["true"]] for one in made]))
+            values.append(np.array([[one["validation"], one["promised"]] for one in made]))
     one, two = values
     deviation, difference = one.std(0, ddof=1), two - one
     mean, error = difference.mean(0), difference.std(0, ddof=1) / np.sqrt(trials)
-    for i, name in enumerate(("validation loss", "true return")):
+    for i, name in enumerate(("validation loss", "promised return")):
         reach = abs(mean[i]) + 1.729 * error[i]  # 90 %, 19 degrees of freedom
         found.count(
-            reach <= 0.5 * deviation[i], f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}"
+            0 < deviation[i] and reach <= 0.5 * deviation[i],
+            f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}",
         )
     found.note = f"largest difference {np.max(np.abs(mean) / deviation):.3f} of a seed's standard deviation"
     return found
