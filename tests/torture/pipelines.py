@@ -227,7 +227,7 @@ def threads(trials: int) -> Outcome:
     for i, name in enumerate(("validation loss", "promised return")):
         reach = abs(mean[i]) + 1.729 * error[i]  # 90 %, 19 degrees of freedom
         found.count(
-            0 < deviation[i] and reach <= 0.5 * deviation[i],
+            deviation[i] > 0 and reach <= 0.5 * deviation[i],
             f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}",
         )
     found.note = f"largest difference {np.max(np.abs(mean) / deviation):.3f} of a seed's standard deviation"
