@@ -226,6 +226,12 @@ def test_intervals_of_honest_directions_hold_the_truth_as_often_as_they_should()
     assert found.spread.median() == pytest.approx(math.degrees(0.4), rel=0.05)
 
 
+def test_where_nothing_was_moved_there_are_no_deflections_to_tell_of() -> None:
+    found = Deflections(torch.zeros(5, 0), torch.zeros(0), torch.zeros(5, 0))
+    assert [len(end) for end in found.interval()] == [0, 0]
+    assert latent.deflection_rows(found, PUSH, model="tsm", seed=0, scale="smoke") == []
+
+
 def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:
     first, second = torch.randn(2, 5000, 8, generator=rng())
     codes = latent.between(first, second, 5)

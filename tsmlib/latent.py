@@ -283,6 +283,8 @@ class Deflections:
 
     def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
         """The central interval (E,) of the sampled directions around their mean, degrees off the true one."""
+        if not len(self.travel):
+            return self.travel, self.travel
         mean = self._mean.angle()
         around = torch.exp(1j * (self.off - mean)).angle()  # in (-pi, pi]
         edges = torch.nanquantile(around, torch.tensor([(1 - level) / 2, (1 + level) / 2]), dim=0) + mean
@@ -443,7 +445,9 @@ def contact_rows(seen: Seen, **common: Any) -> list[dict[str, Any]]:
 
 
 def deflection_rows(found: Deflections, env: str, **common: Any) -> list[dict[str, Any]]:
-    """Directions and distances after the first touch."""
+    """Directions and distances after the first touch; no rows where no object was moved."""
+    if not len(found.travel):
+        return []
     common = dict(common, env=env, sim=sim_of(env), planner="none", condition="first touch", n=len(found.travel))
     low, high = torch.quantile(found.travels, torch.tensor([0.1, 0.9]), dim=0)
     miss = (found.travels.mean(0) - found.travel).abs()

@@ -59,13 +59,13 @@ def schedule(run: Run, env: str, model: str) -> list[Stage]:
     steps. prior: free-running over two segments, its own budget.
     """
     if model == "prior":
-        return [Stage("loss", run.pick(smoke=30, laptop=1500, paper=3000), lr=1e-3)]
+        return [Stage("loss", run.pick(smoke=20, laptop=1500, paper=3000), lr=1e-3)]
     seconds = BUDGET[short(imperfections(env)[0])] * run.pick(smoke=0.0, laptop=0.5, paper=1.0)
     wide = has_block(env)
 
     def stage(loss: str, rate: float, share: float = 1.0, **options: Any) -> Stage:
         """rate: updates per second on one core of the machine that the published models were trained on."""
-        return Stage(loss, max(30, 10 * round(seconds * share * rate / 10)), **options)
+        return Stage(loss, max(20, 10 * round(seconds * share * rate / 10)), **options)
 
     teacher = stage("teacher_forced_loss", 20 if wide else 30, 0.25, future_len=10)
     longer = stage("teacher_forced_loss", 26, 0.4, future_len=10)
