@@ -5,19 +5,16 @@ Letters in shapes: B starts, S model samples, K segments, T horizon, dz and du s
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from tsmlib.control import Task
 from tsmlib.dynamics import DynamicsModel
 from tsmlib.prior import ActionPrior
-from tsmlib.style import interval, name
 from tsmlib.trajectory import Segment
 from tsmlib.trajopt import DirectActions, LatentActions, Space, expected_return, through_model
 
@@ -97,21 +94,3 @@ def signal(task: Task, model: DynamicsModel, space: Space, *, samples: int = 32,
     mean, deviation = drawn.mean(0).abs(), drawn.std(0)
     ratio = mean / torch.maximum(deviation, ROUNDING * mean).clamp_min(1e-300)
     return ratio.clamp_min(ROUNDING).log().mean(1).exp()
-
-
-def report(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows of ``gradient_snr`` as a Markdown table: the geometric mean over starts, and by how much that over codes is
-    larger than that over torques, with the 95 % t interval over starts (means over the seeds there are)."""
-    found: dict[tuple[str, str], dict[str, dict[int, list[float]]]] = {}
-    for row in rows:
-        if row["metric"] == "gradient_snr":
-            starts = found.setdefault((row["env"], row["model"]), {}).setdefault(row["prior"], {})
-            starts.setdefault(row["target"], []).append(math.log(row["value"]))
-    lines = ["| environment | model | n | over codes | over torques | codes / torques |", "|---" * 6 + "|"]
-    for (env, model), ways in found.items():
-        codes, actions = (np.array([np.mean(ways[way][i]) for i in sorted(ways[way])]) for way in ("codes", "actions"))
-        mean, half = interval(codes - actions)
-        cells = [f"{np.exp(value):.3g}" for value in (codes.mean(), actions.mean(), mean, mean - half, mean + half)]
-        ratio = f"{cells[2]} [{cells[3]}, {cells[4]}]"
-        lines.append(f"| `{env}` | {name(model)} | {len(codes)} | {cells[0]} | {cells[1]} | {ratio} |")
-    return "\n".join(lines)

@@ -6,6 +6,7 @@ A row's ``condition`` is OPEN (executed open loop, as in the paper), CLOSED (pla
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -361,6 +362,24 @@ def verdicts(found: Mapping[str, tuple[str, str, bool]]) -> str:
     """``bars`` as a Markdown table."""
     lines = ((what, bar, reached, "yes" if met else "no") for what, (bar, reached, met) in found.items())
     return _table(("what", "bar", "measured", "reached"), lines)
+
+
+def by_gradient(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Rows of ``gradient_snr`` as a Markdown table: the geometric mean over starts, and by how much that over codes is
+    larger than that over torques, with the 95 % t interval over starts (means over the seeds there are)."""
+    found: dict[tuple[str, str], dict[str, dict[int, list[float]]]] = {}
+    for row in rows:
+        if row["metric"] == "gradient_snr":
+            starts = found.setdefault((row["env"], row["model"]), {}).setdefault(row["prior"], {})
+            starts.setdefault(row["target"], []).append(math.log(row["value"]))
+    lines = ["| environment | model | n | over codes | over torques | codes / torques |", "|---" * 6 + "|"]
+    for (env, model), ways in found.items():
+        codes, actions = (np.array([np.mean(ways[way][i]) for i in sorted(ways[way])]) for way in ("codes", "actions"))
+        mean, half = interval(codes - actions)
+        cells = [f"{np.exp(value):.3g}" for value in (codes.mean(), actions.mean(), mean, mean - half, mean + half)]
+        ratio = f"{cells[2]} [{cells[3]}, {cells[4]}]"
+        lines.append(f"| `{env}` | {NAMES.get(model, model)} | {len(codes)} | {cells[0]} | {cells[1]} | {ratio} |")
+    return "\n".join(lines)
 
 
 # Pictures ------------------------------------------------------------------------------------------------------------
