@@ -5,7 +5,7 @@ Letters in shapes: B batch, P positions in time, C channels, dz latent size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+BLOCK = 1024  # rows that are decoded at once on a processor
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,13 @@ def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
     return torch.randn(shape, generator=noise, device=like.device, dtype=like.dtype)
+
+
+def in_blocks(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+    """``compute`` of so few rows at a time that what lies between its steps stays in a processor's cache."""
+    if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
+        return compute(*rows)
+    return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
 
 
 def sigmoid_tanh(a: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tsmlib.nets import CausalDecoder, Encoder, Noise, kl_from_standard_normal, sample_posterior
+from tsmlib.nets import CausalDecoder, Encoder, Noise, in_blocks, kl_from_standard_normal, sample_posterior
 from tsmlib.trajectory import Window
 
 
@@ -63,6 +63,9 @@ class ActionPrior(nn.Module):
 
     def decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
         """P(U+ | U-, z): past actions (B, L, du) and codes (B, dz) -> actions (B, H, du) in [-1, 1]."""
+        return in_blocks(self._decode, past_actions, z)
+
+    def _decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
         u, codes = past_actions[:, -1], self.decoder.codes(z)
         cache = self.decoder.begin(past_actions[:, :-1] / self.std, z)
         actions = []

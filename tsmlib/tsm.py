@@ -21,6 +21,7 @@ from tsmlib.nets import (
     Encoder,
     Features,
     Noise,
+    in_blocks,
     kl_from_standard_normal,
     sample_posterior,
     standard_normal,
@@ -84,8 +85,12 @@ class TSM(nn.Module):
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z), free-running: each state is computed from the predicted one before it."""
-        step = self._begin(past, z)
-        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
+
+        def decode(states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+            step = self._begin(Segment(states, before), z)
+            return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
+
+        return in_blocks(decode, *past, actions, z)
 
     def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
         """``predict_segment`` one action at a time, with one code for the segment; see ``dynamics.stepper``."""

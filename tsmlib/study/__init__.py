@@ -19,6 +19,7 @@ from tsmlib.study.models import (
     schedule,
     train,
 )
+from tsmlib.study.parallel import ahead
 from tsmlib.study.plans import along_the_way, plan, trial
 from tsmlib.study.policies import EPISODES, assess, kept_budget, learn, within_data
 from tsmlib.study.predictions import RESULTS, evidence, scores, table
@@ -26,8 +27,7 @@ from tsmlib.study.tasks import FROZEN, TASK_SEED, draw_task, freeze_tasks, task
 
 __all__ = [
     "BUDGET", "CHOICES", "CLASSES", "DYNAMICS", "EPISODES", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS",
-    "SPLITS",
-    "TASK_SEED", "Stage", "along_the_way", "assess", "chosen", "dataset", "draw_task", "evidence", "fingerprint",
-    "freeze_tasks", "fresh", "has_block", "kept_budget", "learn", "load_or_train", "plan", "random_data", "schedule",
-    "scores", "short", "sizes", "table", "task", "train", "trial", "within_data",
+    "SPLITS", "TASK_SEED", "Stage", "ahead", "along_the_way", "assess", "chosen", "dataset", "draw_task",
+    "evidence", "fingerprint", "freeze_tasks", "fresh", "has_block", "kept_budget", "learn", "load_or_train",
+    "plan", "random_data", "schedule", "scores", "short", "sizes", "table", "task", "train", "trial", "within_data",
 ]  # fmt: skip

@@ -18,31 +18,31 @@ from tqdm.auto import tqdm
 from tsmlib.runs import Run
 
 
-def ahead(run: Run, make: Callable[..., Any], things: Sequence[tuple[Any, ...]], *, progress: str = "") -> None:
-    """Call ``make(run, *thing)`` for each of ``things``, as many at a time as there are cores, in other processes.
+def ahead(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
+    """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
 
     make: a function of ``study`` that keeps what it makes in the run's folder, such as ``load_or_train``, where the
-    notebook then finds it. Things must not depend on each other: models first, then what is made with them. At scale
-    paper alone; elsewhere the notebook makes each thing when it comes to it. The first error is raised when the others
-    have ended; what they made is kept.
+    notebook then finds it. Calls must not need each other's results: models first, then what is made with them. At
+    scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error is raised when the
+    calls under way have ended; what they made is kept.
     """
-    workers = min(_cores(), len(things))
+    workers = min(_cores(), len(calls))
     if run.scale != "paper" or workers < 2:
         return
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin) as pool:
-        calls = [pool.submit(_call, make, run, *thing) for thing in things]
+        under_way = [pool.submit(_make, run, *call) for call in calls]
         try:
-            for call in tqdm(as_completed(calls), total=len(calls), desc=progress or make.__name__):
-                call.result()
+            for done in tqdm(as_completed(under_way), total=len(calls), desc=progress):
+                done.result()
         except BaseException:  # an interrupt too: no more is begun
             pool.shutdown(cancel_futures=True)
             raise
 
 
-def _call(make: Callable[..., Any], run: Run, *thing: Any) -> None:
+def _make(run: Run, make: Callable[..., Any], *arguments: Any) -> None:
     """In the worker. What is made stays in the run's folder; only that it is done goes back."""
-    make(run, *thing)
+    make(run, *arguments)
 
 
 def _begin() -> None:
