@@ -77,7 +77,7 @@ class Row:
         """What a person reads, under HEAD."""
         low, middle, high = self.ratio
         ratio = f"{figure(middle)} ({figure(low)} to {figure(high)})" if self.reference else ""
-        share = "" if self.share is None else f"{self.share:.0%} of {self.limit}"
+        share = "" if self.share is None else f"{figure(100 * self.share)} % of {self.limit}"
         peak = "" if self.peak_bytes is None else f"{self.peak_bytes / 2**30:.2f} GiB"
         value = f"{figure(self.value)} {self.unit}".strip()
         return (self.what, self.reference, value, ratio, share, peak, str(self.n))
