@@ -1,29 +1,33 @@
-"""Planning pushes over latent codes through the model, against simulating as many steps in MuJoCo.
+"""Planning pushes through the model: over codes and over torques by Adam, and over codes by the cross-entropy method.
 
-The paper's planner: Adam over the codes of the action prior, 100 iterations for all targets at once. Each iteration
-predicts one rollout per target and sample; the reference executes as many steps in the simulator, in bulk and without
-a gradient. Every round times both, in turn.
+The paper's planner is Adam with 100 iterations for all targets at once. A call here has a few iterations, in turn with
+the same call through the plain model and prior of ``_plain``, and with simulating some of the same steps in MuJoCo, in
+bulk and without a gradient. A planner also predicts once after its last iteration and once for the plan that it gives
+back, here as there. ``--whole`` also runs the whole plan over codes once, as a check of what the rounds extrapolate.
 
     python benchmarks/plan.py        or        python -m tsmlib bench plan
 """
 
 from __future__ import annotations
 
-import argparse
+import os
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from _plain import PlainPrior, PlainTSM
+from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from tsmlib import runs, store, study
 from tsmlib.collect import collect, once
 from tsmlib.prior import ActionPrior
-from tsmlib.trajopt import LatentActions, adam, through_model
+from tsmlib.trajopt import DirectActions, LatentActions, adam, cem, through_model
 from tsmlib.tsm import TSM
 
 ENV = "tsm/ReacherPush-v0"
@@ -52,52 +56,99 @@ def timed(call: Callable[[Tensor], Tensor], name: str, seconds: dict[str, float]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--targets", type=int, default=100)
-    parser.add_argument("--iterations", type=int, default=100)
-    parser.add_argument("--samples", type=int, default=2, help="model samples per target (default 2, as scale laptop)")
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
+    options = parser(__doc__, rounds=3)
+    options.add_argument("--targets", type=int, default=100)
+    options.add_argument("--iterations", type=int, default=100, help="of the whole plan (default 100, as in the paper)")
+    options.add_argument("--few", type=int, default=2, help="iterations in a round (default 2)")
+    options.add_argument("--candidates", type=int, default=8, help="of the cross-entropy method (default 8)")
+    options.add_argument("--samples", type=int, default=2, help="model samples per target (default 2, as scale laptop)")
+    options.add_argument("--whole", action="store_true", help="run the whole plan too, minutes")
+    arguments = parsed(options)
+    few, samples = arguments.few, arguments.samples
     run = runs.resolve("bench", scale="laptop")
     task = study.task(ENV).take(arguments.targets)
+    n_targets, horizon = len(task), task.horizon
     model, prior, origin = models(run, ENV)
-    n_rollouts = (arguments.iterations + 2) * arguments.samples * len(task)  # before, between and after the iterations
+    plain_prior: Any = PlainPrior(prior)
+    seconds: dict[str, float] = defaultdict(float)
 
-    totals: dict[str, list[float]] = defaultdict(list)
-    for _ in tqdm(range(arguments.rounds), desc="rounds"):
-        seconds: dict[str, float] = defaultdict(float)
-        space = LatentActions(prior, task.horizon)
-        start = torch.zeros(1, len(task), *space.shape)
+    def codes(prior: Any) -> LatentActions:
+        return LatentActions(prior, horizon)
+
+    def through(model: Any) -> Callable[[Tensor], Tensor]:
+        return through_model(model, task.past(model.past_len), samples=samples)
+
+    def in_parts() -> None:
+        """The plan over codes, telling its parts apart."""
+        space = codes(prior)
         space.decode = timed(space.decode, "codes to torques", seconds)  # type: ignore[method-assign]
-        predict = through_model(model, task.past(model.past_len), samples=arguments.samples)
-        predict = timed(predict, "torques to states", seconds)
-        plan = adam(predict, task.reward, space, start, iterations=arguments.iterations)
-        seconds["gradients and the rest"] = plan.seconds - sum(seconds.values())
-        began = time.perf_counter()
-        simulate(task.start, plan.actions, n_rollouts)
-        for name, value in {"plan": plan.seconds, "simulate": time.perf_counter() - began, **seconds}.items():
-            totals[name].append(value)
+        predict = timed(through(model), "torques to states", seconds)
+        seconds["plan"] += adam(predict, task.reward, space, n_targets, iterations=few).seconds
 
-    rows = []
+    fast, plain = through(model), through(PlainTSM(model))
+    few_codes = partial(adam, reward=task.reward, start=n_targets, iterations=few)
+    few_cem = partial(cem, reward=task.reward, start=n_targets, iterations=1, candidates=arguments.candidates,
+                      elites=max(2, arguments.candidates // 4))  # fmt: skip
+    simulated = max(1, samples * n_targets // 4)  # rollouts, a part of those of one iteration
+    start, torques = task.start, 0.1 * torch.randn(n_targets, horizon, 2, generator=torch.Generator().manual_seed(0))
+    ways: dict[str, Callable[[], object]] = {
+        "codes, Adam": lambda: few_codes(fast, space=codes(prior)),
+        "codes, Adam plain": lambda: few_codes(plain, space=codes(plain_prior)),
+        "actions, Adam": lambda: few_codes(fast, space=DirectActions(horizon)),
+        "actions, Adam plain": lambda: few_codes(plain, space=DirectActions(horizon)),
+        "codes, CEM": lambda: few_cem(fast, space=codes(prior)),
+        "codes, CEM plain": lambda: few_cem(plain, space=codes(plain_prior)),
+        "simulate": lambda: simulate(start, torques, simulated),
+    }
+    words = ("codes, Adam", "actions, Adam", "codes, CEM")
+    products = {f"{word} sgemm": Products.of(ways[word]).alone() for word in words}
+    peaks = {way: peak_bytes(call) for way, call in ways.items()}
+    taken = interleaved(ways | products, arguments.rounds, warm=False)
+    in_parts()
+
+    common = dict(env=ENV, sim="mujoco", task="push", model="tsm", horizon=horizon)
+    rows, threads = [], min(os.cpu_count() or 1, 8)  # as the environment takes them
+    for word in words:
+        prior_word, planner = word.lower().split(", ")
+        done = few if planner == "adam" else 1
+        rows.append(
+            Row.of(
+                f"plan over {word}, {n_targets} targets: iterations", done / taken[word], "plain eager float32",
+                done / taken[f"{word} plain"], limit=SGEMM, bound=done / taken[f"{word} sgemm"], peak=peaks[word],
+                planner=planner, prior=prior_word, condition="plain", metric="iterations_per_second", **common,
+            )
+        )  # fmt: skip
+        if planner == "cem":
+            continue
+        scale, n_rollouts = (arguments.iterations + 2) / (few + 2), (few + 2) * samples * n_targets
+        rows.append(
+            Row.of(
+                f"plan over {word}, {n_targets} targets, {arguments.iterations} iterations: seconds",
+                scale * taken[word], f"executing its steps in MuJoCo, {threads} threads",
+                scale * taken["simulate"] * n_rollouts / simulated, unit="s", peak=peaks[word], planner=planner,
+                prior=prior_word, condition="simulate", metric="plan_seconds", **common,
+            )
+        )  # fmt: skip
+    if arguments.whole:
+        whole = partial(adam, fast, task.reward, codes(prior), n_targets, iterations=arguments.iterations)
+        began = time.perf_counter()
+        peak = peak_bytes(whole)
+        extrapolated = np.median(taken["codes, Adam"]) * (arguments.iterations + 2) / (few + 2)
+        rows.append(
+            Row.of(
+                "plan over codes, Adam, all of it once: seconds", np.array([time.perf_counter() - began]),
+                "its extrapolation from the rounds", extrapolated, unit="s", peak=peak, planner="adam", prior="codes",
+                condition="whole", metric="plan_seconds", **common,
+            )
+        )  # fmt: skip
+    seconds["gradients and the rest"] = 2 * seconds["plan"] - sum(seconds.values())
+    for part in ("codes to torques", "torques to states", "gradients and the rest"):
+        print(f"{part:24} {seconds[part] / seconds['plan']:5.0%} of the plan over codes")
     print(
-        f"{ENV}, {len(task)} targets, {task.horizon} steps, {arguments.iterations} iterations, {arguments.samples} "
-        f"samples, {origin} models, {torch.get_num_threads()} threads, {arguments.rounds} rounds: median (lowest to "
-        "highest)"
+        f"{ENV}, {n_targets} targets, {horizon} steps, {few} iterations, {samples} samples, {origin} models, "
+        f"{arguments.threads} threads, {arguments.rounds} rounds"
     )
-    common = dict(env=ENV, sim="mujoco", task="push", model="tsm", planner="adam", prior="codes")
-    for name, values in totals.items():
-        share = f"{np.median(np.array(values) / totals['plan']):5.0%} of the plan" if name != "simulate" else ""
-        print(f"{name:24} {np.median(values):7.2f} s ({min(values):.2f} to {max(values):.2f})  {share}")
-        metric = "plan_seconds" if name == "plan" else "seconds"
-        rows.append(dict(common, condition=name, metric=metric, value=np.median(values), unit="s"))
-    ratio = np.array(totals["plan"]) / np.array(totals["simulate"])
-    spread = f"({ratio.min():.2f} to {ratio.max():.2f})"
-    print(f"a plan takes {np.median(ratio):.2f}x {spread} as long as simulating its steps")
-    for word, of in (("median", np.median), ("lowest", np.min), ("highest", np.max)):
-        rows.append(dict(common, condition="plan", metric=f"ratio_{word}", value=of(ratio)))
-    path = runs.resolve("bench").dir.parents[1] / "bench" / "plan.csv"
-    store.save_table(path, [dict(row, horizon=task.horizon, n=arguments.rounds) for row in rows])
-    print(path)
+    save("plan", rows)
 
 
 def simulate(start: np.ndarray, actions: Tensor, n_rollouts: int) -> None:

@@ -14,6 +14,7 @@ import contextlib
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from unittest import mock
 import numpy as np
 import safetensors.torch
 import torch
+from _rounds import Row, parsed, parser, peak_bytes, save
 from tqdm.auto import tqdm
 
 from tsmlib import runs, store, study
@@ -32,15 +34,13 @@ from tsmlib.tsm import TSM
 
 ENV = "tsm/ReacherPush-v0"
 EVERY = 250  # updates to a checkpoint, at scales laptop and paper
-SPREAD = {"median": np.median, "lowest": np.min, "highest": np.max}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=20, help="of a training (default 20, with two checkpoints)")
-    parser.add_argument("--loads", type=int, default=20)
-    parser.add_argument("--rounds", type=int, default=5)
-    arguments = parser.parse_args()
+    options = parser(__doc__, rounds=5)
+    options.add_argument("--steps", type=int, default=20, help="of a training (default 20, with two checkpoints)")
+    options.add_argument("--loads", type=int, default=20)
+    arguments = parsed(options)
 
     data, held_out = (study.random_data(ENV, n, seed=seed) for n, seed in ((200, 0), (2, 1)))
     run = runs.resolve("bench", scale="laptop")
@@ -49,25 +49,31 @@ def main() -> None:
     existing = store.load_model(shipped, TSM, expect=expect)
     seconds: dict[str, list[float]] = {"update": [], "save": [], "load": [], "read": []}
     ratio = np.array([round_of(arguments, run, data, held_out, seconds) for _ in tqdm(range(arguments.rounds))])
+    load_checked = partial(store.load_model, shipped, TSM, expect=expect)
+    peak = peak_bytes(load_checked)
     for _ in range(arguments.loads):
         with timed(seconds["load"]):
-            store.load_model(shipped, TSM, expect=expect)
+            load_checked()
         with timed(seconds["read"]):
             existing.load_state_dict(safetensors.torch.load(shipped.read_bytes()))
-    update, save, load, read = (1000 * np.median(seconds[what]) for what in seconds)
+    update, save_ms, load, read = (1000 * np.median(seconds[what]) for what in seconds)
     print(f"{ENV}, {arguments.steps} steps, {arguments.rounds} rounds, {torch.get_num_threads()} threads")
-    print(f"an update takes {update:.1f} ms, a checkpoint {save:.1f} ms; with one every {EVERY} updates training takes")
-    print(f"{np.median(ratio):.4f} times as long ({ratio.min():.4f} to {ratio.max():.4f}); at most 1.05")
+    print(f"an update takes {update:.1f} ms, a checkpoint {save_ms:.1f} ms; with one every {EVERY} updates training")
+    print(f"takes {np.median(ratio):.4f} times as long ({ratio.min():.4f} to {ratio.max():.4f}); at most 1.05")
     print(f"loading a shipped model takes {load:.1f} ms, {load - read:.1f} ms more than its bytes; at most 50 ms more")
-    common = dict(env=ENV, sim="mujoco", model="tsm", n=arguments.rounds)
+    common: dict[str, Any] = dict(env=ENV, sim="mujoco", model="tsm", metric="seconds", unit="s")
+    between = EVERY * update / 1000
     rows = [
-        dict(common, condition="checkpoints", metric=f"ratio_{word}", value=of(ratio)) for word, of in SPREAD.items()
-    ]
-    rows.append(dict(common, condition="load", metric="seconds", value=load / 1000, unit="s"))
-    rows.append(dict(common, condition="checks", metric="seconds", value=(load - read) / 1000, unit="s"))
-    path = run.dir.parents[1] / "bench" / "trust.csv"
-    store.save_table(path, rows)
-    print(path)
+        Row.of(
+            f"{EVERY} updates and a checkpoint: processor seconds", between * ratio, "the updates alone", between,
+            condition="checkpoints", **common,
+        ),
+        Row.of(
+            "load a shipped model, checked: processor seconds", np.array(seconds["load"]), "reading its bytes",
+            np.maximum(seconds["read"], 1e-6), peak=peak, condition="load", **common,
+        ),
+    ]  # fmt: skip
+    save("trust", rows)
 
 
 def round_of(

@@ -1,0 +1,117 @@
+"""Training each model as the study trains it, against the same updates written plainly, and against sgemm.
+
+Every call is ``tsmlib.train.fit`` for a few updates, with the loss, the batch and the future of a stage of
+``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on a few windows. The reference is
+the same stage in float32 through ``_plain.PlainTSM``; for models that have no plain form, themselves in float32. The
+limit is the time that the matrix products of the very same call take alone, in float32: the share says how many of the
+processor's float32 operations per second training gets.
+
+    python benchmarks/train.py        or        python -m tsmlib bench train
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from _plain import PlainTSM
+from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
+
+from tsmlib import runs, study
+from tsmlib.study import Stage
+from tsmlib.train import fit
+from tsmlib.trajectory import Trajectories
+from tsmlib.tsm import TSM
+
+ENV = "tsm/ReacherPush-v0"
+WORDS = {"teacher_forced_loss": "teacher-forced", "loss": "free-running", "energy_loss": "energy score"}
+ONE_STEP = {"onestep", "ensemble", "ensemble+mse"}
+Data = tuple[Trajectories, Trajectories]
+
+
+def main() -> None:
+    options = parser(__doc__, rounds=3)
+    options.add_argument("--models", default=",".join([*study.DYNAMICS, "prior"]))
+    options.add_argument("--updates", type=int, default=2, help="in every call (default 2)")
+    options.add_argument("--batches", default="128,256,512,1024", help="windows per update, tsm free-running")
+    options.add_argument("--episodes", type=int, default=200, help="to draw windows from (default 200)")
+    arguments = parsed(options)
+    run = runs.resolve("bench", scale="laptop")
+    data = study.random_data(ENV, arguments.episodes, seed=0), study.random_data(ENV, 1, seed=1)
+    rows, seen = [], set()
+    for model in arguments.models.split(","):
+        for stage in study.schedule(run, ENV, model):
+            net = study.fresh(run, model, data[0])
+            kind = (type(net), str(net.config()), stage.loss, stage.batch, stage.future_len)
+            if kind not in seen:  # tsm and tsm+energy begin alike
+                rows.append(stage_row(net, model, stage, data, arguments))
+            seen.add(kind)
+    if arguments.batches:
+        sizes = [int(word) for word in arguments.batches.split(",")]
+        rows += batch_rows(study.fresh(run, "tsm", data[0]), sizes, data, 2)
+    print(f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads")
+    save("train", rows)
+
+
+def training(net: Any, stage: Stage, data: Data, *, updates: int, bf16: bool) -> Callable[[], object]:
+    """``updates`` updates of a stage, as the study has them."""
+
+    def call() -> None:
+        fit(net, getattr(net, stage.loss), *data, past_len=net.past_len, future_len=stage.future_len, steps=updates,
+            batch_size=stage.batch, validate_every=updates, lr=1e-5, bf16=bf16)  # fmt: skip
+
+    return call
+
+
+def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) -> Row:
+    """Supervised targets per second of one stage."""
+    plain = PlainTSM(net) if isinstance(net, TSM) else net
+    fast = training(net, stage, data, updates=arguments.updates, bf16=True)
+    products = Products.of(fast)
+    ways = {
+        "fast": fast,
+        "plain": training(plain, stage, data, updates=arguments.updates, bf16=False),
+        "sgemm": products.alone(),
+    }
+    ways["plain"]()
+    peak = peak_bytes(fast)
+    seconds = interleaved(ways, arguments.rounds, warm=False, progress=f"{model}: {stage.loss}")
+    targets = arguments.updates * stage.batch * stage.future_len  # states, or torques, that a loss compares
+    windows = arguments.updates * stage.batch / seconds["fast"]
+    name = stage.loss if stage.loss not in WORDS or model in ONE_STEP else WORDS[stage.loss]
+    name = {"loss": "one step ahead", "multi_step_loss": "free-running"}.get(name, name)
+    print(f"{model}, {name}: {sorted(windows)[len(windows) // 2]:,.0f} windows a second")
+    return Row.of(
+        f"train {model}, {name}: targets", targets / seconds["fast"],
+        "plain eager float32" if plain is not net else "itself in float32", targets / seconds["plain"],
+        limit=SGEMM, bound=targets / seconds["sgemm"], peak=peak, env=ENV, sim="mujoco", model=model,
+        condition=stage.loss, metric="targets_per_second", horizon=stage.future_len,
+    )  # fmt: skip
+
+
+def batch_rows(net: Any, sizes: list[int], data: Data, rounds: int) -> list[Row]:
+    """tsm free-running: bfloat16 against float32, batch by batch, per window."""
+    ways, products = {}, {}
+    for batch in sizes:
+        stage = Stage("loss", 1, batch=batch)
+        for word, bf16 in (("bfloat16", True), ("float32", False)):
+            ways[f"{word} {batch}"] = training(net, stage, data, updates=1, bf16=bf16)
+        products[batch] = Products.of(ways[f"float32 {batch}"])
+        ways[f"sgemm {batch}"] = products[batch].alone()
+    peaks = {way: peak_bytes(call) for way, call in ways.items()}
+    seconds = interleaved(ways, rounds, warm=False, progress="batches")
+    return [
+        Row.of(
+            f"train tsm, free-running, {word}, batch {batch}: windows", batch / seconds[f"{word} {batch}"],
+            f"{'float32, the same batch' if word == 'bfloat16' else f'float32, batch {sizes[0]}'}",
+            batch / seconds[f"float32 {batch}"] if word == "bfloat16" else sizes[0] / seconds[f"float32 {sizes[0]}"],
+            limit=SGEMM, bound=batch / seconds[f"sgemm {batch}"], peak=peaks[f"{word} {batch}"], env=ENV,
+            sim="mujoco", model="tsm", condition="batch", metric="windows_per_second", horizon=20,
+        )
+        for batch in sizes
+        for word in ("bfloat16", "float32")
+    ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
