@@ -66,7 +66,7 @@ def training(net: Any, stage: Stage, data: Data, *, updates: int, bf16: bool) ->
 def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) -> Row:
     """Supervised targets per second of one stage."""
     plain = PlainTSM(net) if isinstance(net, TSM) else net
-    fast = training(net, stage, data, updates=arguments.updates, bf16=True)
+    fast = training(net, stage, data, updates=arguments.updates, bf16=study.bf16_pays(model, stage))
     products = Products.of(fast)
     ways = {
         "fast": fast,

@@ -338,6 +338,24 @@ def test_a_row_of_the_prior_does_not_depend_on_its_batch(prior: ActionPrior) -> 
         torch.testing.assert_close(prior.plan(past[i : i + 1], z[i : i + 1])[0], together[i], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_a_wide_batch_is_decoded_in_blocks_and_nothing_shows_it(
+    case: Case, prior: ActionPrior, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = case.model()
+    past, future = window(case, model.past_len, 23)
+    z = torch.randn(B, 2, 8, generator=generator()).double()
+
+    def everything() -> list[Tensor]:
+        actions = prior.plan(past.actions[:, :1].repeat(1, prior.past_len, 1), z)
+        return [rollout(model, past, future.actions, generator=generator()), actions]
+
+    at_once = everything()
+    monkeypatch.setattr("tsmlib.nets.BLOCK", size)
+    for blocks, whole in zip(everything(), at_once, strict=True):
+        torch.testing.assert_close(blocks, whole, rtol=1e-12, atol=1e-12)
+
+
 def test_candidates_with_shared_noise_meet_the_same_futures(case: Case) -> None:
     model, candidates = case.model(), 3
     past, future = window(case, model.past_len, 23)

@@ -11,9 +11,11 @@ import pytest
 from tsmlib import runs, store
 
 ARM = ["--env", "tsm/Reacher-v0"]
+TRIES = [("half the batch",), ("twice the batch, half the updates",)]
 TINY = {  # options, the columns that tell tries apart, and the tries
     "samples": ([*ARM, "--samples", "2", "4", "--episodes", "4"], ("samples",), [(2,), (4,)]),
     "learning_rates": ([*ARM, "--models", "onestep", "--share", "0.1"], ("rate",), [(2e-3,), (4e-3,), (8e-3,)]),
+    "budget": ([*ARM, "--stages", "1"], ("condition",), TRIES),
     "starts": (
         ["--targets", "2", "--iterations", "1", "--weights", "1"],
         ("prior", "start"),

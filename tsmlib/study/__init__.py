@@ -14,6 +14,7 @@ from tsmlib.study.models import (
     MODELS,
     OURS,
     Stage,
+    bf16_pays,
     fresh,
     load_or_train,
     schedule,
@@ -27,7 +28,7 @@ from tsmlib.study.tasks import FROZEN, TASK_SEED, draw_task, freeze_tasks, task
 
 __all__ = [
     "BUDGET", "CHOICES", "CLASSES", "DYNAMICS", "EPISODES", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS",
-    "SPLITS", "TASK_SEED", "Stage", "ahead", "along_the_way", "assess", "chosen", "dataset", "draw_task",
+    "SPLITS", "TASK_SEED", "Stage", "ahead", "along_the_way", "assess", "bf16_pays", "chosen", "dataset", "draw_task",
     "evidence", "fingerprint", "freeze_tasks", "fresh", "has_block", "kept_budget", "learn", "load_or_train",
     "plan", "random_data", "schedule", "scores", "short", "sizes", "table", "task", "train", "trial", "within_data",
 ]  # fmt: skip

@@ -125,7 +125,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
             net, getattr(net, stage.loss), data, held_out,
             past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr,
             batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
-            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=_bf16_pays(model, stage),
+            validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=bf16_pays(model, stage),
             checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
         )  # fmt: skip
         curves[stage.loss] = asdict(curve)
@@ -142,7 +142,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
     return net, store.read_header(path)
 
 
-def _bf16_pays(model: str, stage: Stage) -> bool:
+def bf16_pays(model: str, stage: Stage) -> bool:
     """Whether products in bfloat16 are faster: not where a gated stack is run step by step (benchmarks/train.py)."""
     return stage.loss == "teacher_forced_loss" or model.partition("+")[0] not in ("tsm", "prior")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -46,8 +47,12 @@ def _make(run: Run, make: Callable[..., Any], *arguments: Any) -> None:
 
 
 def _begin() -> None:
-    """One thread for each worker, which ends when the process that started it does."""
+    """One thread for each worker, which ends when the process that started it does.
+
+    Its progress bars would overwrite those of the others; the notebook's says how many calls are done.
+    """
     torch.set_num_threads(1)
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - as long as the process lives
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -1,0 +1,163 @@
+"""What one seed of the whole study costs at scale paper: the sum of its parts, in processor time.
+
+A seed trains every model of the three MuJoCo arms and of two imperfect ones, scores them, plans with them on 100
+targets of two tasks, and learns policies in them (notebooks 02, 03, 05 and 06 of a seed other than 0, without the
+ablations and the extra planners of seed 0). Of every part a little is done in each round, with one thread, and
+multiplied by how often the seed does it: updates of each stage of each training, episodes of each score, iterations of
+each plan, updates of each policy. Every update does the same work, and so on. The reference is the budget of two hours
+on two cores, so this row, unlike all others, depends on the machine and on what else it does.
+
+    python benchmarks/seed.py        or        python -m tsmlib bench seed
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from _rounds import Row, parsed, parser, peak_bytes, save
+from torch import Tensor
+from tqdm.auto import tqdm
+from train import training
+
+from tsmlib import evaluate, rewards, runs, scoreboard, study
+from tsmlib.control import Task
+from tsmlib.envs import DELAY, MUJOCO_IDS, NOISE, imperfect
+from tsmlib.policy import OneStepPolicy, SegmentPolicy, episodes_from, improve
+from tsmlib.trajectory import Trajectories
+from tsmlib.trajopt import DirectActions, LatentActions, cem, reassess, through_model
+
+BUDGET = 2 * 2 * 3600.0  # seconds of two cores in two hours
+REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+BEST = "tsm+energy+direct"
+IMPERFECT = (imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY))
+LITTLE = {"updates": 3, "episodes": 10, "targets": 10}
+WORDS = {
+    "train": "all trainings of a seed: processor seconds", "score": "all scores of a seed: processor seconds",
+    "plan": "all plans of a seed: processor seconds", "policy": "all policies of a seed: processor seconds",
+    "a whole seed": "a whole seed, the sum: processor seconds",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Part:
+    """Something that a seed does ``times`` times what ``call`` does."""
+
+    kind: str
+    call: Callable[[], object]
+    times: float
+
+
+def main() -> None:
+    options = parser(__doc__, rounds=2)
+    options.add_argument("--models", default=",".join(study.DYNAMICS))
+    options.add_argument("--envs", default=",".join(MUJOCO_IDS))
+    arguments = parsed(options)
+    parts = list(everything(arguments))
+    peaks: dict[str, int] = defaultdict(int)
+    for part in parts:
+        peaks[part.kind] = max(peaks[part.kind], peak_bytes(part.call))
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for _ in tqdm(range(arguments.rounds), desc="rounds"):
+        spent: dict[str, float] = defaultdict(float)
+        for part in tqdm(parts, desc="parts", leave=False):
+            spent[part.kind] += part.times * processor_seconds(part.call)
+        for name, value in spent.items():
+            seconds[name].append(value)
+    kinds = list(dict.fromkeys(part.kind for part in parts))
+    seconds["a whole seed"] = np.sum([seconds[kind] for kind in kinds], 0).tolist()
+    peaks["a whole seed"] = max(peaks.values())
+    rows = [
+        Row.of(
+            WORDS[kind], np.array(seconds[kind]), "two hours of two cores", BUDGET, unit="s", peak=peaks[kind],
+            condition=kind, metric="seconds", sim="mujoco",
+        )
+        for kind in (*kinds, "a whole seed")
+    ]  # fmt: skip
+    count = {kind: sum(part.kind == kind for part in parts) for kind in kinds}
+    print(", ".join(f"{kind}: {n} parts" for kind, n in count.items()) + f"; {arguments.rounds} rounds, one thread")
+    save("seed", rows)
+
+
+def processor_seconds(call: Callable[[], object]) -> float:
+    began = time.process_time()
+    call()
+    return time.process_time() - began
+
+
+def everything(arguments: argparse.Namespace) -> Iterator[Part]:
+    """The parts of a seed."""
+    run, models = runs.resolve("bench", scale="paper"), arguments.models.split(",")
+    envs = arguments.envs.split(",")
+    data = {env: study.random_data(env, 200, seed=0) for env in (*envs, *(IMPERFECT if REACH in envs else ()))}
+    few = {env: study.random_data(env, LITTLE["episodes"], seed=1) for env in data}
+    robust = [word for word in models if word in ("tsm", BEST, "onestep", "multistep", "lstm")]
+    nets = {(env, word): study.fresh(run, word, data[env]) for env in data for word in (*models, "prior")}
+    for env in data:
+        own = robust if env in IMPERFECT else [*models, *(["tsm+teacher"] if env == PUSH else [])]
+        for word in own:
+            yield from trainings(run, env, word, data[env], few[env])
+            if word in models:
+                yield from scores(nets[env, word], few[env])
+    for env in (env for env in (REACH, PUSH) if env in envs):
+        yield from trainings(run, env, "prior", data[env], few[env])
+        task = study.task(env, "validation")
+        for word in models:
+            if word != "tsm+energy":
+                yield from plans(nets[env, word], nets[env, "prior"], task)
+        for word in (word for word in models if word in (BEST, "onestep", "multistep", "lstm", "ensemble+mse")):
+            yield from policies(nets[env, word], nets[env, "prior"] if word == BEST else None, task)
+
+
+def trainings(run: runs.Run, env: str, word: str, data: Trajectories, held_out: Trajectories) -> Iterator[Part]:
+    """The stages of one model; an update costs the same at any time."""
+    n, net = LITTLE["updates"], study.fresh(run, word, data)
+    for stage in study.schedule(run, env, word):
+        bf16 = study.bf16_pays(word, stage)
+        few = training(net, stage, (data, held_out.take(slice(1))), updates=n, bf16=bf16)
+        yield Part("train", few, stage.steps / n)
+
+
+def scores(net: Any, few: Trajectories) -> Iterator[Part]:
+    """Open loop and by segments, 1,000 test and 200 validation episodes."""
+    for options in ({"horizon": 90}, {"horizon": 10, "starts": list(scoreboard.SEGMENTS)}):
+        yield Part("score", partial(evaluate.score, net, net.features, few, few, samples=32, **options),
+                   1200 / (2 * len(few)))  # fmt: skip
+
+
+def plans(net: Any, prior: Any, task: Task) -> Iterator[Part]:
+    """CEM of 96 candidates and 10 iterations over codes and over torques, and its promise from 32 samples."""
+    few, horizon = task.take(LITTLE["targets"]), task.horizon
+    past, samples = few.past(net.past_len), 2 if getattr(net, "stochastic", True) else 1
+    for space in (LatentActions(prior, horizon), DirectActions(horizon)):
+        predict = through_model(net, past, samples=samples)
+        judge = through_model(net, past, samples=16 * samples, seed=1)
+
+        def call(space: Any = space, predict: Any = predict) -> None:
+            cem(predict, few.reward, space, len(few), candidates=96, elites=9, iterations=2)
+
+        found = cem(predict, few.reward, space, len(few), candidates=2, elites=2, iterations=1)
+        yield Part("plan", call, 10 / 2 * len(task) / len(few))
+        yield Part("plan", partial(reassess, found, judge, few.reward), len(task) / len(few))
+
+
+def policies(net: Any, prior: Any, task: Task) -> Iterator[Part]:
+    """Three copies, 2,200 updates, acting by torques, and by codes where there is a prior."""
+    draw, n = episodes_from(torch.from_numpy(task.start)), LITTLE["updates"]
+    reward: Callable[[Tensor], Any] = rewards.reach if task.name == "reach" else rewards.push
+    learners: list[Any] = [OneStepPolicy(task.start.shape[1], 2, copies=3)]
+    learners += [SegmentPolicy(task.start.shape[1], prior, copies=3)] if prior is not None else []
+    for learner in learners:
+        learner.features.load_state_dict(net.features.state_dict())
+        yield Part("policy", partial(improve, learner, net, reward, draw, iterations=n, record_every=n), 2200 / n)
+
+
+if __name__ == "__main__":
+    main()
