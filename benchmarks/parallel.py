@@ -1,0 +1,61 @@
+"""Trainings side by side, in processes of one thread each, against one after another with as many threads.
+
+The same few updates of the paper's model on pushing, once for each of ``--trainings``: by ``study.ahead``, starting its
+processes included, and in this process with as many threads as the other way has processes.
+
+    python benchmarks/parallel.py        or        python -m tsmlib bench parallel
+"""
+
+from __future__ import annotations
+
+import os
+
+import torch
+from _rounds import Row, interleaved, parsed, parser, peak_bytes, save
+from train import training
+
+from tsmlib import runs, study
+from tsmlib.runs import Run
+
+ENV = "tsm/ReacherPush-v0"
+
+
+def little(run: Run, seed: int, updates: int) -> None:
+    """``updates`` of the free-running stage."""
+    data, held_out = (study.random_data(ENV, n, seed=seed) for n in (100, 1))
+    stage = study.schedule(run, ENV, "tsm")[-1]
+    net = study.fresh(run, "tsm", data)
+    training(net, stage, (data, held_out), updates=updates, bf16=study.bf16_pays("tsm", stage))()
+
+
+def main() -> None:
+    options = parser(__doc__, rounds=2)
+    options.add_argument("--trainings", type=int, default=4)
+    options.add_argument("--updates", type=int, default=40, help="of each (default 40)")
+    arguments = parsed(options)
+    run, cores = runs.resolve("bench", scale="paper"), os.cpu_count() or 1
+    calls = [(little, seed, arguments.updates) for seed in range(arguments.trainings)]
+
+    def in_turn() -> None:
+        torch.set_num_threads(cores)
+        for make, *given in calls:
+            make(run, *given)
+        torch.set_num_threads(arguments.threads)
+
+    def side_by_side() -> None:
+        study.ahead(run, calls)
+
+    peak = peak_bytes(in_turn)
+    seconds = interleaved({"ahead": side_by_side, "in turn": in_turn}, arguments.rounds, warm=False)
+    n = arguments.trainings
+    row = Row.of(
+        f"{n} trainings side by side on {cores} cores: trainings", n / seconds["ahead"],
+        f"in turn, {cores} threads", n / seconds["in turn"], peak=peak, threads=1, env=ENV, sim="mujoco", model="tsm",
+        condition="processes", metric="trainings_per_second",
+    )  # fmt: skip
+    print(f"{ENV}, {arguments.updates} updates each, {arguments.rounds} rounds, {cores} cores")
+    save("parallel", [row])
+
+
+if __name__ == "__main__":
+    main()
