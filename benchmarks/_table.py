@@ -50,7 +50,7 @@ TARGETS = (
     Target("the same free-running", "train", starts("train tsm, free-running: targets"), "ratio", True, 1.4),
     Target("share of the processor's float32 matrix products in training TSM, both stages", "train",
            starts("train tsm, teacher-forced: targets", "train tsm, free-running: targets"), "share", True, 0.55),
-    Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, the best of all batches and types", "rollout",
+    Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, best of all batches", "rollout",
            starts("imagine with tsm, "), "ratio", True, 5, best=True),
     Target("100 latent plans, T = 50, 100 iterations, over plain eager", "plan",
            lambda row, r: r["condition"] == "plain" and r["planner"] == "adam" and r["prior"] == "codes",
