@@ -5,7 +5,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
-.PHONY: help collect train predict latent control robustness action_prior claims test torture lint clean
+.PHONY: help collect train predict latent control robustness action_prior claims test torture bench lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
@@ -18,6 +18,7 @@ help:
 	@echo "make claims    what the paper claims, judged from the rows that ship (notebooks/08_claims.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
 	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (an hour of one processor)"
+	@echo "make bench     speed of everything against references, and docs/speed.md (about a quarter of an hour)"
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
@@ -30,6 +31,10 @@ test: $(READY)
 
 torture: $(READY)
 	$(PY) tests/torture $(PARTS)
+
+bench: $(READY)
+	$(PY) -m tsmlib bench
+	$(PY) -m tsmlib bench table
 
 lint: $(READY)
 	$(PY) -m ruff check .

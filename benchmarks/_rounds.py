@@ -242,18 +242,15 @@ def save(name: str, rows: Sequence[Row]) -> None:
 
 def load(path: Path) -> list[tuple[Row, dict[str, Any]]]:
     """The rows of one benchmark, each with the fields that it stands in."""
-    return [
-        (
-            Row(
-                r["what"], r["reference"], r["value"], r["unit"],
-                (r["ratio_lowest"], r["ratio_median"], r["ratio_highest"]), r["n"], r["limit"],
-                None if r["share"] == "" else r["share"], None if r["peak_bytes"] == "" else r["peak_bytes"],
-                r["threads"],
-            ),
-            r,
+    found = []
+    for r in store.load_table(path):
+        share, peak = (None if r[name] == "" else r[name] for name in ("share", "peak_bytes"))
+        ratio = (r["ratio_lowest"], r["ratio_median"], r["ratio_highest"])
+        row = Row(
+            r["what"], r["reference"], r["value"], r["unit"], ratio, r["n"], r["limit"], share, peak, r["threads"]
         )
-        for r in store.load_table(path)
-    ]  # fmt: skip
+        found.append((row, r))
+    return found
 
 
 def text(rows: Sequence[Row]) -> str:

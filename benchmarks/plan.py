@@ -59,6 +59,7 @@ def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--targets", type=int, default=100)
     options.add_argument("--iterations", type=int, default=100, help="of the whole plan (default 100, as in the paper)")
+    options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
     options.add_argument("--few", type=int, default=2, help="iterations in a round (default 2)")
     options.add_argument("--candidates", type=int, default=8, help="of the cross-entropy method (default 8)")
     options.add_argument("--samples", type=int, default=2, help="model samples per target (default 2, as scale laptop)")
@@ -67,7 +68,7 @@ def main() -> None:
     few, samples = arguments.few, arguments.samples
     run = runs.resolve("bench", scale="laptop")
     task = study.task(ENV).take(arguments.targets)
-    n_targets, horizon = len(task), task.horizon
+    n_targets, horizon = len(task), arguments.horizon
     model, prior, origin = models(run, ENV)
     plain_prior: Any = PlainPrior(prior)
     seconds: dict[str, float] = defaultdict(float)

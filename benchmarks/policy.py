@@ -29,16 +29,17 @@ EPISODES = 20  # of each update and copy, ``improve``'s default
 def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--env", default="tsm/Reacher-v0")
+    options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
     options.add_argument("--copies", type=int, default=10)
     options.add_argument("--iterations", type=int, default=3, help="updates per round (default 3)")
     arguments = parsed(options)
-    n, copies = arguments.iterations, arguments.copies
+    n, copies, horizon = arguments.iterations, arguments.copies, arguments.horizon
     model, prior, origin = models(runs.resolve("bench", scale="laptop"), arguments.env)
     task = study.task(arguments.env, "validation")
     draw, reward = episodes_from(torch.from_numpy(task.start)), getattr(rewards, task.name)
     state_dim = task.start.shape[1]
     starts = torch.from_numpy(task.start[:EPISODES])
-    torques = 0.1 * torch.randn(len(starts), task.horizon, 2, generator=torch.Generator().manual_seed(0))
+    torques = 0.1 * torch.randn(len(starts), horizon, 2, generator=torch.Generator().manual_seed(0))
 
     def learn(kind: str, copies: int) -> None:
         learner: Any = (
@@ -47,7 +48,7 @@ def main() -> None:
             else OneStepPolicy(state_dim, 2, copies=copies)
         )
         learner.features.load_state_dict(model.features.state_dict())
-        improve(learner, model, reward, draw, iterations=n, record_every=n)
+        improve(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon)
 
     @torch.no_grad()
     def imagine() -> None:
@@ -62,11 +63,11 @@ def main() -> None:
     seconds = interleaved(ways | products, arguments.rounds, warm=False)
 
     print(
-        f"{arguments.env}, {origin} models, {task.horizon} steps, {EPISODES} episodes and {arguments.threads} threads, "
+        f"{arguments.env}, {origin} models, {horizon} steps, {EPISODES} episodes and {arguments.threads} threads, "
         f"{n} updates in each of {arguments.rounds} rounds"
     )
     rows = []
-    common = dict(env=arguments.env, sim="mujoco", task=task.name, model="tsm", planner="policy", horizon=task.horizon)
+    common = dict(env=arguments.env, sim="mujoco", task=task.name, model="tsm", planner="policy", horizon=horizon)
     for kind in ("codes", "actions"):
         one, many = (f"{kind} {m}" for m in (1, copies))
         whole = SCHEDULE * np.median(seconds[one]) / n

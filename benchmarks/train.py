@@ -12,6 +12,7 @@ processor's float32 operations per second training gets.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from _plain import PlainTSM
@@ -34,6 +35,7 @@ def main() -> None:
     options.add_argument("--models", default=",".join([*study.DYNAMICS, "prior"]))
     options.add_argument("--updates", type=int, default=2, help="in every call (default 2)")
     options.add_argument("--batches", default="128,256,512,1024", help="windows per update, tsm free-running")
+    options.add_argument("--batch", type=int, default=0, help="windows per update; 0: as in the schedule (default)")
     options.add_argument("--episodes", type=int, default=200, help="to draw windows from (default 200)")
     arguments = parsed(options)
     run = runs.resolve("bench", scale="laptop")
@@ -41,6 +43,7 @@ def main() -> None:
     rows, seen = [], set()
     for model in arguments.models.split(","):
         for stage in study.schedule(run, ENV, model):
+            stage = replace(stage, batch=arguments.batch or stage.batch)
             net = study.fresh(run, model, data[0])
             kind = (type(net), str(net.config()), stage.loss, stage.batch, stage.future_len)
             if kind not in seen:  # tsm and tsm+energy begin alike

@@ -4,55 +4,169 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from tsmlib import runs, store
-from tsmlib.__main__ import main
+from tsmlib.__main__ import _benchmarks, main
+from tsmlib.nets import CausalDecoder, Encoder
+
+sys.path.insert(0, str(runs.ROOT / "benchmarks"))
+
+import _rounds
+import _table
 
 TINY = {
-    "collect": ["--episodes", "6", "--loop-episodes", "2", "--rounds", "2"],
-    "plan": ["--targets", "2", "--iterations", "1", "--samples", "1", "--rounds", "2"],
-    "trust": ["--steps", "4", "--loads", "1", "--rounds", "2"],
-    "policy": ["--copies", "2", "--iterations", "1", "--rounds", "2"],
+    "collect": ["--episodes", "6", "--loop-episodes", "2"],
+    "train": ["--models", "tsm,onestep", "--updates", "1", "--batch", "4", "--batches", "4", "--episodes", "3"],
+    "rollout": ["--models", "tsm,onestep", "--rows", "2,4", "--horizon", "3", "--episodes", "2"],
+    "plan": [
+        "--targets",
+        "2",
+        "--iterations",
+        "1",
+        "--few",
+        "1",
+        "--samples",
+        "1",
+        "--candidates",
+        "2",
+        "--horizon",
+        "10",
+    ],
+    "policy": ["--copies", "2", "--iterations", "1", "--horizon", "10"],
+    "score": ["--models", "tsm,onestep", "--episodes", "2", "--samples", "4", "--many", "5", "--horizon", "3"],
+    "growth": ["--only", "channels", "--largest", "32"],
+    "trust": ["--steps", "2", "--loads", "2"],
 }
-
-RATIOS = {"ratio_lowest", "ratio_median", "ratio_highest"}
-SPEEDS = {"steps_per_second", "steps_per_core_second", *RATIOS}
+SPEEDS, SECONDS = {"steps_per_second"}, {"seconds"}
 ROWS = {  # condition -> metrics
-    "collect": {"bulk": SPEEDS, "env.step": SPEEDS, "mj_step": SPEEDS, "": {"peak_bytes"}},
-    "trust": {"checkpoints": RATIOS, "load": {"seconds"}, "checks": {"seconds"}},
-    "plan": {
-        "plan": {"plan_seconds", *RATIOS},
-        **{
-            part: {"seconds"}
-            for part in ("simulate", "codes to torques", "torques to states", "gradients and the rest")
-        },
+    "collect": {"env.step": {"steps_per_second", "steps_per_core_second"}, "mj_step": SPEEDS},
+    "train": {
+        "teacher_forced_loss": {"targets_per_second"}, "loss": {"targets_per_second"}, "batch": {"windows_per_second"},
     },
-    "policy": {"extrapolated": {"seconds"}, "copies": {"peak_bytes", *RATIOS}},
-}
+    "rollout": {"float32": SPEEDS, "bfloat16": SPEEDS},
+    "plan": {"plain": {"iterations_per_second"}, "simulate": {"plan_seconds"}},
+    "policy": {"one": SECONDS, "copies": SECONDS},
+    "score": {"4 samples": SECONDS, "5 samples": SECONDS},
+    "growth": {"channels": {"exponent"}},
+    "trust": {"checkpoints": SECONDS, "load": SECONDS},
+}  # fmt: skip
+LIMITED = {"collect", "train", "rollout", "plan", "policy", "score"}
+
+
+def run(name: str, *options: str) -> str:
+    script = runs.ROOT / "benchmarks" / f"{name}.py"
+    return subprocess.run([sys.executable, script, *options], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_a_benchmark_states_ratios_with_their_spread(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    script = runs.ROOT / "benchmarks" / f"{name}.py"
+def test_a_benchmark_states_ratios_with_their_spread(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(place))
     # collect ends with an error where two ways reach states that differ in any bit
-    printed = subprocess.run([sys.executable, script, *TINY[name]], capture_output=True, text=True, check=True).stdout
-    assert "2 rounds" in printed
-    values: dict[str, dict[str, float]] = defaultdict(dict)
-    for row in store.load_table(tmp_path / "bench" / f"{name}.csv"):
-        values[row["condition"]][row["metric"]] = row["value"]
-    assert {condition: set(metrics) for condition, metrics in values.items()} == ROWS[name]
-    for metrics in values.values():
-        if set(metrics) >= RATIOS:
-            assert metrics["ratio_lowest"] <= metrics["ratio_median"] <= metrics["ratio_highest"]
+    assert "2 rounds" in run(name, *TINY[name], "--rounds", "2")
+    values: dict[str, set[str]] = {}
+    rows = _rounds.load(place / "bench" / f"{name}.csv")
+    for row, columns in rows:
+        values.setdefault(columns["condition"], set()).add(columns["metric"])
+        assert row.ratio == tuple(sorted(row.ratio)), row.what
+        assert row.n == 2
+        assert row.peak_bytes is None or row.peak_bytes > 2**26
+        assert columns["processor"]
+        assert "/" not in columns["processor"]
+    assert values == ROWS[name]
+    assert any(row.share is not None and row.limit for row, _ in rows) == (name in LIMITED)
+    assert len({row.what + row.reference for row, _ in rows}) == len(rows)
+
+
+def test_the_table_is_written_from_what_was_measured(
+    place: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(place))
+    if len(found := _table.measured()) < len(TINY):
+        pytest.skip("needs the tables of the tests above")
+    page, picture = tmp_path / "speed.md", tmp_path / "growth"
+    page.write_bytes(_table.DOCS.read_bytes())
+    monkeypatch.setattr(_table, "DOCS", page)
+    monkeypatch.setattr(_table, "PICTURE", picture)
+    monkeypatch.setattr(runs, "ROOT", tmp_path)
+    _table.publish(found)
+    text = page.read_text()
+    assert all(row.what in text for rows in found.values() for row, _ in rows)
+    assert all(target.says in text for target in _table.TARGETS)
+    asked = text.partition("| bench |")[0]
+    assert asked.count("not measured") == 1, "a target names rows that there are not; growth has few sizes here"
+    assert picture.with_suffix(".png").exists()
+    _table.publish(found)
+    assert page.read_text() == text
+
+
+def test_of_several_rows_the_worst_is_held_against_a_target() -> None:
+    def row(ratio: float) -> _rounds.Row:
+        return _rounds.Row("ten", "one", 1.0, "s", (ratio, ratio, ratio), 1)
+
+    found = {"policy": [(row(ratio), {"condition": "copies"}) for ratio in (2.0, 3.0)]}
+    (line,) = (line for line in _table.targets(found) if line[0].startswith("ten policies"))
+    assert line[2].startswith("3 ")
+    assert line[3] == "**not reached**"
+
+
+def test_ways_run_in_turn_after_one_call_that_does_not_count() -> None:
+    called: list[str] = []
+    seconds = _rounds.interleaved({"a": lambda: called.append("a"), "b": lambda: called.append("b")}, 3)
+    assert called == ["a", "b"] * 4
+    assert {way: taken.shape for way, taken in seconds.items()} == {"a": (3,), "b": (3,)}
+
+
+def test_a_ratio_of_speeds_and_a_share_say_how_much_was_reached() -> None:
+    row = _rounds.Row.of("w", np.array([2.0, 4.0]), "r", np.array([1.0, 1.0]), limit="l", bound=np.array([4.0, 8.0]))
+    assert row.ratio == (2.0, 3.0, 4.0)
+    assert row.share == 0.5
+    slow = _rounds.Row.of("w", np.array([2.0]), "r", np.array([1.0]), "s", limit="l", bound=np.array([0.5]))
+    assert slow.share == 0.25
+
+
+def test_the_peak_is_that_of_the_call() -> None:
+    little = _rounds.peak_bytes(lambda: None)
+    much = _rounds.peak_bytes(lambda: torch.ones(2**26))
+    assert much > little + 2**27
+
+
+def test_products_are_those_that_torch_counts() -> None:
+    decoder, encoder = CausalDecoder(8, 6, 4, channels=16), Encoder(6, 10, 4)
+
+    def call() -> None:
+        value = decoder(torch.randn(5, 12, 8), torch.randn(5, 4)).sum() + encoder(torch.randn(5, 10, 6))[0].sum()
+        value.backward()
+
+    counter = FlopCounterMode(display=False)
+    with counter:
+        call()
+    products = _rounds.Products.of(call)
+    assert products.flops == pytest.approx(counter.get_total_flops(), rel=1e-6)
+    products.alone()()
+
+
+def test_every_benchmark_has_a_test_and_a_place_in_the_table() -> None:
+    assert set(_benchmarks()) - {"seed"} == set(TINY)  # a whole seed takes minutes
+    assert set(_benchmarks()) <= set(_table.ORDER)
 
 
 def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "there are collect, plan, policy, trust, or all" in capsys.readouterr().err
+    assert "score, train, trust, all of them, or table" in capsys.readouterr().err
+
+
+def test_the_page_of_speed_has_a_place_for_its_table() -> None:
+    text = (runs.ROOT / "docs" / "speed.md").read_text()
+    assert text.count(_table.MARKS[0]) == text.count(_table.MARKS[1]) == 1
+    assert store.COLUMNS[-1] == "scale"  # what benchmarks add comes after

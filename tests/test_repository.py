@@ -98,6 +98,7 @@ def uses() -> dict[str, set[str]]:
 
 PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery", "knobs"}
 PICTURES |= {"latent_figures", "plan_figures", "policy_figures", "predict_figures", "prior_figures", "robust_figures"}
+PICTURES |= {"speed_figures"}
 ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
 
 
@@ -110,7 +111,7 @@ def test_figures_know_nothing_but_figures() -> None:
     assert needs["style"] == needs["film"] == {"disk"}
     for name in ("diagrams", "plan_figures", "axes"):
         assert needs[name] == {"style"}, name
-    for name in ("predict_figures", "gallery", "latent_figures", "prior_figures"):
+    for name in ("predict_figures", "gallery", "latent_figures", "prior_figures", "speed_figures"):
         assert needs[name] == {"axes", "style"}, name
     assert needs["robust_figures"] == {"axes", "policy_figures", "style"}
     assert needs["figures"] <= PICTURES

@@ -1,5 +1,6 @@
 """Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify [PATH]`` hashes again.
-``python -m tsmlib bench [NAME]`` measures speed. ``python -m tsmlib publish`` copies a paper-scale run to what ships.
+``python -m tsmlib bench [NAME]`` measures speed; ``bench table`` writes docs/speed.md from what was measured.
+``python -m tsmlib publish`` copies a paper-scale run to what ships.
 
 Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
 """
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tsmlib import parameters, runs
 
@@ -27,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
     bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
-    bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, or all (default)")
+    bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, all (default), or table")
     publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
     publish.add_argument("--seed", default="0")
     arguments = parser.parse_args(argv)
@@ -95,16 +97,26 @@ def _publish(seed: int) -> int:
 
 
 def _benchmarks() -> dict[str, Path]:
-    return {path.stem: path for path in sorted((runs.ROOT / "benchmarks").glob("*.py"))}
+    """The scripts that measure; a name that begins with _ is what they share."""
+    folder = runs.ROOT / "benchmarks"
+    return {path.stem: path for path in sorted(folder.glob("*.py")) if not path.stem.startswith("_")}
 
 
 def _bench(name: str) -> int:
-    present = _benchmarks()
-    if name != "all" and name not in present:
-        raise runs.ParameterError(f"no benchmark is called {name!r:.80}; there are {', '.join(present)}, or all.")
-    for word in present if name == "all" else [name]:
-        status = subprocess.run([sys.executable, str(present[word])], check=False).returncode  # its memory is its own
+    present, table = _benchmarks(), runs.ROOT / "benchmarks" / "_table.py"
+    if name not in ("all", "table", *present):
+        raise runs.ParameterError(
+            f"no benchmark is called {name!r:.80}; there are {', '.join(present)}, all of them, or table."
+        )
+    commands: list[tuple[Any, ...]] = [(present[word],) for word in present if name in ("all", word)]
+    if name == "all":
+        commands.append((table,))
+    elif name == "table":
+        commands.append((table, "--publish"))
+    for script, *options in commands:  # in a process of its own, so that its memory is too
+        status = subprocess.run([sys.executable, str(script), *options], check=False).returncode
         if status:
+            word = script.stem.removeprefix("_")
             raise runs.RunError(f"the benchmark {word} ended with status {status}; what went wrong stands above.")
     return 0
 

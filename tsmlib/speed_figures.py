@@ -8,22 +8,23 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from tsmlib.axes import finite
-from tsmlib.style import COLOURS, legend, panels, styled, tint
+from tsmlib.style import COLOURS, legend, panels, styled
 
-LOOKS: dict[str, dict[str, Any]] = {  # one blue throughout, the model's; black is the true simulator
+LOOKS: dict[str, dict[str, Any]] = {  # the model's blues and a grey; black is the true simulator
     "train": dict(color=COLOURS["tsm"], marker="o"),
-    "imagine": dict(color=COLOURS["tsm+energy"], marker="s"),
+    "imagine": dict(color=COLOURS["data"], marker="s"),
     "plan": dict(color=COLOURS["tsm+energy+direct"], marker="^"),
-    "score": dict(color=COLOURS["tsm+energy"], marker="D"),
+    "score": dict(color=COLOURS["tsm"], marker="D"),
     "learn": dict(color=COLOURS["tsm"], marker="v"),
     "simulate": dict(color=COLOURS["oracle"], marker="x"),
 }
+UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
 WORDS = {
-    "train": "one training update", "imagine": "imagined rollouts", "plan": "one planning iteration",
-    "score": "scoring", "learn": "one policy update", "simulate": "MuJoCo itself",
+    "train": "training update", "imagine": "imagining", "plan": "planning iteration", "score": "scoring",
+    "learn": "policy update", "simulate": "MuJoCo",
 }  # fmt: skip
 
 Curve = tuple[np.ndarray, np.ndarray]  # sizes (K,), seconds (R, K)
@@ -57,23 +58,27 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
             bars = np.stack([middle - relative.min(0), relative.max(0) - middle])
             ax.errorbar(sizes, middle, bars, **LOOKS[word], ms=3, lw=1, elinewidth=0.7, zorder=3)
             found = exponents(sizes, seconds)
-            notes.append((f"{np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})", LOOKS[word]["color"]))
-        ax.set(xscale="log", yscale="log", title=title.capitalize())
+            notes.append(
+                (f"exponent {np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})", LOOKS[word]["color"])
+            )
+        unit = f" ({UNITS[title]})" if title in UNITS else ""
+        ax.set(xscale="log", yscale="log", title=title.capitalize() + unit)
         ax.set_xticks(every, [f"{size:g}" for size in every])
-        ax.xaxis.set_minor_locator(NullLocator())
+        ax.yaxis.set_major_locator(FixedLocator([a * 10.0**b for b in range(-2, 4) for a in (1, 2, 5)]))
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_minor_locator(NullLocator())
+        low, high = ax.get_ylim()
+        room = (high / low) ** (0.13 * len(notes))  # for the notes: below lines that rise, above those that should fall
+        ax.set_ylim((low / room, high) if slope > 0 else (low, high * room))
         for i, (note, shade) in enumerate(reversed(notes) if slope > 0 else notes):
-            if slope > 0:  # lines rise: the free corner is at the lower right
-                ax.text(0.99, 0.03 + 0.11 * i, note, transform=ax.transAxes, ha="right", va="bottom", color=shade,
-                        fontsize=6)  # fmt: skip
-            else:
-                ax.text(0.99, 0.97 - 0.11 * i, note, transform=ax.transAxes, ha="right", va="top", color=shade,
-                        fontsize=6)  # fmt: skip
+            y, anchor = (0.02 + 0.09 * i, "bottom") if slope > 0 else (0.98 - 0.09 * i, "top")
+            ax.text(1.0, y, note.replace("-", "\u2212"), transform=ax.transAxes, ha="right", va=anchor, color=shade,
+                    fontsize=6)  # fmt: skip
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]
     entries = [Line2D([], [], **LOOKS[word], ms=3, label=WORDS[word]) for word in used]
-    entries.append(Line2D([], [], color=tint(COLOURS["zero"], 1.0), ls="--", lw=0.8, label="in proportion"))
-    legend(figure, entries)
+    entries.append(Line2D([], [], color=COLOURS["zero"], ls="--", lw=0.8, label="in proportion"))
+    legend(figure, entries, 7)
     return figure
