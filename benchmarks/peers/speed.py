@@ -176,10 +176,9 @@ WAYS = (
     *(Way("cem", "codes", model, iterations=8, candidates=96) for model in SHIPPED),  # scale laptop; paper has 10
     *(Way("cem", "codes", model, iterations=4, candidates=48) for model in SHIPPED),
     *(Way("cem", "codes", model, iterations=2, candidates=24) for model in SHIPPED),
-    *(Way("adam", "codes", model, iterations=100) for model in SHIPPED),
+    Way("adam", "codes", "tsm+energy+direct", iterations=100),
     Way("mbrl-cem", "actions", "tsm+energy+direct", iterations=5, candidates=350, bound=0.2),
     Way("mbrl-cem", "codes", "tsm+energy+direct", iterations=5, candidates=350, bound=2.0),
-    Way("mbrl-cem", "codes", "pets", iterations=5, candidates=350, samples=20, bound=2.0),
     Way("cem", "codes", "pets", iterations=8, candidates=96),
 )
 
@@ -205,12 +204,14 @@ def search(objective: Callable[[Tensor], Tensor], shape: tuple[int, ...], way: W
         return torch.from_numpy(optimizer.optimize(objective))
 
 
+def stepwise(task: Task, unit: Tensor, actions: Tensor, scaled: Tensor) -> Tensor:
+    """Reward (C, 1) of one step for the only target of ``task``; scaled (C, dx): the states after it, over ``unit``."""
+    return task.reward((scaled * unit)[:, None, None], actions[:, None, None])[:, 0]
+
+
 def through_pets(model: Any, unit: Tensor, task: Task, samples: int) -> Callable[[Tensor], Tensor]:
     """mbrl-lib's own rollouts for the only target of ``task``: actions (C, T, du) -> returns (C,)."""
     from mbrl.models import ModelEnv
-
-    def reward(actions: Tensor, scaled: Tensor) -> Tensor:
-        return task.reward((scaled * unit)[:, None, None], actions[:, None, None])[:, :, 0]
 
     def never(actions: Tensor, scaled: Tensor) -> Tensor:
         return torch.zeros(len(scaled), 1, dtype=torch.bool)
@@ -218,7 +219,7 @@ def through_pets(model: Any, unit: Tensor, task: Task, samples: int) -> Callable
     class Spaces:  # of an environment, which nothing here asks for
         observation_space = action_space = None
 
-    env = ModelEnv(Spaces(), model, never, reward, generator=torch.Generator().manual_seed(0))
+    env = ModelEnv(Spaces(), model, never, partial(stepwise, task, unit), generator=torch.Generator().manual_seed(0))
     start = task.start[0] / unit.numpy()
     return lambda actions: env.evaluate_action_sequences(actions, start, samples)
 
@@ -250,19 +251,20 @@ def planned(way: Way, task: Task, models: Models, *, seed: int = 0) -> Tensor:
         options: dict[str, Any] = dict(candidates=way.candidates, elites=max(2, way.candidates // 10), seed=seed)
         return cem(predict, task.reward, space, len(task), iterations=way.iterations, **options).actions
     found = []
+
+    def decode(parameters: Tensor) -> Tensor:
+        """(C, *shape) -> (C, T, du). What mbrl-cem searches is within its bounds, so that no torque is squashed."""
+        return parameters if way.prior == "actions" else space.decode(parameters[:, None])[:, 0]
+
     for i in range(len(task)):
         single = at(task, [i])
-        if way.prior == "actions":  # mbrl-cem keeps to its bounds, so that nothing is squashed
-            decode: Callable[[Tensor], Tensor] = lambda actions: actions  # noqa: E731
-        else:
-            decode = lambda codes: space.decode(codes[:, None])[:, 0]  # noqa: E731
         if way.model == "pets":
             value = through_pets(models.theirs, model.unit, single, way.samples)
         else:
             predict = through_model(model, single.past(model.past_len), samples=way.samples, seed=seed)
             value = partial(_value, predict, single)
         with torch.no_grad():
-            best = search(lambda p, d=decode, v=value: v(d(p)), space.shape, way, seed=seed + i)
+            best = search(lambda parameters, v=value: v(decode(parameters)), space.shape, way, seed=seed + i)
             found.append(decode(best[None])[0])
     return torch.stack(found)
 
@@ -442,9 +444,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--form", choices=pets.MODELS, default="gaussian", help="what plans (default gaussian)")
     parser.add_argument("--seconds", type=float, default=300, help="processor time of its training (default 300)")
-    parser.add_argument("--targets", type=int, default=12, help="of the frozen test task (default 12)")
-    parser.add_argument("--rounds", type=int, default=3, help="each with a share of the targets (default 3)")
-    parser.add_argument("--transitions", type=int, default=20480, help="of a turn of training (default 20480)")
+    parser.add_argument("--targets", type=int, default=10, help="of the frozen test task (default 10)")
+    parser.add_argument("--rounds", type=int, default=2, help="each with a share of the targets (default 2)")
+    parser.add_argument("--transitions", type=int, default=10240, help="of a turn of training (default 10240)")
     parser.add_argument("--training-rounds", type=int, default=5, help="default 5")
     parser.add_argument("--threads", type=int, default=1, help="default 1; with more, seconds are those of a clock")
     arguments = parser.parse_args()
