@@ -309,7 +309,7 @@ def test_only_what_earns_as_much_counts_as_faster(capsys: pytest.CaptureFixture[
     assert half == pytest.approx(12.706, rel=1e-3)  # differences 3 and 1: their deviation over the root of 2 is 1
     speed.verdicts([subject, worse, slower, best])
     printed = capsys.readouterr().out
-    assert "5.0 (5.0 to 5.0) times faster" in printed
+    assert "5.00 (5.00 to 5.00) times faster" in printed
     assert re.search(rf"{re.escape(slower.way.name)} +none", printed)
 
 

@@ -373,16 +373,19 @@ def training(
 def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
     """Print and return what every way takes, promises and earns, and how it stands to mbrl-lib's with its settings."""
     first, n, rows = found[0], len(task), []
-    floor = execute(task, zero_torques(task)).true.mean().item()
+    idle = execute(task, zero_torques(task)).true.numpy()
     print(
-        f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; no torques earn {floor:.2f}"
+        f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; idle (no torques) earns "
+        f"{idle.mean():.2f}"
     )
     print(
         f"{'planner, what it searches, model':64} {'s a target':>22} {'promised':>8} {'true':>6} {'m at end':>8} "
-        f"{'true over the first':>19} {'times faster':>22}"
+        f"{'over the first':>14} {'over idle':>14} {'times faster':>22} {'ms a rollout':>12}"
     )
     for outcome in found:
         way, (gain, half), ratio = outcome.way, compared(outcome, first), times_faster(outcome, first)
+        over_idle, idle_half = interval(outcome.true - idle)
+        rollout = np.median(outcome.seconds) / (way.candidates * way.iterations * way.samples)
         values = {
             "return_predicted": outcome.promised.mean().item(), "return_true": outcome.true.mean(),
             "final_distance": outcome.trial.final_distance.mean().item(),
@@ -390,13 +393,15 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
         predicted, true, distance = values.values()
         print(
             f"{way.name:64} {spread(outcome.seconds):>22} {predicted:8.2f} {true:6.2f} {distance:8.3f} "
-            f"{f'{gain:+.2f} +- {half:.2f}':>19} {spread(ratio, 1):>22}"
+            f"{f'{gain:+.2f} +- {half:.2f}':>14} {f'{over_idle:+.2f} +- {idle_half:.2f}':>14} {spread(ratio, 1):>22} "
+            f"{1000 * rollout:12.2f}"
         )
         about = dict(
             env=ENV, sim="mujoco", task=task.name, model=way.model, planner=way.planner, prior=way.prior,
             horizon=task.horizon, condition=way.settings,
         )  # fmt: skip
-        for metric, value in {**values, "return_gain": gain, "return_gain_half": half}.items():
+        gains = {"gain": gain, "gain_half": half, "gain_idle": over_idle, "gain_idle_half": idle_half}
+        for metric, value in {**values, **{f"return_{word}": value for word, value in gains.items()}}.items():
             rows.append(dict(about, metric=metric, value=value, unit="m" * (metric == "final_distance"), n=n))
         for word, of in SPREAD.items():
             rows.append(dict(about, metric=f"plan_seconds_{word}", value=of(outcome.seconds), unit="s", n=n))
@@ -415,7 +420,7 @@ def verdicts(found: Sequence[Outcome]) -> None:
                 print(f"{subject.way.name:64} none")
                 continue
             gain, half = compared(best, subject)
-            faster = spread(times_faster(best, subject), 1)
+            faster = spread(times_faster(best, subject))
             print(f"{subject.way.name:64} {best.way.name}: {faster} times faster, earns {gain:+.2f} +- {half:.2f} more")
 
 
