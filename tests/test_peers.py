@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from itertools import count
+import sys
+from dataclasses import replace
+from itertools import count, pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import store
+from tsmlib import runs, store, study
+from tsmlib.control import Trial
 from tsmlib.dynamics import rollout
 from tsmlib.nets import Features, SharedNoise
 from tsmlib.runs import ROOT
@@ -23,16 +27,18 @@ FOLDER = ROOT / "benchmarks" / "peers"
 MEMBERS, DX, DU, FIXED = 5, 8, 2, (6, 7)  # an arm and an obstacle, which never moves
 
 
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("pets", FOLDER / "pets.py")
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where speed finds pets, and dataclasses their module
     spec.loader.exec_module(module)
     return module
 
 
-pets = load()
+pets = load("pets")
+speed = load("speed")
 
 
 @pytest.fixture
@@ -174,6 +180,170 @@ def test_rows_of_the_same_model_are_replaced(tmp_path: Path) -> None:
     assert {row["model"]: row["value"] for row in store.load_table(path)} == {"pets": 3.0, "pets+mse": 2.0}
 
 
+# Beside ours: speed.py --------------------------------------------------------------------------------------------
+
+
+def trainer(name: str, per_update: int = 100, parameters: int = 1000, run: Any = lambda updates: None) -> Any:
+    return speed.Trainer(name, True, run, per_update, parameters)
+
+
+def test_a_turn_of_training_is_as_many_transitions_for_everyone() -> None:
+    now = [0.0]
+
+    def costs(seconds: float) -> Any:
+        def run(updates: int) -> None:
+            now[0] += seconds * updates
+
+        return run
+
+    both = [trainer("small", 100, run=costs(0.1)), trainer("large", 400, run=costs(0.2))]
+    found = speed.speeds(both, lambda: now[0], transitions=1200, rounds=3)
+    assert np.allclose(found["small"], [1000] * 3)
+    assert np.allclose(found["large"], [2000] * 3)
+    assert now[0] == pytest.approx(2 * 0.1 + 2 * 0.2 + 3 * (12 * 0.1 + 3 * 0.2))
+
+
+@pytest.mark.parametrize("form", ["gaussian", "mse"])
+def test_every_member_of_ours_sees_as_many_transitions_as_are_counted(
+    data: Trajectories, features: Features, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, whole = [], speed.Ensemble.increments
+
+    def spy(self: Any, x: Tensor, u: Tensor) -> Any:
+        if torch.is_grad_enabled():  # not at validation
+            seen.append(tuple(x.shape[:2]))
+        return whole(self, x, u)
+
+    monkeypatch.setattr(speed.Ensemble, "increments", spy)
+    made = speed.ours(form, features, data, batch=64, bf16=False)
+    made.run(3)
+    assert seen == [(MEMBERS, made.per_update)] * 3
+    widths = [DX + 2 + DU, 200, 200, 200, 200, DX * (2 if form == "gaussian" else 1)]  # of mbrl-lib's GaussianMLP
+    theirs = MEMBERS * sum((i + 1) * o for i, o in pairwise(widths)) + 2 * DX * (form == "gaussian")
+    assert made.parameters == theirs
+
+
+def test_a_batch_that_cannot_be_dealt_out_equally_is_refused(data: Trajectories, features: Features) -> None:
+    with pytest.raises(ValueError, match="not 63"):
+        speed.ours("mse", features, data, batch=63, bf16=False)
+
+
+def test_networks_of_another_size_are_not_compared() -> None:
+    speed.same_size([trainer("a"), trainer("b", parameters=1010)])
+    with pytest.raises(SystemExit, match="not equal in size"):
+        speed.same_size([trainer("a"), trainer("b", parameters=1011)])
+
+
+def test_theirs_earns_the_reward_of_the_task_step_by_step() -> None:
+    task, unit = study.task(speed.ENV).take(3), torch.logspace(-1, 1, 10)
+    generator = torch.Generator().manual_seed(0)
+    states, actions = torch.randn(7, 3, 4, 10, generator=generator), torch.randn(7, 3, 4, 2, generator=generator)
+    expected = task.reward(states, actions)  # (C, B, T)
+    for b in range(3):
+        single = speed.at(task, [b])
+        for t in range(4):
+            found = speed.stepwise(single, unit, actions[:, b, t], states[:, b, t] / unit)
+            assert torch.allclose(found, expected[:, b, t, None], atol=1e-5)
+
+
+class Still:
+    """Nothing moves, whatever is done."""
+
+    segment_len, past_len, stochastic = 100, 1, True
+
+    def __init__(self) -> None:
+        self.unit = torch.ones(10)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Any = None) -> Tensor:
+        return past.states[:, -1:] + 0 * actions[..., :1]
+
+
+THEIRS = speed.Way("mbrl-cem", "actions", "pets", iterations=1, candidates=2, bound=1.0)
+OURS = speed.Way("cem", "actions", "tsm", iterations=1, candidates=4)
+
+
+def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task = replace(study.task(speed.ENV).take(5), horizon=4)
+    now, asked = [0.0], []
+
+    def objective(model: Any, unit: Tensor, single: Any, samples: int) -> Any:
+        asked.append(single.target)
+        return lambda actions: actions.sum((1, 2))
+
+    def search(value: Any, shape: tuple[int, ...], way: Any, *, seed: int) -> Tensor:
+        now[0] += 3.0
+        value(torch.zeros(2, *shape))
+        return torch.full(shape, 0.01 * len(asked))
+
+    monkeypatch.setattr(speed, "through_pets", objective)
+    monkeypatch.setattr(speed, "search", search)
+    models = speed.Models(None, {"pets": Still(), "tsm": Still()}, None)
+    first, second = speed.outcomes([THEIRS, OURS], task, models, lambda: now[0], rounds=2)
+    assert torch.equal(torch.cat(asked), task.target)
+    assert torch.allclose(first.trial.actions[:, 0, 0], 0.01 * torch.arange(1.0, 6))
+    assert first.seconds.tolist() == [3.0, 3.0]  # a target, however many are in a share
+    assert second.trial.actions.shape == (5, 4, 2)
+    assert len(second.seconds) == 2
+    assert (first.trial.true - first.promised).abs().max() < 0.1  # nothing was pushed
+
+
+def outcome(way: Any, seconds: float, true: list[float]) -> Any:
+    earned = torch.tensor(true)
+    trial = Trial(torch.zeros(len(true), 4, 2), torch.zeros(len(true), 5, 10), earned, torch.zeros(len(true)))
+    return speed.Outcome(way, np.array([seconds, 2 * seconds]), trial, earned)
+
+
+def test_only_what_earns_as_much_counts_as_faster(capsys: pytest.CaptureFixture[str]) -> None:
+    subject = outcome(THEIRS, 10.0, [-3.0, -1.0])
+    worse, slower, best = (
+        outcome(replace(OURS, iterations=i), seconds, true)
+        for i, (seconds, true) in enumerate(((0.1, [-3.0, -2.0]), (5.0, [0.0, 0.0]), (2.0, [-2.0, -2.0])), start=1)
+    )
+    assert speed.as_good(subject, [worse, slower, best]) is best
+    assert speed.as_good(subject, [worse]) is None
+    assert speed.times_faster(best, subject).tolist() == [5.0, 5.0]
+    gain, half = speed.compared(slower, subject)
+    assert gain == pytest.approx(2.0)
+    assert half == pytest.approx(12.706, rel=1e-3)  # differences 3 and 1: their deviation over the root of 2 is 1
+    speed.verdicts([subject, worse, slower, best])
+    printed = capsys.readouterr().out
+    assert "5.00 (5.00 to 5.00) times faster" in printed
+    assert re.search(rf"{re.escape(slower.way.name)} +none", printed)
+
+
+def test_ways_of_both_are_compared_and_mixed_ones_are_told_apart() -> None:
+    assert (THEIRS.origin, OURS.origin) == ("theirs", "ours")
+    assert replace(OURS, model="pets").origin == replace(THEIRS, model="tsm").origin == "mixed"
+    assert speed.WAYS[0].origin == "theirs"  # what the others are held against
+    assert {way.origin for way in speed.WAYS} == {"theirs", "ours", "mixed"}
+    assert len({way.name for way in speed.WAYS}) == len(speed.WAYS)
+    for way in speed.WAYS:
+        if way.planner == "mbrl-cem" and way.model == "pets":
+            assert way.candidates * way.samples % MEMBERS == 0  # as mbrl-lib deals rows out among members
+
+
+def test_the_trained_network_is_found_again_until_its_training_changes(
+    data: Trajectories, features: Features, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def train(*arguments: Any, **options: Any) -> tuple[Any, dict[str, float]]:
+        made.append(torch.nn.Linear(2, 2))
+        return made[-1], {"epochs": 1.0}
+
+    monkeypatch.setattr(pets, "train", train)
+    monkeypatch.setattr(pets, "fresh", lambda *_, **options: (torch.nn.Linear(2, 2), None))
+    run = runs.Run("peers", "laptop", 0, tmp_path)
+    first, again = (speed.trained(run, "mse", features, data, data, seconds=3.0) for _ in range(2))
+    assert torch.equal(first.weight, again.weight)
+    assert len(made) == 1
+    speed.trained(run, "mse", features, data, data, seconds=4.0)
+    speed.trained(run, "mse", features, data.take(slice(10)), data, seconds=4.0)
+    assert len(made) == 3
+
+
 def pins(path: Path) -> dict[str, str]:
     lines = path.read_text().splitlines()
     return dict(line.split("==") for line in lines if line and not line.startswith("#"))
@@ -187,7 +357,8 @@ def test_pins_are_those_of_the_lock_where_both_name_a_package() -> None:
 
 
 def test_the_readme_names_the_pins_and_options_that_exist() -> None:
-    readme, source = (FOLDER / "README.md").read_text(), (FOLDER / "pets.py").read_text()
+    readme = (FOLDER / "README.md").read_text()
+    source = "".join((FOLDER / name).read_text() for name in ("pets.py", "speed.py"))
     assert "--no-deps mbrl==0.2.0 -e ." in readme
     assert f"torch=={pins(FOLDER / 'requirements.txt')['torch']}" in readme
     for path in re.findall(r"benchmarks/peers/[\w.]+", readme):

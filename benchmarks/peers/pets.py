@@ -124,6 +124,26 @@ def wrapped(form: str, features: Features, action_dim: int) -> Any:
     )  # fmt: skip
 
 
+def batch_of(data: Trajectories, features: Features) -> Any:
+    """All transitions of ``data`` as mbrl-lib takes them."""
+    from mbrl.types import TransitionBatch
+
+    before, actions, after = transitions(data, unit_of(features))
+    nothing = np.zeros(len(actions), np.float32)  # no rewards, no ends
+    return TransitionBatch(before, actions, after, nothing, nothing.astype(bool), nothing.astype(bool))
+
+
+def fresh(form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH) -> tuple[Any, Any]:
+    """mbrl-lib's model with new weights and the statistics of ``data``, and batches of a bootstrap for every member."""
+    from mbrl.util.replay_buffer import BootstrapIterator
+
+    model, whole = wrapped(form, features, data.actions.shape[2]), batch_of(data, features)
+    model.update_normalizer(whole)
+    return model, BootstrapIterator(
+        whole, batch, MEMBERS, shuffle_each_epoch=True, permute_indices=False, rng=np.random.default_rng(seed)
+    )
+
+
 def network_of(model: Any) -> Network:
     """All members of mbrl-lib's model as one function, its own normalisation of the inputs included."""
     return lambda inputs: model.model(model.input_normalizer.normalize(inputs), use_propagation=False)
@@ -156,20 +176,10 @@ def train(
     error of any member on the validation data falls by 1 %.
     """
     from mbrl.models import ModelTrainer
-    from mbrl.types import TransitionBatch
-    from mbrl.util.replay_buffer import BootstrapIterator, TransitionIterator
-
-    def batch_of(part: Trajectories) -> Any:
-        before, actions, after = transitions(part, unit_of(features))
-        nothing = np.zeros(len(actions), np.float32)  # no rewards, no ends
-        return TransitionBatch(before, actions, after, nothing, nothing.astype(bool), nothing.astype(bool))
+    from mbrl.util.replay_buffer import TransitionIterator
 
     torch.manual_seed(seed)
-    model, batch = wrapped(form, features, data.actions.shape[2]), batch_of(data)
-    model.update_normalizer(batch)
-    bootstraps = BootstrapIterator(
-        batch, BATCH, MEMBERS, shuffle_each_epoch=True, permute_indices=False, rng=np.random.default_rng(seed)
-    )
+    model, bootstraps = fresh(form, features, data, seed=seed)
     parts = Parts(bootstraps, min(PART, len(bootstraps)))
     best: dict[str, Any] = {"score": None, "weights": None}
     bar = tqdm(total=round(seconds), desc=f"{study.short(data.env)} {MODELS[form]}", unit="s")
@@ -186,7 +196,7 @@ def train(
 
     with suppress(BudgetUsed):
         ModelTrainer(model, optim_lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY).train(
-            parts, dataset_val=TransitionIterator(batch_of(held_out), BATCH), callback=after_part, silent=True
+            parts, dataset_val=TransitionIterator(batch_of(held_out, features), BATCH), callback=after_part, silent=True
         )
     used = time.process_time() - began
     bar.close()
