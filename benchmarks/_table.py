@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import growth
-from _rounds import Row, figure, folder, load, text
+from _rounds import EXTRA, Row, figure, folder, load, text
 
 from tsmlib import runs, store, style
 
@@ -84,7 +85,12 @@ def measured() -> Found:
     """The rows of each benchmark that has left a table in the form of ``_rounds``."""
     paths = {path.stem: path for path in sorted(folder().glob("*.csv")) if not path.stem.endswith("_rows")}
     names = [*(name for name in ORDER if name in paths), *(name for name in paths if name not in ORDER)]
-    return {name: load(paths[name]) for name in names if "what" in paths[name].read_text().partition("\n")[0]}
+    return {name: load(paths[name]) for name in names if set(EXTRA) <= set(columns_of(paths[name]))}
+
+
+def columns_of(path: Path) -> list[str]:
+    """The first line of a table; one in another form has no place here."""
+    return path.read_text().partition("\n")[0].split(",")
 
 
 def targets(found: Found) -> list[tuple[str, str, str, str]]:
@@ -102,7 +108,7 @@ def targets(found: Found) -> list[tuple[str, str, str, str]]:
         chosen = (max if highest else min)(rows, key=lambda row: value_of(row, target.field))
         value = value_of(chosen, target.field)
         low, _, high = chosen.ratio
-        words = f"{value:.0%}" if percent else f"{figure(value)} ({figure(low)} to {figure(high)})"
+        words = f"{value:.1%}" if percent else f"{value:.4g} ({low:.4g} to {high:.4g})"
         reached = value >= target.bound if target.least else value <= target.bound
         lines.append((target.says, asked, f"{words}: {chosen.what}", "reached" if reached else "**not reached**"))
     peaks = [row for rows in found.values() for row, _ in rows if row.peak_bytes]

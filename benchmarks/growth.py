@@ -55,9 +55,10 @@ def main() -> None:
             found = speed_figures.exponents(sizes, seconds)
             peak = max(peaks[axis, word, size] for size in calls)
             many = f"{sizes[0]} to {sizes[-1]}"
+            linear = "in proportion (-1)" if axis == "threads" else "linear growth (1)"
             rows.append(
                 Row.of(
-                    f"{speed_figures.WORDS[word]} against {axis}, {many}", found, "linear growth", 1.0,
+                    f"{speed_figures.WORDS[word]} against {axis}, {many}", found, linear, 1.0,
                     unit="exponent", peak=peak, env=ENV, sim="mujoco", model="tsm", condition=axis, metric="exponent",
                 )
             )  # fmt: skip

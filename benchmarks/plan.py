@@ -61,7 +61,7 @@ def main() -> None:
     options.add_argument("--iterations", type=int, default=100, help="of the whole plan (default 100, as in the paper)")
     options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
     options.add_argument("--few", type=int, default=2, help="iterations in a round (default 2)")
-    options.add_argument("--candidates", type=int, default=8, help="of the cross-entropy method (default 8)")
+    options.add_argument("--candidates", type=int, default=4, help="of the cross-entropy method (default 4)")
     options.add_argument("--samples", type=int, default=2, help="model samples per target (default 2, as scale laptop)")
     options.add_argument("--whole", action="store_true", help="run the whole plan too, minutes")
     arguments = parsed(options)

@@ -1,0 +1,27 @@
+"""The figure of how cost grows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tsmlib.speed_figures import exponents, growth
+
+SIZES = np.array([1, 2, 4, 8])
+
+
+def test_an_exponent_is_that_of_the_power_that_made_the_curve() -> None:
+    seconds = np.stack([3.0 * SIZES**0.5, 0.1 * SIZES**2.0])
+    np.testing.assert_allclose(exponents(SIZES, seconds), [0.5, 2.0])
+
+
+def test_each_panel_names_its_exponents() -> None:
+    flat = np.stack([np.ones(4), np.ones(4)])
+    figure = growth({"batch": {"train": (SIZES, flat * SIZES)}, "threads": {"simulate": (SIZES, flat / SIZES)}})
+    notes = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert notes == ["exponent 1.00 (1.00 to 1.00)", "exponent −1.00 (−1.00 to −1.00)"]
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(ValueError, match="seconds of batch, train"):
+        growth({"batch": {"train": (SIZES, np.full((2, 4), np.nan))}})
