@@ -17,7 +17,7 @@ from _rounds import EXTRA, Row, figure, folder, load, text
 
 from tsmlib import runs, store, style
 
-ORDER = ("collect", "train", "rollout", "plan", "policy", "score", "seed", "peers", "growth", "trust")
+ORDER = ("collect", "train", "rollout", "plan", "policy", "score", "seed", "parallel", "growth", "trust")
 DOCS = runs.ROOT / "docs" / "speed.md"
 PICTURE = runs.ROOT / "figures" / "bench_growth"
 MARKS = ("<!-- table -->", "<!-- end of table -->")
@@ -61,6 +61,8 @@ TARGETS = (
     Target("share of raw mujoco.rollout in collecting", "collect",
            lambda row, r: r["metric"] == "steps_per_second", "share", True, 0.6),
     Target("ten policies over one, time", "policy", lambda row, r: r["condition"] == "copies", "ratio", False, 2.5),
+    Target("a whole seed, the sum of its parts, over two hours of two cores", "seed",
+           lambda row, r: r["condition"] == "a whole seed", "ratio", False, 1),
     Target("exponent of cost against horizon, targets and seeds, told from 1 to within 0.05", "growth",
            lambda row, r: r["condition"] in ("horizon", "targets", "seeds"), "ratio", False, 1.05),
 )  # fmt: skip

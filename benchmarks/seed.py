@@ -38,7 +38,6 @@ BUDGET = 2 * 2 * 3600.0  # seconds of two cores in two hours
 REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 BEST = "tsm+energy+direct"
 IMPERFECT = (imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY))
-LITTLE = {"updates": 3, "episodes": 10, "targets": 10}
 WORDS = {
     "train": "all trainings of a seed: processor seconds", "score": "all scores of a seed: processor seconds",
     "plan": "all plans of a seed: processor seconds", "policy": "all policies of a seed: processor seconds",
@@ -59,6 +58,8 @@ def main() -> None:
     options = parser(__doc__, rounds=2)
     options.add_argument("--models", default=",".join(study.DYNAMICS))
     options.add_argument("--envs", default=",".join(MUJOCO_IDS))
+    options.add_argument("--little", type=int, default=10, help="episodes, and targets, of each part (default 10)")
+    options.add_argument("--updates", type=int, default=3, help="of each training and policy (default 3)")
     arguments = parsed(options)
     parts = list(everything(arguments))
     peaks: dict[str, int] = defaultdict(int)
@@ -97,31 +98,31 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
     run, models = runs.resolve("bench", scale="paper"), arguments.models.split(",")
     envs = arguments.envs.split(",")
     data = {env: study.random_data(env, 200, seed=0) for env in (*envs, *(IMPERFECT if REACH in envs else ()))}
-    few = {env: study.random_data(env, LITTLE["episodes"], seed=1) for env in data}
+    few = {env: study.random_data(env, arguments.little, seed=1) for env in data}
     robust = [word for word in models if word in ("tsm", BEST, "onestep", "multistep", "lstm")]
     nets = {(env, word): study.fresh(run, word, data[env]) for env in data for word in (*models, "prior")}
     for env in data:
         own = robust if env in IMPERFECT else [*models, *(["tsm+teacher"] if env == PUSH else [])]
         for word in own:
-            yield from trainings(run, env, word, data[env], few[env])
+            yield from trainings(run, env, word, data[env], arguments.updates)
             if word in models:
                 yield from scores(nets[env, word], few[env])
     for env in (env for env in (REACH, PUSH) if env in envs):
-        yield from trainings(run, env, "prior", data[env], few[env])
+        yield from trainings(run, env, "prior", data[env], arguments.updates)
         task = study.task(env, "validation")
         for word in models:
             if word != "tsm+energy":
-                yield from plans(nets[env, word], nets[env, "prior"], task)
+                yield from plans(nets[env, word], nets[env, "prior"], task, arguments.little)
         for word in (word for word in models if word in (BEST, "onestep", "multistep", "lstm", "ensemble+mse")):
-            yield from policies(nets[env, word], nets[env, "prior"] if word == BEST else None, task)
+            yield from policies(nets[env, word], nets[env, "prior"] if word == BEST else None, task, arguments.updates)
 
 
-def trainings(run: runs.Run, env: str, word: str, data: Trajectories, held_out: Trajectories) -> Iterator[Part]:
+def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) -> Iterator[Part]:
     """The stages of one model; an update costs the same at any time."""
-    n, net = LITTLE["updates"], study.fresh(run, word, data)
+    net, held_out = study.fresh(run, word, data), data.take(slice(1))
     for stage in study.schedule(run, env, word):
         bf16 = study.bf16_pays(word, stage)
-        few = training(net, stage, (data, held_out.take(slice(1))), updates=n, bf16=bf16)
+        few = training(net, stage, (data, held_out), updates=n, bf16=bf16)
         yield Part("train", few, stage.steps / n)
 
 
@@ -132,9 +133,9 @@ def scores(net: Any, few: Trajectories) -> Iterator[Part]:
                    1200 / (2 * len(few)))  # fmt: skip
 
 
-def plans(net: Any, prior: Any, task: Task) -> Iterator[Part]:
+def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
     """CEM of 96 candidates and 10 iterations over codes and over torques, and its promise from 32 samples."""
-    few, horizon = task.take(LITTLE["targets"]), task.horizon
+    few, horizon = task.take(n), task.horizon
     past, samples = few.past(net.past_len), 2 if getattr(net, "stochastic", True) else 1
     for space in (LatentActions(prior, horizon), DirectActions(horizon)):
         predict = through_model(net, past, samples=samples)
@@ -148,9 +149,9 @@ def plans(net: Any, prior: Any, task: Task) -> Iterator[Part]:
         yield Part("plan", partial(reassess, found, judge, few.reward), len(task) / len(few))
 
 
-def policies(net: Any, prior: Any, task: Task) -> Iterator[Part]:
+def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
     """Three copies, 2,200 updates, acting by torques, and by codes where there is a prior."""
-    draw, n = episodes_from(torch.from_numpy(task.start)), LITTLE["updates"]
+    draw = episodes_from(torch.from_numpy(task.start))
     reward: Callable[[Tensor], Any] = rewards.reach if task.name == "reach" else rewards.push
     learners: list[Any] = [OneStepPolicy(task.start.shape[1], 2, copies=3)]
     learners += [SegmentPolicy(task.start.shape[1], prior, copies=3)] if prior is not None else []
