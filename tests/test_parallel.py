@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from tsmlib import runs, study
-from tsmlib.runs import Run
+from tsmlib.envs import ENV_IDS
+from tsmlib.runs import Run, RunError
 
 
 def write(run: Run, name: str) -> None:
@@ -20,6 +21,11 @@ def write(run: Run, name: str) -> None:
     (run.folder("made") / name).write_text(f"{os.getpid()} {torch.get_num_threads()}")
 
 
+def die(run: Run, name: str) -> None:
+    """As where memory runs out."""
+    os._exit(9)
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return runs.resolve("02_train", scale="paper", run_dir=str(tmp_path))
@@ -27,7 +33,7 @@ def run(tmp_path: Path) -> Run:
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsmlib.study.parallel._cores", lambda: 2)
+    monkeypatch.setattr("tsmlib.study.parallel.cores", lambda: 2)
 
 
 def test_everything_is_made_by_other_processes_of_one_thread_each(run: Run) -> None:
@@ -37,10 +43,24 @@ def test_everything_is_made_by_other_processes_of_one_thread_each(run: Run) -> N
     assert all(pid != str(os.getpid()) and threads == "1" for pid, threads in made.values())
 
 
-def test_an_error_reaches_the_notebook_and_what_was_made_beside_it_stays(run: Run) -> None:
+def test_an_error_reaches_the_notebook_and_only_what_was_under_way_is_finished(run: Run) -> None:
     with pytest.raises(ValueError, match="this cannot be made"):
-        study.ahead(run, [(write, "a"), (write, "impossible")])
-    assert [path.name for path in run.folder("made").iterdir()] == ["a"]
+        study.ahead(run, [(write, name) for name in ("a", "impossible", "b", "c", "d", "e")])
+    made = {path.name for path in run.folder("made").iterdir()}
+    assert "a" in made
+    assert not made & {"c", "d", "e"}
+
+
+def test_a_worker_that_dies_is_told_of_and_what_to_do(run: Run) -> None:
+    with pytest.raises(RunError, match="Run it again"):
+        study.ahead(run, [(die, "a"), (die, "b")])
+
+
+def test_a_prior_that_several_arms_share_is_trained_once(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, str]] = []
+    monkeypatch.setattr(study.models, "ahead", lambda run, calls, **_: asked.extend(call[1:] for call in calls))
+    study.train_ahead(run, [(env, model) for env in ENV_IDS for model in ("tsm", "prior")])
+    assert len(asked) == len(set(asked)) == len(ENV_IDS) + 2
 
 
 def test_only_the_paper_scale_makes_anything_ahead(run: Run) -> None:

@@ -85,12 +85,11 @@ class TSM(nn.Module):
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z), free-running: each state is computed from the predicted one before it."""
+        return in_blocks(self._decode, *past, actions, z)
 
-        def decode(states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
-            step = self._begin(Segment(states, before), z)
-            return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
-
-        return in_blocks(decode, *past, actions, z)
+    def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+        step = self._begin(Segment(states, before), z)
+        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
 
     def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
         """``predict_segment`` one action at a time, with one code for the segment; see ``dynamics.stepper``."""

@@ -19,6 +19,7 @@ from tsmlib.study.models import (
     load_or_train,
     schedule,
     train,
+    train_ahead,
 )
 from tsmlib.study.parallel import ahead
 from tsmlib.study.plans import along_the_way, plan, trial
@@ -30,5 +31,6 @@ __all__ = [
     "BUDGET", "CHOICES", "CLASSES", "DYNAMICS", "EPISODES", "FROZEN", "HELD_OUT_SEED", "MODELS", "OURS", "RESULTS",
     "SPLITS", "TASK_SEED", "Stage", "ahead", "along_the_way", "assess", "bf16_pays", "chosen", "dataset", "draw_task",
     "evidence", "fingerprint", "freeze_tasks", "fresh", "has_block", "kept_budget", "learn", "load_or_train",
-    "plan", "random_data", "schedule", "scores", "short", "sizes", "table", "task", "train", "trial", "within_data",
+    "plan", "random_data", "schedule", "scores", "short", "sizes", "table", "task", "train",
+    "train_ahead", "trial", "within_data",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from tsmlib.envs import has_block, imperfections
 from tsmlib.prior import ActionPrior
 from tsmlib.runs import Run
 from tsmlib.study.data import dataset, fingerprint, short
+from tsmlib.study.parallel import ahead
 from tsmlib.train import fit
 from tsmlib.trajectory import Trajectories
 from tsmlib.tsm import TSM
@@ -93,8 +95,7 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now. Raises
     store.StoreError for a file of another environment, word, class or schedule.
     """
-    if model == "prior":  # equally many episodes hold the same torques, whatever the environment
-        env = "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
+    env = _trained_on(env, model)
     own = run.folder(f"models/{short(env)}") / f"{model}.safetensors"
     shipped = run.shipped / short(env) / f"{model}.safetensors"
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
@@ -111,6 +112,19 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
                 )
             return store.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
     return train(run, env, model, own)
+
+
+def train_ahead(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
+    """``ahead`` for models: each (env, model) that is wanted, once."""
+    pairs = dict.fromkeys((_trained_on(env, model), model) for env, model in wanted)
+    ahead(run, [(load_or_train, *pair) for pair in pairs], progress="models")
+
+
+def _trained_on(env: str, model: str) -> str:
+    """The environment; of the prior, since equally many episodes hold the same torques, one with as many."""
+    if model != "prior":
+        return env
+    return "tsm/ReacherPush-v0" if has_block(env) else "tsm/Reacher-v0"
 
 
 def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, Any]]:
@@ -132,6 +146,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
         "schedule": _plain(schedule(run, env, model)), "torch": torch.__version__,
+        "bf16": [stage.loss for stage in schedule(run, env, model) if bf16_pays(model, stage)],
         "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
         "seconds": sum(c["seconds"][-1] for c in curves.values()),  # of processor time
         "inputs": _inputs(run, env, path),

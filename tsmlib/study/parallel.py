@@ -1,4 +1,4 @@
-"""Several things of a run made at the same time, by processes of one thread each.
+"""Several things of a run made at the same time, by processes in which torch has one thread.
 
 Two threads on one small network gain little over one; two networks on a thread each gain nearly all of the second core.
 """
@@ -10,35 +10,48 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from typing import Any
 
 import torch
 from tqdm.auto import tqdm
 
-from tsmlib.runs import Run
+from tsmlib.runs import Run, RunError
 
 
 def ahead(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
     """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
 
-    make: a function of ``study`` that keeps what it makes in the run's folder, such as ``load_or_train``, where the
-    notebook then finds it. Calls must not need each other's results: models first, then what is made with them. At
-    scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error is raised when the
-    calls under way have ended; what they made is kept.
+    make: a function of ``study`` that keeps what it makes in the run's folder, such as ``plan``, where the notebook
+    then finds it. Calls must not need each other's results: models first (``train_ahead``), then what is made with
+    them. At scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error, or an
+    interrupt, ends it when the calls under way have ended; what they made is kept. Raises RunError where a worker died.
     """
-    workers = min(_cores(), len(calls))
+    workers = min(cores(), len(calls), 61)  # Windows allows no more
     if run.scale != "paper" or workers < 2:
         return
+    waiting, under_way = iter(calls), set[Future[None]]()
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin) as pool:
-        under_way = [pool.submit(_make, run, *call) for call in calls]
-        try:
-            for done in tqdm(as_completed(under_way), total=len(calls), desc=progress):
-                done.result()
-        except BaseException:  # an interrupt too: no more is begun
-            pool.shutdown(cancel_futures=True)
-            raise
+    with (
+        ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin) as pool,
+        tqdm(total=len(calls), desc=progress) as bar,
+    ):
+        while True:
+            under_way |= {pool.submit(_make, run, *call) for call in islice(waiting, workers - len(under_way))}
+            if not under_way:
+                break
+            done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            for call in done:
+                try:
+                    call.result()
+                except BrokenProcessPool as error:
+                    raise RunError(
+                        "a process that made things ahead died, perhaps for want of memory. Run it again: trainings "
+                        "go on where they were"
+                    ) from error
+                bar.update()
 
 
 def _make(run: Run, make: Callable[..., Any], *arguments: Any) -> None:
@@ -63,5 +76,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
