@@ -18,7 +18,7 @@ help:
 	@echo "make claims    what the paper claims, judged from the rows that ship (notebooks/08_claims.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
 	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (an hour of one processor)"
-	@echo "make bench     speed of everything against references, and docs/speed.md (about a quarter of an hour)"
+	@echo "make bench     speed of everything against references, and docs/speed.md"
 	@echo "make lint      style and types"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 

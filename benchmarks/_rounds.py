@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import sys
 import time
 from collections import Counter
@@ -114,17 +113,19 @@ def parsed(made: argparse.ArgumentParser) -> argparse.Namespace:
 def interleaved(ways: Ways, rounds: int, *, warm: bool = True, progress: str = "rounds") -> dict[str, np.ndarray]:
     """Seconds (rounds,) of each way, all of them in turn in every round, after one call of each that does not count.
 
+    Every other round goes through them backwards, so that none always follows the same one. A way that returns a float
+    says itself how many seconds count.
     warm: whether that call is made; not where ``peak_bytes`` has called them.
     """
     if warm:
         for call in ways.values():
             call()
     seconds: dict[str, list[float]] = {way: [] for way in ways}
-    for _ in tqdm(range(rounds), desc=progress, leave=False):
-        for way, call in ways.items():
+    for i in tqdm(range(rounds), desc=progress, leave=False):
+        for way, call in list(ways.items())[:: -1 if i % 2 else 1]:
             began = time.perf_counter()
-            call()
-            seconds[way].append(time.perf_counter() - began)
+            own = call()
+            seconds[way].append(own if isinstance(own, float) else time.perf_counter() - began)
     return {way: np.array(taken) for way, taken in seconds.items()}
 
 
@@ -132,6 +133,8 @@ def peak_bytes(call: Callable[[], object]) -> int:
     """The most memory that this process has while ``call`` runs; where Linux does not tell, that it ever had."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if not reset.exists():
+        import resource  # not on Windows
+
         call()
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     reset.write_text("5")  # the highest so far is forgotten
@@ -180,6 +183,12 @@ class Products(TorchDispatchMode):
         with cls() as found:
             call()
         return found
+
+    def __sub__(self, other: Products) -> Products:
+        """What is left without those of ``other``."""
+        left = Products()
+        left.shapes = self.shapes - other.shapes
+        return left
 
     @property
     def flops(self) -> int:

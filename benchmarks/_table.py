@@ -48,12 +48,13 @@ def starts(*words: str) -> Callable[[Row, dict[str, Any]], bool]:
 TARGETS = (
     Target("training TSM, c = 64, teacher-forced, targets per second over plain eager windows", "train",
            starts("train tsm, teacher-forced: targets"), "ratio", True, 2.2),
-    Target("the same free-running", "train", starts("train tsm, free-running: targets"), "ratio", True, 1.4),
+    Target("training TSM, c = 64, free-running, targets per second over plain eager windows", "train",
+           starts("train tsm, free-running: targets"), "ratio", True, 1.4),
     Target("share of the processor's float32 matrix products in training TSM, both stages", "train",
            starts("train tsm, teacher-forced: targets", "train tsm, free-running: targets"), "share", True, 0.55),
     Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, best of all batches", "rollout",
            starts("imagine with tsm, "), "ratio", True, 5, best=True),
-    Target("100 latent plans, T = 50, 100 iterations, over plain eager", "plan",
+    Target("100 latent plans, T = 50, over plain eager, per iteration", "plan",
            lambda row, r: r["condition"] == "plain" and r["planner"] == "adam" and r["prior"] == "codes",
            "ratio", True, 2),
     Target("collecting over a loop of env.step", "collect",
@@ -61,9 +62,9 @@ TARGETS = (
     Target("share of raw mujoco.rollout in collecting", "collect",
            lambda row, r: r["metric"] == "steps_per_second", "share", True, 0.6),
     Target("ten policies over one, time", "policy", lambda row, r: r["condition"] == "copies", "ratio", False, 2.5),
-    Target("a whole seed, the sum of its parts, over two hours of two cores", "seed",
+    Target("trainings, scores, CEM plans and policies of a seed, over two hours of two cores", "seed",
            lambda row, r: r["condition"] == "a whole seed", "ratio", False, 1),
-    Target("exponent of cost against horizon, targets and seeds, told from 1 to within 0.05", "growth",
+    Target("exponent of cost against horizon, targets and seeds", "growth",
            lambda row, r: r["condition"] in ("horizon", "targets", "seeds"), "ratio", False, 1.05),
 )  # fmt: skip
 MOST_GIB = 6

@@ -24,7 +24,7 @@ from tsmlib import evaluate, rewards, runs, speed_figures, store, study
 from tsmlib.dynamics import rollout
 from tsmlib.policy import OneStepPolicy, episodes_from, improve
 from tsmlib.style import save as save_figure
-from tsmlib.trajectory import Segment, Trajectories, Window
+from tsmlib.trajectory import Segment, Window
 from tsmlib.trajopt import DirectActions, adam, through_model
 from tsmlib.tsm import TSM
 
@@ -108,13 +108,13 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
         predict = through_model(model, some.past(model.past_len))
         return partial(adam, predict, some.reward, DirectActions(horizon), n_targets, iterations=1)
 
-    def learn(copies: int) -> None:
+    def learn(copies: int) -> float:
         policy: Any = OneStepPolicy(reach.start.shape[1], DU, copies=copies)
         policy.features.load_state_dict(small.features.state_dict())
         draw = episodes_from(torch.from_numpy(reach.start))
-        improve(policy, small, getattr(rewards, reach.name), draw, iterations=1, record_every=1)
+        return improve(policy, small, getattr(rewards, reach.name), draw, iterations=2, record_every=2).seconds[-1]
 
-    few = Trajectories(data.states[:2], data.actions[:2], ENV, data.dt, data.names, data.units, data.angles)
+    few = data.take(slice(2))
     cores = os.cpu_count() or 1
     on = partial(with_threads, after=threads)
     return {

@@ -8,14 +8,13 @@ processes included, and in this process with as many threads as the other way ha
 
 from __future__ import annotations
 
-import os
-
 import torch
-from _rounds import Row, interleaved, parsed, parser, peak_bytes, save
+from _rounds import Row, interleaved, parsed, parser, save
 from train import training
 
 from tsmlib import runs, study
 from tsmlib.runs import Run
+from tsmlib.study.parallel import cores
 
 ENV = "tsm/ReacherPush-v0"
 
@@ -33,11 +32,11 @@ def main() -> None:
     options.add_argument("--trainings", type=int, default=4)
     options.add_argument("--updates", type=int, default=40, help="of each (default 40)")
     arguments = parsed(options)
-    run, cores = runs.resolve("bench", scale="paper"), os.cpu_count() or 1
+    run, at_once = runs.resolve("bench", scale="paper"), min(cores(), arguments.trainings)
     calls = [(little, seed, arguments.updates) for seed in range(arguments.trainings)]
 
     def in_turn() -> None:
-        torch.set_num_threads(cores)
+        torch.set_num_threads(at_once)
         for make, *given in calls:
             make(run, *given)
         torch.set_num_threads(arguments.threads)
@@ -45,15 +44,14 @@ def main() -> None:
     def side_by_side() -> None:
         study.ahead(run, calls)
 
-    peak = peak_bytes(in_turn)
     seconds = interleaved({"ahead": side_by_side, "in turn": in_turn}, arguments.rounds, warm=False)
     n = arguments.trainings
     row = Row.of(
-        f"{n} trainings side by side on {cores} cores: trainings", n / seconds["ahead"],
-        f"in turn, {cores} threads", n / seconds["in turn"], peak=peak, threads=1, env=ENV, sim="mujoco", model="tsm",
+        f"{n} trainings side by side in {at_once} processes: trainings", n / seconds["ahead"],
+        f"in turn, {at_once} threads", n / seconds["in turn"], threads=1, env=ENV, sim="mujoco", model="tsm",
         condition="processes", metric="trainings_per_second",
     )  # fmt: skip
-    print(f"{ENV}, {arguments.updates} updates each, {arguments.rounds} rounds, {cores} cores")
+    print(f"{ENV}, {arguments.updates} updates each, {arguments.rounds} rounds")
     save("parallel", [row])
 
 

@@ -41,14 +41,15 @@ def main() -> None:
     starts = torch.from_numpy(task.start[:EPISODES])
     torques = 0.1 * torch.randn(len(starts), horizon, 2, generator=torch.Generator().manual_seed(0))
 
-    def learn(kind: str, copies: int) -> None:
+    def learn(kind: str, copies: int, n: int = n) -> float:
+        """Seconds of the updates alone, without the records before and after them."""
         learner: Any = (
             SegmentPolicy(state_dim, prior, copies=copies)
             if kind == "codes"
             else OneStepPolicy(state_dim, 2, copies=copies)
         )
         learner.features.load_state_dict(model.features.state_dict())
-        improve(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon)
+        return improve(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon).seconds[-1]
 
     @torch.no_grad()
     def imagine() -> None:
@@ -58,7 +59,11 @@ def main() -> None:
 
     ways: dict[str, Callable[[], object]] = {"imagine": imagine}
     ways |= {f"{kind} {m}": partial(learn, kind, m) for kind in ("codes", "actions") for m in (1, copies)}
-    products = {f"sgemm {way}": Products.of(call).alone() for way, call in ways.items()}
+    products = {  # of the updates alone
+        f"sgemm {way}": (Products.of(partial(call, n=2 * n)) - Products.of(call)).alone()
+        for way, call in ways.items()
+        if way != "imagine"
+    }
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     seconds = interleaved(ways | products, arguments.rounds, warm=False)
 

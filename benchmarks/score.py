@@ -33,7 +33,7 @@ def main() -> None:
     horizon = arguments.horizon
     run = runs.resolve("bench", scale="laptop")
     splits = [study.random_data(ENV, arguments.episodes, seed=seed) for seed in (0, 1)]
-    pairs = [Trajectories(d.states[:2], d.actions[:2], d.env, d.dt, d.names, d.units, d.angles) for d in splits]
+    pairs = [data.take(slice(2)) for data in splits]
     ways: dict[str, Callable[[], object]] = {"memory": bandwidth(BYTES)}
     for model in arguments.models.split(","):
         net = study.fresh(run, model, splits[0])

@@ -2,9 +2,9 @@
 
 Every call is ``tsmlib.train.fit`` for a few updates, with the loss, the batch and the future of a stage of
 ``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on a few windows. The reference is
-the same stage in float32 through ``_plain.PlainTSM``; for models that have no plain form, themselves in float32. The
-limit is the time that the matrix products of the very same call take alone, in float32: the share says how many of the
-processor's float32 operations per second training gets.
+the same stage in float32 through ``_plain.PlainTSM``; for models that have no plain form, themselves in the other
+precision. The limit is the time that the matrix products of the very same call take alone, in float32: the share says
+how many of the processor's float32 operations per second training gets.
 
     python benchmarks/train.py        or        python -m tsmlib bench train
 """
@@ -68,12 +68,14 @@ def training(net: Any, stage: Stage, data: Data, *, updates: int, bf16: bool) ->
 
 def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) -> Row:
     """Supervised targets per second of one stage."""
+    bf16 = study.bf16_pays(model, stage)
     plain = PlainTSM(net) if isinstance(net, TSM) else net
-    fast = training(net, stage, data, updates=arguments.updates, bf16=study.bf16_pays(model, stage))
+    other = "plain eager float32" if plain is not net else f"itself in {'float32' if bf16 else 'bfloat16'}"
+    fast = training(net, stage, data, updates=arguments.updates, bf16=bf16)
     products = Products.of(fast)
     ways = {
         "fast": fast,
-        "plain": training(plain, stage, data, updates=arguments.updates, bf16=False),
+        "plain": training(plain, stage, data, updates=arguments.updates, bf16=plain is net and not bf16),
         "sgemm": products.alone(),
     }
     ways["plain"]()
@@ -86,7 +88,7 @@ def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) ->
     print(f"{model}, {name}: {sorted(windows)[len(windows) // 2]:,.0f} windows a second")
     return Row.of(
         f"train {model}, {name}: targets", targets / seconds["fast"],
-        "plain eager float32" if plain is not net else "itself in float32", targets / seconds["plain"],
+        other, targets / seconds["plain"],
         limit=SGEMM, bound=targets / seconds["sgemm"], peak=peak, env=ENV, sim="mujoco", model=model,
         condition=stage.loss, metric="targets_per_second", horizon=stage.future_len,
     )  # fmt: skip
