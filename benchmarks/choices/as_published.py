@@ -29,9 +29,8 @@ def main() -> None:
         values = np.array([r["value"] for r in same])
         if len(values) < 3:
             continue
-        what = (
-            f"{row['env']:20} {row['model']:18} {row['metric']:18} {f'at {row["horizon"]}' if row['horizon'] else '':6}"
-        )
+        step = f"at {row['horizon']}" if row["horizon"] else ""
+        what = f"{row['env']:20} {row['model']:18} {row['metric']:18} {step:6}"
         spread = 4.303 * values.std(ddof=1) * np.sqrt(1 + 1 / len(values))  # 95 % of one more seed, t with 2 freedoms
         print(f"{what} {row['value']:9.3f}   published {', '.join(f'{v:.3f}' for v in values)}")
         compared += 1
