@@ -64,13 +64,14 @@ def main() -> None:
     arguments = parsed(options)
     parts = list(everything(arguments))
     peaks: dict[str, int] = defaultdict(int)
-    for part in parts:
-        peaks[part.kind] = max(peaks[part.kind], peak_bytes(part.call))
     seconds: dict[str, list[float]] = defaultdict(list)
     for _ in tqdm(range(arguments.rounds), desc="rounds"):
         spent: dict[str, float] = defaultdict(float)
         for part in tqdm(parts, desc="parts", leave=False):
-            spent[part.kind] += part.times * processor_seconds(part.call)
+            taken: list[float] = []
+            peak = peak_bytes(lambda part=part, taken=taken: taken.append(processor_seconds(part.call)))
+            spent[part.kind] += part.times * taken[0]
+            peaks[part.kind] = max(peaks[part.kind], peak)
         for name, value in spent.items():
             seconds[name].append(value)
     kinds = list(dict.fromkeys(part.kind for part in parts))

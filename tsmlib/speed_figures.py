@@ -74,7 +74,7 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         for i, (note, shade) in enumerate(reversed(notes) if slope > 0 else notes):
             y, anchor = (0.02 + 0.09 * i, "bottom") if slope > 0 else (0.98 - 0.09 * i, "top")
             ax.text(1.0, y, note.replace("-", "\u2212"), transform=ax.transAxes, ha="right", va=anchor, color=shade,
-                    fontsize=6)  # fmt: skip
+                    fontsize=6 if slope > 0 else 5.2)  # fmt: skip
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]
