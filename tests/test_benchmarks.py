@@ -155,7 +155,7 @@ def test_every_benchmark_has_a_test_and_a_place_in_the_table() -> None:
 
 def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed"]) == 2
-    assert "score, train, trust, all of them, or table" in capsys.readouterr().err
+    assert "score, seed, train, trust, all of them, or table" in capsys.readouterr().err
 
 
 def test_the_page_of_speed_has_a_place_for_its_table() -> None:
