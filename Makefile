@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
+TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
 .PHONY: help collect train predict latent control robustness action_prior claims test torture bench lint clean
 
@@ -26,8 +27,8 @@ collect train predict latent control robustness action_prior claims: $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)
-	$(PY) -m pytest
-	$(PY) -m pytest --nbval-lax notebooks
+	$(TEST) tests
+	$(TEST) --nbval-lax notebooks
 
 torture: $(READY)
 	$(PY) tests/torture $(PARTS)

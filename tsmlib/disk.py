@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 PathLike = str | os.PathLike[str]
 
 
@@ -63,12 +65,9 @@ def _sync(folder: Path) -> None:
 def alive(pid: Any) -> bool:
     """Whether there may be a process of this number; True for what is none."""
     try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except (TypeError, ValueError, OverflowError, PermissionError):
-        pass
-    return True
+        return psutil.pid_exists(int(pid))
+    except (TypeError, ValueError, OverflowError):
+        return True
 
 
 @contextlib.contextmanager
