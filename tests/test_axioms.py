@@ -251,6 +251,8 @@ def test_a_cache_may_begin_with_nothing_known() -> None:
     cache, codes = decoder.begin(inputs[:, :0], z), decoder.codes(z)
     outputs = torch.stack([decoder.step(x, codes, cache) for x in inputs.unbind(1)], 1)
     torch.testing.assert_close(outputs, decoder(inputs, z), rtol=1e-10, atol=1e-10)
+    for n in range(1, inputs.shape[1] + 1):
+        torch.testing.assert_close(decoder(inputs, z, n), outputs[:, -n:], rtol=1e-10, atol=1e-10)
 
 
 # Differentiability ---------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.nets import Features, Noise, sigmoid_tanh, standard_normal
+from tsmlib.nets import Features, Noise, standard_normal
 from tsmlib.trajectory import Segment, Window
 
 
@@ -137,8 +137,8 @@ class LSTM(nn.Module):
         """The next hidden state h and cell c, (B, hidden) each."""
         gates = self.cell(torch.cat([self.features(x), u, h], dim=-1))
         forget, write, read, candidate = gates.chunk(4, dim=-1)
-        c = forget.sigmoid() * c + write.sigmoid() * sigmoid_tanh(candidate)
-        return read.sigmoid() * sigmoid_tanh(c), c
+        c = forget.sigmoid() * c + write.sigmoid() * candidate.tanh()
+        return read.sigmoid() * c.tanh(), c
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error of the states over the whole future, on the model's own predictions."""

@@ -57,17 +57,6 @@ def in_blocks(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
 
 
-def sigmoid_tanh(a: Tensor) -> Tensor:
-    """tanh(a) as 2 sigmoid(2 a) - 1: torch's tanh is ten times slower on a CPU."""
-    return 2 * torch.sigmoid(2 * a) - 1
-
-
-def gated(filtered: Tensor, gate: Tensor) -> Tensor:
-    """tanh(filtered) . sigmoid(gate) in few operations, with tanh as in ``sigmoid_tanh``."""
-    gate = torch.sigmoid(gate)
-    return torch.addcmul(-gate, torch.sigmoid(2 * filtered), gate, value=2)
-
-
 class GatedLayer(nn.Module):
     """One dilated causal layer with the gated activation of Eq. 1, a residual and a skip connection.
 
@@ -86,7 +75,7 @@ class GatedLayer(nn.Module):
     def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
         filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
-        residual, skip = self.out(gated(filtered, gate)).chunk(2, dim=-1)
+        residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
         return now + residual if self.residual else residual, skip if self.skip else torch.zeros_like(skip)
 
 
@@ -129,10 +118,11 @@ class CausalDecoder(nn.Module):
             head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
             self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
 
-    def forward(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """(B, P, input_dim), (B, dz) -> (B, P, output_dim)."""
-        _, total = self._parallel(inputs, z, len(self.layers))
-        return self._out(total, inputs)
+    def forward(self, inputs: Tensor, z: Tensor, n: int | None = None) -> Tensor:
+        """(B, P, input_dim), (B, dz) -> (B, n, output_dim): at the last ``n`` positions, or at all."""
+        first = 0 if n is None else inputs.shape[1] - n
+        _, skips = self._parallel(inputs, z, inputs.shape[1] - first)
+        return self._out(reduce(torch.add, skips), inputs[:, first:])
 
     def last(self, inputs: Tensor, z: Tensor) -> Tensor:
         """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, output_dim).
@@ -158,7 +148,7 @@ class CausalDecoder(nn.Module):
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
-        layer_inputs, _ = self._parallel(inputs, z, len(self.layers) - 1)  # the last layer's output is not kept
+        layer_inputs, _ = self._parallel(inputs, z, 0)
         return [
             list(F.pad(s, (0, 0, dilation, 0))[:, -dilation:].unbind(1))
             for dilation, s in zip(self.dilations, layer_inputs, strict=True)
@@ -177,18 +167,25 @@ class CausalDecoder(nn.Module):
     def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
         return self.head(torch.cat([total, inputs], dim=-1) if self.direct else total)
 
-    def _parallel(self, inputs: Tensor, z: Tensor, n_layers: int) -> tuple[list[Tensor], Tensor]:
-        """The inputs of the first ``n_layers`` layers and of the one after them, and the sum of their skips."""
-        layer_inputs = [self.inlet(inputs)]  # (B, P, C)
+    def _parallel(self, inputs: Tensor, z: Tensor, n: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Each layer's inputs, as far as the outputs at the last ``n`` positions see them, and its skips there.
+
+        Going down from the last layer, ``owed`` is how many last positions of a layer's inputs are needed.
+        """
+        owed = [n]
+        for dilation in reversed(self.dilations):
+            owed.insert(0, min(inputs.shape[1], owed[0] + dilation))
+        s = self.inlet(inputs[:, inputs.shape[1] - owed[0] :])  # (B, P, C)
+        layer_inputs, skips = [s], []
         codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
-        total = torch.zeros_like(layer_inputs[0])
-        for layer, dilation, code in list(zip(self.layers, self.dilations, codes, strict=True))[:n_layers]:
-            s = layer_inputs[-1]
-            earlier = F.pad(s, (0, 0, dilation, 0))[:, : s.shape[1]]
-            s, skip = layer(earlier, s, code)
+        for layer, dilation, code, now in zip(self.layers, self.dilations, codes, owed[1:], strict=True):
+            if layer is self.layers[-1] and not n:
+                break
+            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[:, :now]  # zeros before the first position
+            s, skip = layer(earlier, s[:, s.shape[1] - now :], code)
             layer_inputs.append(s)
-            total = total + skip
-        return layer_inputs, total
+            skips.append(skip[:, now - n :])
+        return layer_inputs, skips
 
 
 class Encoder(nn.Module):

@@ -39,7 +39,7 @@ from tsmlib.checkpoint import Progress, TrainingStopped
 from tsmlib.collect import Controller
 from tsmlib.disk import only_writer
 from tsmlib.dynamics import DynamicsModel, stepper
-from tsmlib.nets import Features, Noise, SeparateNoise, gated, standard_normal
+from tsmlib.nets import Features, Noise, SeparateNoise, standard_normal
 from tsmlib.prior import ActionPrior
 from tsmlib.rewards import Reward
 from tsmlib.trajectory import Segment, initial_past
@@ -211,7 +211,7 @@ class SegmentPolicy(nn.Module):
         for taps, out, goal, inputs in zip(self.taps, self.outs, goals, carried, strict=True):
             inputs.append(s)
             filtered, gate = (taps(torch.cat([inputs.popleft(), s], dim=-1)) + goal).chunk(2, dim=-1)
-            residual, skip = out(gated(filtered, gate)).chunk(2, dim=-1)
+            residual, skip = out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
             s = s + residual
             skips.append(skip)
         return reduce(torch.add, skips)

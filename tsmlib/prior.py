@@ -82,10 +82,9 @@ class ActionPrior(nn.Module):
 
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
         """P(U+ | U-, z) with the true actions as inputs, all positions at once: (B, H, du)."""
-        past, future = window.past.actions, window.future.actions
+        past, future, n = window.past.actions, window.future.actions, window.future.actions.shape[1]
         before = torch.cat([past, future[:, :-1]], dim=1)
-        step = self.decoder(before / self.std, z)[:, -future.shape[1] :]
-        return (before[:, -future.shape[1] :] + self.std * step).clamp(-1, 1)
+        return (before[:, -n:] + self.std * self.decoder(before / self.std, z, n)).clamp(-1, 1)
 
     def plan(self, past_actions: Tensor, z: Tensor) -> Tensor:
         """Chain segments (Eq. 3): past actions (B, L, du) and codes (B, K, dz) -> actions (B, K H, du)."""

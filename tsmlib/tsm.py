@@ -100,7 +100,7 @@ class TSM(nn.Module):
         (past, future), n = window, window.future.actions.shape[1]
         before = torch.cat([past.states, future.states[:, :-1]], dim=1)  # x_{t-L+1} .. x_{t+K-1}
         actions = torch.cat([past.actions[:, 1:], future.actions], dim=1)  # the action taken in each of them
-        increments = self.decoder(self._inputs(before, actions), z)[:, -n:]
+        increments = self.decoder(self._inputs(before, actions), z, n)
         return before[:, -n:] + self.features.step_std * increments
 
     def encode(self, states: Tensor) -> tuple[Tensor, Tensor]:
