@@ -53,7 +53,7 @@ def fit(
     """
     if steps < 1 or batch_size < 1 or validate_every < 1:
         raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
-    optimizer = torch.optim.Adam(model.parameters(), lr=lr)
+    optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
     state = Progress(model, optimizer)
     identity = dict(
         past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final,
