@@ -33,5 +33,8 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Notebooks last and in order, each with its cells in order; the longest test first, beside the others under -n."""
     items.sort(
-        key=lambda item: (item.path.name != "test_notebooks.py", str(item.path) * (item.path.suffix == ".ipynb"))
+        key=lambda item: (
+            item.path.name != "test_notebooks.py",
+            str(item.path) if item.path.suffix == ".ipynb" else "",
+        )
     )
