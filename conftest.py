@@ -17,7 +17,7 @@ def notebooks_run(config: pytest.Config) -> bool:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    for name in ("TSM_SCALE", "TSM_RUN_DIR"):
+    for name in ("TSM_SCALE", "TSM_RUN_DIR", "TSM_DEVICE"):
         os.environ.pop(name, None)
     os.environ["TQDM_DISABLE"] = "1"
     if notebooks_run(config):  # the kernels inherit this process's environment

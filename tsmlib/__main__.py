@@ -8,6 +8,7 @@ Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad argume
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("notebook", help=f"{names}, or all")
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
+    run.add_argument("--device", default="", help="where models are trained and rolled out: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
@@ -62,6 +64,8 @@ def _run(arguments: argparse.Namespace) -> int:
             f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
         )
     seed = parameters.convert("seed", arguments.seed)
+    if parameters.check("device", arguments.device, origin="--device"):
+        os.environ["TSM_DEVICE"] = arguments.device  # for the notebooks' kernels and their workers
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")

@@ -269,7 +269,7 @@ class Ensemble(nn.Module):
         future, scale = window.future, self.features.step_std
         tuples = [part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)]
         share = -(-len(tuples[0]) // self.members)
-        index = torch.randint(len(tuples[0]), (self.members, share), generator=generator, device=scale.device)
+        index = torch.randint(len(tuples[0]), (self.members, share), generator=generator)
         x, u, after = (part[index] for part in tuples)
         mean, log_variance = self.increments(x, u)
         moving = self.features.moving

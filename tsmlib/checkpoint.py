@@ -81,7 +81,7 @@ class Progress:
         tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
         tensors |= {f"adam.{i}.{name}": tensor for i, moments in adam.items() for name, tensor in moments.items()}
         header = dict(
-            identity=identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve), made_by=provenance(),
+            identity=identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve), made_by=self._made_by(),
             best_step=self.best_step, best_loss=self.best_loss,
         )  # fmt: skip
         save_generation(folder, self.step, tensors, header=header)
@@ -89,7 +89,7 @@ class Progress:
     def load(self, folder: Path, identity: dict[str, Any]) -> None:
         """Go on from the newest whole generation in ``folder``, if there is one.
 
-        Says and records what differs in code, libraries, processor or threads. StoreError for another run's.
+        Says and records what differs in code, libraries, processor, threads or device. StoreError for another run's.
         """
         if (old := folder.with_name(f"{folder.name}.safetensors")).exists():
             raise StoreError(
@@ -113,7 +113,7 @@ class Progress:
             for name, tensor in groups["adam"].items():
                 index, _, moment = name.partition(".")
                 moments.setdefault(int(index), {})[moment] = tensor
-            curve, before, now = type(self.curve)(**header["curve"]), {**header["made_by"]}, provenance()
+            curve, before, now = type(self.curve)(**header["curve"]), {**header["made_by"]}, self._made_by()
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:
@@ -133,6 +133,9 @@ class Progress:
                 "uninterrupted run; this is noted with the model.",
                 stacklevel=3,
             )
+
+    def _made_by(self) -> dict[str, Any]:
+        return {**provenance(), "device": next(self.model.parameters()).device.type}
 
 
 def save_generation(folder: Path, number: int, tensors: Mapping[str, Tensor], *, header: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from tsmlib.nets import Noise
+from tsmlib.nets import Noise, beside
 from tsmlib.trajectory import Segment, Window
 
 Step = Callable[[Tensor], Tensor]  # an action (B, du) -> the state (B, dx) that it leads to
@@ -37,15 +37,17 @@ class DynamicsModel(Protocol):
 def rollout(model: DynamicsModel, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
     """Chain segments over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
 
-    Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps.
+    Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps. What
+    is given may be on another device than the model; the states are where the actions are.
     """
     _require_past(model, past)
-    predicted = []
+    home, (*known, actions) = actions.device, beside(model, *past, actions)
+    past, predicted = Segment(*known), []
     for segment_actions in actions.split(model.segment_len, dim=1):
         states = model.predict_segment(past.last(model.past_len), segment_actions, generator=generator)
         predicted.append(states)
         past = past.last(model.past_len).then(Segment(states, segment_actions))
-    return torch.cat(predicted, dim=1)
+    return torch.cat(predicted, dim=1).to(home)
 
 
 def stepper(model: DynamicsModel, past: Segment, *, generator: Noise | None = None) -> Step:

@@ -40,14 +40,20 @@ Noise = torch.Generator | SharedNoise | SeparateNoise
 
 
 def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
-    """Draw N(0, 1) of ``shape`` with the device and type of ``like``."""
+    """Draw N(0, 1) of ``shape`` with the device and type of ``like``: the same numbers on any device."""
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])
         return torch.cat([standard_normal(share, generator, like) for generator in noise.generators])
     if isinstance(noise, SharedNoise):
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
-    return torch.randn(shape, generator=noise, device=like.device, dtype=like.dtype)
+    return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(like.device)
+
+
+def beside(model: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """``tensors`` on the device of the model's weights; as they are where it has none."""
+    weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
+    return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
 
 
 def in_blocks(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
@@ -140,7 +146,7 @@ class CausalDecoder(nn.Module):
             at = {p: i for i, p in enumerate(held)}
             s = F.pad(s, (0, 0, 0, 1))  # zeros stand for what lies before the first position
             taken = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
-            earlier, now = s.index_select(1, torch.tensor(taken, device=s.device)).chunk(2, dim=1)
+            earlier, now = s.index_select(1, torch.tensor(taken).to(s.device)).chunk(2, dim=1)
             s, skip = layer(earlier, now, code)
             skips.append(skip[:, 0])
             held = positions

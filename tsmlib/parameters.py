@@ -25,6 +25,7 @@ MODELS = (
     *("tsm+full", "tsm+plain", "tsm+z4", "tsm+z16", "tsm+h1", "tsm+h20"),
 )
 LONGEST = 1000  # characters
+_DEVICE = re.compile(r"(cpu|cuda(:[0-9]{1,3})?)?", re.ASCII)
 _RESTORE = "Restore it: git checkout -- notebooks"
 
 
@@ -65,6 +66,7 @@ def _is_folder(value: str) -> bool:
 SCHEMA: dict[str, Rule] = {
     "scale": _one_of(*SCALES),
     "seed": _whole(0, 2**31 - 1),
+    "device": Rule(str, "cpu, cuda, or one of several as in cuda:1", lambda value: bool(_DEVICE.fullmatch(value))),
     "run_dir": Rule(
         str, "an absolute path, or one inside the repository, without '..', a leading '~', control characters or names "
         "that Windows reserves", _is_folder,

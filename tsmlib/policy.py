@@ -39,7 +39,7 @@ from tsmlib.checkpoint import Progress, TrainingStopped
 from tsmlib.collect import Controller
 from tsmlib.disk import only_writer
 from tsmlib.dynamics import DynamicsModel, stepper
-from tsmlib.nets import Features, Noise, SeparateNoise, standard_normal
+from tsmlib.nets import Features, Noise, SeparateNoise, beside, standard_normal
 from tsmlib.prior import ActionPrior
 from tsmlib.rewards import Reward
 from tsmlib.trajectory import Segment, initial_past
@@ -224,10 +224,12 @@ def controller(policy: Policy, target: Tensor, *, noise: float = 0.0, generator:
     """
 
     def control(past: Segment) -> Tensor:
-        shape = (len(target), policy.output_dim)
-        drawn = None if generator is None else noise * standard_normal(shape, generator, target)
+        states, actions, goal = beside(policy, *past, target)
+        shape = (len(goal), policy.output_dim)
+        drawn = None if generator is None else noise * standard_normal(shape, generator, goal)
         with torch.no_grad():
-            return policy.begin(past, target)(past.states[:, -1], past.actions[:, -1], drawn)[:, None]
+            act = policy.begin(Segment(states, actions), goal)
+            return act(states[:, -1], actions[:, -1], drawn)[:, None].to(target.device)
 
     return control
 
@@ -244,10 +246,12 @@ def imagine(
 ) -> Segment:
     """What the model says would happen if the policy acted from ``start`` (R, dx): states (R, T, dx), actions.
 
-    Differentiable in the policy's parameters. No generator: no noise, and the model's mode.
+    Differentiable in the policy's parameters. No generator: no noise, and the model's mode. Policy and model are on one
+    device, ``start`` and what is returned on any.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
+    home, (start, target) = start.device, beside(policy, start, target)
     past = initial_past(start, max(policy.past_len, model.past_len), policy.action_dim)
     drawn: Sequence[Tensor | None] = [None] * horizon
     if generator is not None:
@@ -260,7 +264,7 @@ def imagine(
         x = step(u)
         states.append(x)
         actions.append(u)
-    return Segment(torch.stack(states, dim=1), torch.stack(actions, dim=1))
+    return Segment(torch.stack(states, dim=1).to(home), torch.stack(actions, dim=1).to(home))
 
 
 @dataclass

@@ -44,6 +44,7 @@ class Run:
     scale: str
     seed: int
     dir: Path
+    device: str = "cpu"  # where models and policies are trained, and models rolled out
 
     @property
     def data(self) -> Path:
@@ -91,11 +92,13 @@ def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "",
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
     run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
-    others: the notebook's other parameters, checked against the same schema.
+    others: the notebook's other parameters, checked against the same schema. The run's device is TSM_DEVICE, which
+    ``--device`` sets, and without it the processor.
     Raises ParameterError naming the value and what is allowed.
     """
     schema.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
+    device = _present(_setting("device", "", "TSM_DEVICE", "cpu"))
     base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
     defaults = schema.declared(notebooks()[notebook[3:]]) if others and notebook[3:] in notebooks() else {}
     for name, value in others.items():
@@ -107,13 +110,28 @@ def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "",
         if isinstance(error, ParameterError):
             raise
         raise ParameterError(f"run_dir is {str(base)[:80]!a}, expected the name of a folder: {error}.") from None
-    return Run(notebook, scale, seed, base / scale / f"seed{seed}")
+    return Run(notebook, scale, seed, base / scale / f"seed{seed}", device)
 
 
 def _setting(name: str, value: str, variable: str, default: str) -> str:
     """A parameter, else its environment variable, else ``default``."""
     schema.check(name, value)
     return value or schema.check(name, os.environ.get(variable, ""), origin=variable) or default
+
+
+def _present(device: str) -> str:
+    """``device``, if this machine has it."""
+    if device == "cpu":
+        return device
+    import torch  # heavy, and not needed otherwise
+
+    found, asked = torch.cuda.device_count() if torch.cuda.is_available() else 0, torch.device(device).index or 0
+    if asked >= found:
+        raise ParameterError(
+            f"device is {device}, but torch {torch.__version__} finds {found} such devices here. Leave --device (or "
+            "TSM_DEVICE) out, or install a torch that is built for this machine's: https://pytorch.org/get-started"
+        )
+    return device
 
 
 # Notebooks ------------------------------------------------------------------------------------------------------------

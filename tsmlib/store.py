@@ -453,7 +453,7 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     """SHA-256 of named arrays, by name and content."""
     found = hashlib.sha256()
     for name, tensor in sorted(tensors.items()):
-        found.update(name.encode() + tensor.detach().contiguous().numpy().tobytes())
+        found.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
 
 

@@ -42,6 +42,7 @@ def fit(
     patience: int = 0,  # validations without improvement before stopping early; 0: never
     seed: int = 0,
     bf16: bool = False,  # matrix products in bfloat16, weights in float32
+    device: str = "cpu",  # where it is trained: "cuda", for one; the model comes back to the processor
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
 ) -> Curve:
@@ -53,6 +54,8 @@ def fit(
     """
     if steps < 1 or batch_size < 1 or validate_every < 1:
         raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
+    kind = torch.device(device).type
+    model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
     state = Progress(model, optimizer)
     identity = dict(
@@ -62,14 +65,15 @@ def fit(
         data=[_digest(data) for data in (train, validation)],
     )  # fmt: skip
     generator = torch.Generator()
-    held_out = fixed_windows(validation, past_len, future_len)
+    held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, past_len, future_len)))
     draw = batches(
-        train.padded(past_len),
+        train.padded(past_len).to(device),
         past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator,
     )  # fmt: skip
     with contextlib.ExitStack() as stack:
-        torch.set_autocast_enabled("cpu", False)  # or this on
-        stack.callback(torch.set_autocast_enabled, "cpu", False)
+        stack.callback(model.to, "cpu")
+        torch.set_autocast_enabled(kind, False)  # or this on
+        stack.callback(torch.set_autocast_enabled, kind, False)
         if checkpoint is not None:
             stack.enter_context(only_writer(checkpoint, f"training, seed {seed}"))
             state.load(checkpoint, identity)
@@ -84,7 +88,7 @@ def fit(
             for group in optimizer.param_groups:
                 group["lr"] = schedule(step, steps, lr, lr_final, warmup)
             torch.clear_autocast_cache()  # which one left on would never clear
-            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            with torch.autocast(kind, torch.bfloat16, enabled=bf16):
                 value = loss(next(draw), generator)
             if not torch.isfinite(value):
                 raise state.stopped("training loss", value.item(), f"{step} of {steps}", lr)

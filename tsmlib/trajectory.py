@@ -36,6 +36,10 @@ class Segment(NamedTuple):
         """The last ``length`` steps, as the past of what follows."""
         return Segment(self.states[:, -length:], self.actions[:, -length:])
 
+    def to(self, device: torch.device | str) -> Segment:
+        """This segment on ``device``."""
+        return Segment(self.states.to(device), self.actions.to(device))
+
 
 class Window(NamedTuple):
     """A past segment X-, U- (B, L, .) and the future X+, U+ (B, K, .) that followed it."""

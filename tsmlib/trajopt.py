@@ -26,7 +26,7 @@ from tqdm.auto import tqdm
 
 from tsmlib.collect import collect, once, smooth_torques
 from tsmlib.dynamics import DynamicsModel, rollout
-from tsmlib.nets import SharedNoise
+from tsmlib.nets import SharedNoise, beside
 from tsmlib.prior import ActionPrior
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment
@@ -113,19 +113,20 @@ class LatentActions:
         rest = actions[:, steps : steps + space.shape[0] * prior.segment_len]
         missing = space.shape[0] * prior.segment_len - rest.shape[1]
         rest = torch.cat([rest, rest[:, -1:].expand(-1, missing, -1)], dim=1)
-        codes, _ = prior.encode(rest.reshape(-1, prior.segment_len, rest.shape[2]))
-        return space, codes.unflatten(0, (len(rest), -1))
+        codes, _ = prior.encode(*beside(prior, rest.reshape(-1, prior.segment_len, rest.shape[2])))
+        return space, codes.to(parameters.device).unflatten(0, (len(rest), -1))
 
     def _whole(self, parameters: Tensor) -> Tensor:
         """Actions (C, B, K H, du)."""
         n, n_targets = parameters.shape[:2]
         start = self._before(n_targets).repeat(n, 1, 1)
-        return self.prior.plan(start, parameters.flatten(0, 1)).unflatten(0, (n, n_targets))
+        actions = self.prior.plan(*beside(self.prior, start, parameters.flatten(0, 1)))
+        return actions.to(parameters.device).unflatten(0, (n, n_targets))
 
     def _before(self, n_targets: int) -> Tensor:
         if self.past is not None:
             return self.past
-        return self.prior.std.new_zeros(n_targets, self.prior.past_len, len(self.prior.std))
+        return torch.zeros(n_targets, self.prior.past_len, len(self.prior.std), dtype=self.prior.std.dtype)
 
 
 @dataclass(frozen=True)

@@ -140,14 +140,14 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
             past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr,
             batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
             validate_every=run.pick(smoke=10, laptop=250, paper=250), seed=run.seed, bf16=bf16_pays(model, stage),
-            checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
+            device=run.device, checkpoint=checkpoint, progress=f"{short(env)} {model}: {stage.loss}",
         )  # fmt: skip
         curves[stage.loss] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
         "schedule": _plain(schedule(run, env, model)), "torch": torch.__version__,
         "bf16": [stage.loss for stage in schedule(run, env, model) if bf16_pays(model, stage)],
-        "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+        "threads": torch.get_num_threads(), "device": run.device, "finished": time.strftime("%Y-%m-%d"),
         "seconds": sum(c["seconds"][-1] for c in curves.values()),  # of processor time
         "inputs": _inputs(run, env, path),
     }  # fmt: skip

@@ -83,6 +83,8 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
         return kept
     if task.own is None and model == "oracle" and run.scale == "laptop" and (kept := _kept(shipped, task, posed)):
         return kept
+    for net in nets.values():
+        net.to(run.device)
     bar = f"{task.name}: {model}, {planner} over {prior}"
     if every:
         first = plan(run, task, model, planner, prior)
@@ -104,7 +106,7 @@ def along_the_way(
 ) -> dict[int, Trial]:
     """What a long optimisation promises and earns along its way: iteration -> trial (``trajopt.stopped``)."""
     whole = plan(run, task, model, planner, prior, iterations=iterations)
-    nets = {word: load_or_train(run, task.env, word)[0] for word in ("prior", model)}
+    nets = {word: load_or_train(run, task.env, word)[0].to(run.device) for word in ("prior", model)}
     space, judge = _space(task, nets if prior == "codes" else {}), _judge(run, task, nets[model])
     return {i: execute(task, stopped(whole, i, judge, task.reward, space)) for i in at}
 

@@ -61,7 +61,7 @@ def learn(
     policy.features.fit(torch.from_numpy(data.states))
     checkpoint = own.with_name(f"policy-{model}-{prior}.checkpoint")
     curve = improve(
-        policy, net, rewards.reach if task.name == "reach" else rewards.push,
+        policy.to(run.device), net.to(run.device), rewards.reach if task.name == "reach" else rewards.push,
         episodes_from(torch.from_numpy(data.states[:, 0])), horizon=task.horizon, iterations=budget["iterations"],
         episodes=EPISODES[run.scale], seed=1000 * run.seed,
         record_every=max(1, budget["iterations"] // 10), measure=lambda p: assess(p, net, task, seed=run.seed + 1),
@@ -70,9 +70,10 @@ def learn(
     header = {
         "fingerprint": fingerprint(task.env), "made_from": made_from, "budget": budget, "model": model, "prior": prior,
         "seed": run.seed, "scale": run.scale, "curve": asdict(curve), "seconds": curve.seconds[-1],
-        "torch": torch.__version__, "threads": torch.get_num_threads(), "finished": time.strftime("%Y-%m-%d"),
+        "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
+        "finished": time.strftime("%Y-%m-%d"),
     }  # fmt: skip
-    store.save_model(own, policy, header)
+    store.save_model(own, policy.cpu(), header)
     shutil.rmtree(checkpoint)
     return policy, store.read_header(own)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -38,8 +39,9 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
            for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
     if not path.exists() or store.read_header(path).get("made_from") != made_from:
+        features = deepcopy(net.features)  # what is scored is on the processor
         found = evaluate.score(
-            net, net.features, test, held_out, samples=samples, seed=run.seed, **options,
+            net.to(run.device), features, test, held_out, samples=samples, seed=run.seed, **options,
             progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
         )  # fmt: skip
         tensors = {f"values.{metric}": value for metric, value in found.values.items()}
