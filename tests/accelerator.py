@@ -1,8 +1,8 @@
 """An accelerator that the processor imitates, to see that nothing computes with tensors of two devices.
 
 Its tensors say that they are on the device "imitated" and hold their numbers in a tensor of the processor. An operation
-that meets one of them beside a tensor of the processor fails, as it would on a real accelerator: but for single numbers,
-and for whole numbers that index.
+that meets one of them beside a tensor of the processor fails, as on a real accelerator: but for single numbers, and for
+whole numbers that index.
 """
 
 from __future__ import annotations
