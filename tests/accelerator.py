@@ -1,8 +1,9 @@
 """An accelerator that the processor imitates, to see that nothing computes with tensors of two devices.
 
-Its tensors say that they are on the device "imitated" and hold their numbers in a tensor of the processor. An operation
-that meets one of them beside a tensor of the processor fails, as on a real accelerator: but for single numbers, and for
-whole numbers that index.
+Its tensors say that they are on the device "imitated" and hold their numbers in a tensor of the processor. As on CUDA,
+an operation fails that meets one of them beside a tensor of the processor, but for a single number in elementwise
+operations and for the index in ``x[index]``; and so does drawing on it from a generator of the processor. There is no
+half precision on it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 DEVICE = "imitated"
+INDEXED = ("aten::index", "aten::_unsafe_index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 
 
 class _Backend(_DummyBackendModule):
@@ -71,14 +73,17 @@ def _run(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
     there = any(isinstance(tensor, There) for tensor in tensors)
     if there and name not in ("aten::_to_copy", "aten::copy_"):
+        free = tree_leaves(args[1]) if name in INDEXED else []
         for tensor in tensors:
-            indexes = name.startswith("aten::index") and tensor.dtype == torch.int64
-            if not (isinstance(tensor, There) or indexes or not tensor.ndim):
+            single = not tensor.ndim and torch.Tag.pointwise in operation.tags
+            if not (isinstance(tensor, There) or single or any(tensor is index for index in free)):
                 raise RuntimeError(
                     f"{name}: a tensor of the processor, {tuple(tensor.shape)}, beside the accelerator's"
                 )
     if kwargs.get("device") is not None:
         there, kwargs = torch.device(kwargs["device"]).type == DEVICE, {**kwargs, "device": "cpu"}
+    if there and isinstance(drawn := kwargs.get("generator"), torch.Generator) and drawn.device.type != DEVICE:
+        raise RuntimeError(f"{name}: a generator of the processor draws on the accelerator")
     numbers, named = tree_map(lambda leaf: leaf.here if isinstance(leaf, There) else leaf, (args, kwargs))
     found = operation(*numbers, **named)
     if not there:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 import torch
@@ -13,7 +16,7 @@ from accelerator import DEVICE, Accelerator
 from test_axioms import DU, MODELS, Case, motion, new_prior
 from torch import Tensor
 
-from tsmlib import evaluate, runs
+from tsmlib import evaluate, runs, study
 from tsmlib.__main__ import main
 from tsmlib.dynamics import rollout
 from tsmlib.policy import OneStepPolicy, SegmentPolicy, controller, improve
@@ -22,28 +25,36 @@ from tsmlib.train import fit
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 from tsmlib.trajopt import DirectActions, LatentActions, Planner, Space, adam, cem, through_model
 
-PROCESSOR, HORIZON, TARGETS = "cpu", 20, 3
+T = TypeVar("T")
+
+PROCESSOR, HORIZON, TARGETS, REACHER = "cpu", 20, 3, "tsm/Reacher-v0"
 
 
 @pytest.fixture(params=[DEVICE, *["cuda"] * torch.cuda.is_available()])
-def device(request: pytest.FixtureRequest) -> Iterator[str]:
+def device(request: pytest.FixtureRequest) -> str:
     """An accelerator: one that the processor imitates, and a real one where there is one."""
-    if request.param != DEVICE:
-        yield request.param
-        return
-    with Accelerator() as accelerator:
-        yield DEVICE
-    assert accelerator.count, "nothing ran on it"
-
-
-@pytest.fixture(params=MODELS.values(), ids=MODELS.keys())
-def case(request: pytest.FixtureRequest) -> Case:
     return request.param
 
 
-def agree(found: Tensor, expected: Tensor) -> bool:
-    """On the same device, and equal up to rounding."""
-    return found.device == expected.device and torch.allclose(found, expected, rtol=1e-3, atol=1e-4)
+def on(place: str, make: Callable[[str], T]) -> T:
+    """``make(place)`` while that is a device, which it uses."""
+    if place != DEVICE:
+        return make(place)
+    with Accelerator() as accelerator:
+        made = make(place)
+    assert accelerator.count, "nothing ran on it"
+    return made
+
+
+def agree(found: Tensor, expected: Tensor, device: str) -> bool:
+    """On the same device, and equal up to rounding: the same, imitated, or that of a real accelerator."""
+    close = 1e-6 if device == DEVICE else 1e-3
+    return found.device == expected.device and torch.allclose(found, expected, rtol=close, atol=close)
+
+
+@pytest.fixture(params=["tsm", "tsm, direct", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"])
+def case(request: pytest.FixtureRequest) -> Case:
+    return MODELS[request.param]
 
 
 def episodes(case: Case, n: int, seed: int) -> Trajectories:
@@ -59,6 +70,10 @@ def episodes(case: Case, n: int, seed: int) -> Trajectories:
     )
 
 
+def weights(model: Any) -> Tensor:
+    return torch.cat([parameter.detach().flatten() for parameter in model.parameters()])
+
+
 def new_model(name: str = "tsm") -> Any:
     return MODELS[name].model(torch.float32)
 
@@ -70,14 +85,20 @@ def to_the_origin(states: Tensor, actions: Tensor) -> Tensor:
 def test_a_model_trained_on_it_comes_back_the_same(case: Case, device: str) -> None:
     data, held_out = episodes(case, 12, 0), episodes(case, 4, 1)
     for loss, _ in case.losses:
-        trained = {}
-        for place in (PROCESSOR, device):
+
+        def trained(place: str, loss: str = loss) -> tuple[Tensor, Tensor]:
             model = case.model(torch.float32)
-            settings: dict[str, Any] = dict(steps=2, batch_size=4, validate_every=2, device=place)
-            fit(model, getattr(model, loss), data, held_out, past_len=model.past_len, future_len=10, **settings)
-            trained[place] = model.state_dict()
-        for name, expected in trained[PROCESSOR].items():
-            assert agree(trained[device][name], expected), (loss, name)
+            curve = fit(
+                model, getattr(model, loss), data, held_out, past_len=model.past_len, future_len=10,
+                steps=2, batch_size=4, validate_every=2, warmup=0, device=place,
+            )  # fmt: skip
+            return torch.tensor([curve.train, curve.validation]), weights(model)
+
+        (there, found), (here, expected) = on(device, trained), on(PROCESSOR, trained)
+        assert agree(there, here, device), loss
+        moved = expected - weights(case.model(torch.float32))
+        assert moved.abs().max() > 1e-3
+        assert (found - expected).norm() < 0.01 * moved.norm(), loss
 
 
 def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, tmp_path: Path) -> None:
@@ -97,39 +118,49 @@ def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, t
                     raise KeyboardInterrupt
                 return model.loss(window, generator)
 
-            settings: dict[str, Any] = dict(steps=4, batch_size=8, validate_every=2, device=place, checkpoint=folder)
-            try:
-                fit(model, loss, data, held_out, past_len=10, future_len=10, **settings)
-            except KeyboardInterrupt:
-                assert next(model.parameters()).device.type == PROCESSOR
+            def run(place: str, model: Any = model, loss: Any = loss) -> None:
+                fit(
+                    model, loss, data, held_out, past_len=10, future_len=10, checkpoint=folder,
+                    steps=4, batch_size=8, validate_every=2, warmup=0, device=place,
+                )  # fmt: skip
+
+            with suppress(KeyboardInterrupt):
+                on(place, run)
+            assert next(model.parameters()).device.type == PROCESSOR
         return model.state_dict()
 
     expected = trained(PROCESSOR)
+    again = trained(device, device)
     with pytest.warns(UserWarning, match="device"):
-        moved = trained(device, PROCESSOR)
-    for found in (trained(device, device), moved):
-        assert all(agree(found[name], expected[name]) for name in expected)
+        elsewhere = trained(device, PROCESSOR), trained(PROCESSOR, device)
+    for found in (again, *elsewhere):
+        assert all(torch.allclose(found[name], expected[name], atol=1e-4) for name in expected)
 
 
 def test_a_model_there_is_rolled_out_from_here(case: Case, device: str) -> None:
     model, seen = case.model(torch.float32), motion(case, 6, 40)
     past = Segment(*(part[:, :10].float() for part in seen)).last(model.past_len)
     actions = seen.actions[:, 10:].float()
-    expected = [rollout(model, past, actions, generator=g) for g in (None, torch.Generator().manual_seed(0))]
-    model.to(device)
-    found = [rollout(model, past, actions, generator=g) for g in (None, torch.Generator().manual_seed(0))]
-    assert all(agree(a, b) for a, b in zip(found, expected, strict=True))
+
+    def imagined(place: str) -> list[Tensor]:
+        model.to(place)
+        return [rollout(model, past, actions, generator=g) for g in (None, torch.Generator().manual_seed(0))]
+
+    here, there = on(PROCESSOR, imagined), on(device, imagined)
+    assert all(agree(a, b, device) for a, b in zip(there, here, strict=True))
 
 
 def test_it_scores_as_the_processor_does(case: Case, device: str) -> None:
     data, held_out = episodes(case, 6, 2), episodes(case, 5, 3)
-    model = case.model(torch.float32)
     features = case.model(torch.float32).features
-    there, here = (
-        evaluate.score(model.to(place), features, data, held_out, samples=3, horizon=20)
-        for place in (device, PROCESSOR)
-    )
-    assert all(agree(there.values[metric], here.values[metric]) for metric in here.values)
+
+    def scores(place: str) -> evaluate.Scores:
+        return evaluate.score(
+            case.model(torch.float32).to(place), features, data, held_out, samples=3, horizon=20
+        )  # fmt: skip
+
+    there, here = on(device, scores), on(PROCESSOR, scores)
+    assert all(agree(there.values[metric], here.values[metric], device) for metric in here.values)
 
 
 @pytest.mark.parametrize("planner", [partial(adam, iterations=1), partial(cem, candidates=4, elites=2, iterations=1)])
@@ -145,7 +176,7 @@ def test_it_finds_the_same_plan(planner: Planner, over: str, device: str) -> Non
         left, parameters = space.after(plan.parameters, 7)  # what a closed loop goes on from
         return plan.actions, plan.predicted, left.decode(parameters[None])
 
-    assert all(agree(there, here) for there, here in zip(found(device), found(PROCESSOR), strict=True))
+    assert all(agree(there, here, device) for there, here in zip(on(device, found), on(PROCESSOR, found), strict=True))
 
 
 @pytest.mark.parametrize("through", ["codes", "actions"])
@@ -170,22 +201,61 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
         past = Segment(*(part[:4, :10].float() for part in seen))
         return policy, controller(policy, torch.zeros(4, 2))(past)
 
-    (there, act), (here, expected) = learned(device), learned(PROCESSOR)
-    assert agree(act, expected)
+    (there, act), (here, expected) = on(device, learned), on(PROCESSOR, learned)
+    assert agree(act, expected, device)
     for a, b in zip(there.cpu().parameters(), here.parameters(), strict=True):
-        assert agree(a, b)
+        assert agree(a, b, device)
+
+
+def test_what_study_makes_there_is_what_it_makes_here(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study.models, "bf16_pays", lambda *_: False)
+
+    first = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    study.load_or_train(first, REACHER, "prior")  # would take long on an imitation
+
+    def made(place: str) -> tuple[Tensor, ...]:
+        run = replace(first, device=place, dir=tmp_path / place)
+        shutil.copytree(first.dir, run.dir)
+        task = study.task(REACHER).take(2)
+        assert study.load_or_train(run, REACHER, "onestep")[1]["device"] == place
+        plans = [
+            study.plan(run, task, "onestep", "cem", "codes"),
+            study.plan(run, task, "onestep", "adam+starts", "actions", every=25),
+        ]
+        later = study.along_the_way(run, task, "onestep", "adam", "actions", iterations=1, at=[1])[1].plan
+        assert later is not None
+        policy, header = study.learn(run, task, "onestep", "actions", copies=2, iterations=1)
+        assert header["device"] == place
+        earned = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
+        return (
+            *(plan.actions for plan in plans), *(plan.predicted for plan in (*plans, later)),
+            *study.scores(run, REACHER, "onestep").values.values(), *earned.values(),
+        )  # fmt: skip
+
+    for there, here in zip(on(device, made), on(PROCESSOR, made), strict=True):
+        assert there.device.type == PROCESSOR
+        assert torch.allclose(there, here, rtol=1e-3, atol=1e-3)
 
 
 def test_the_imitated_one_refuses_tensors_of_two_devices() -> None:
     with Accelerator():
-        there = torch.ones(3).to(DEVICE)
-        for on_it in (there + 1, there[torch.tensor([0, 2])]):
+        there, index, number = torch.ones(3).to(DEVICE), torch.tensor([0, 2]), torch.tensor(1.0)
+        for on_it in (there + number, there[index]):
             assert on_it.device.type == DEVICE
-        with pytest.raises(RuntimeError, match="a tensor of the processor"):
-            there + torch.ones(3)
+        for mix in (
+            lambda: there + torch.ones(3),
+            lambda: there.index_select(0, index),
+            lambda: torch.stack([there[0], number]),
+        ):
+            with pytest.raises(RuntimeError, match="a tensor of the processor"):
+                mix()
+        with pytest.raises(RuntimeError, match="a generator of the processor"):
+            torch.randn(3, generator=torch.Generator(), device=DEVICE)
 
 
-@pytest.mark.parametrize("word", ["tpu", "cuda:x", "gpu", "cuda:1234", "CUDA"])
+@pytest.mark.parametrize("word", ["tpu", "cuda:x", "gpu", "cuda:01", "cuda:200", "CUDA"])
 def test_an_unknown_device_is_refused(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "collect", "--device", word]) == 2
     assert f"--device is '{word}', expected cpu, cuda" in capsys.readouterr().err
@@ -194,7 +264,6 @@ def test_an_unknown_device_is_refused(word: str, capsys: pytest.CaptureFixture[s
 def test_a_device_that_is_not_there_is_refused_before_anything_starts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("TSM_DEVICE", "cpu")  # so that it is put back
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["run", "collect", "--device", "cuda"]) == 2

@@ -8,7 +8,6 @@ Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad argume
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -26,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("notebook", help=f"{names}, or all")
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
-    run.add_argument("--device", default="", help="where models are trained and rolled out: cpu (default) or cuda")
+    run.add_argument("--device", default="", help="where to train, learn, plan and imagine: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
@@ -64,8 +63,7 @@ def _run(arguments: argparse.Namespace) -> int:
             f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
         )
     seed = parameters.convert("seed", arguments.seed)
-    if parameters.check("device", arguments.device, origin="--device"):
-        os.environ["TSM_DEVICE"] = arguments.device  # for the notebooks' kernels and their workers
+    parameters.check("device", arguments.device, origin="--device")
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")
@@ -77,9 +75,9 @@ def _run(arguments: argparse.Namespace) -> int:
     chosen = list(present.values()) if word == "all" else [present[word]]
     for notebook in chosen:  # all of them, before the first one starts
         parameters.typed(notebook, given)
-        runs.resolve(notebook.stem, scale=arguments.scale, seed=seed)
+        runs.resolve(notebook.stem, scale=arguments.scale, seed=seed, device=arguments.device)
     for notebook in chosen:
-        print(runs.execute(notebook, scale=arguments.scale, seed=seed, given=given))
+        print(runs.execute(notebook, scale=arguments.scale, seed=seed, device=arguments.device, given=given))
     return 0
 
 

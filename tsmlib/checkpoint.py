@@ -113,7 +113,11 @@ class Progress:
             for name, tensor in groups["adam"].items():
                 index, _, moment = name.partition(".")
                 moments.setdefault(int(index), {})[moment] = tensor
-            curve, before, now = type(self.curve)(**header["curve"]), {**header["made_by"]}, self._made_by()
+            curve, before, now = (
+                type(self.curve)(**header["curve"]),
+                {"device": "cpu", **header["made_by"]},
+                self._made_by(),
+            )
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:
@@ -135,7 +139,8 @@ class Progress:
             )
 
     def _made_by(self) -> dict[str, Any]:
-        return {**provenance(), "device": next(self.model.parameters()).device.type}
+        device = next(self.model.parameters()).device
+        return {**provenance(), "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type}
 
 
 def save_generation(folder: Path, number: int, tensors: Mapping[str, Tensor], *, header: Mapping[str, Any]) -> None:

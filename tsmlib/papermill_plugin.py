@@ -2,7 +2,8 @@
 
 papermill imports its entry points before it reads the command line. Exactly that command, typed in a terminal for a
 notebook of this repository, gets the path where ``python -m tsmlib run control`` would put it; anything else, other
-arguments or a pipe included, is left alone. Only the standard library is imported here: papermill loads this always.
+arguments or a pipe included, is left alone. Only the standard library is imported here, papermill loads
+this always; and torch, where TSM_DEVICE names an accelerator that has to be there.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ MODELS = (
     *("tsm+full", "tsm+plain", "tsm+z4", "tsm+z16", "tsm+h1", "tsm+h20"),
 )
 LONGEST = 1000  # characters
-_DEVICE = re.compile(r"(cpu|cuda(:[0-9]{1,3})?)?", re.ASCII)
+_DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
 _RESTORE = "Restore it: git checkout -- notebooks"
 
 

@@ -229,7 +229,7 @@ def controller(policy: Policy, target: Tensor, *, noise: float = 0.0, generator:
         drawn = None if generator is None else noise * standard_normal(shape, generator, goal)
         with torch.no_grad():
             act = policy.begin(Segment(states, actions), goal)
-            return act(states[:, -1], actions[:, -1], drawn)[:, None].to(target.device)
+            return act(states[:, -1], actions[:, -1], drawn)[:, None].to(past.states.device)
 
     return control
 
@@ -247,7 +247,7 @@ def imagine(
     """What the model says would happen if the policy acted from ``start`` (R, dx): states (R, T, dx), actions.
 
     Differentiable in the policy's parameters. No generator: no noise, and the model's mode. Policy and model are on one
-    device, ``start`` and what is returned on any.
+    device; ``start`` and ``target`` may be elsewhere, and what is returned is where ``start`` is.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")

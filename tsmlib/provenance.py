@@ -18,7 +18,7 @@ LIBRARIES = ("torch", "numpy", "mujoco", "gymnasium", "pymunk", "safetensors")
 def provenance() -> dict[str, Any]:
     """Code version, library versions, processor and threads, as JSON values. No times, no paths, no names of people.
 
-    Two results with equal provenance, seed and inputs should be equal bit for bit.
+    Two results with equal provenance, seed and inputs should be equal bit for bit where the processor computed them.
     """
     return {**_FIXED, "threads": torch.get_num_threads()}
 

@@ -44,7 +44,7 @@ class Run:
     scale: str
     seed: int
     dir: Path
-    device: str = "cpu"  # where models and policies are trained, and models rolled out
+    device: str = "cpu"  # where ``study`` trains, learns, plans and imagines
 
     @property
     def data(self) -> Path:
@@ -87,18 +87,20 @@ class Run:
         return folder
 
 
-def resolve(notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", **others: Any) -> Run:
+def resolve(
+    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Any
+) -> Run:
     """The run that a notebook belongs to. Touches no file.
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
     run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
-    others: the notebook's other parameters, checked against the same schema. The run's device is TSM_DEVICE, which
-    ``--device`` sets, and without it the processor.
+    device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu.
+    others: the notebook's other parameters, checked against the same schema.
     Raises ParameterError naming the value and what is allowed.
     """
     schema.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
-    device = _present(_setting("device", "", "TSM_DEVICE", "cpu"))
+    device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
     base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
     defaults = schema.declared(notebooks()[notebook[3:]]) if others and notebook[3:] in notebooks() else {}
     for name, value in others.items():
@@ -146,7 +148,13 @@ def notebooks() -> dict[str, Path]:
 
 
 def execute(
-    notebook: Path, *, scale: str = "", seed: int = 0, given: Mapping[str, str] | None = None, progress: bool = True
+    notebook: Path,
+    *,
+    scale: str = "",
+    seed: int = 0,
+    device: str = "",
+    given: Mapping[str, str] | None = None,
+    progress: bool = True,
 ) -> Path:
     """Execute a notebook into its run's folder and return the executed copy.
 
@@ -157,7 +165,8 @@ def execute(
     defaults = schema.declared(notebook)
     values = {"scale": scale, "seed": seed, **schema.typed(notebook, given or {})}
     values = {name: values[name] for name in defaults if name in values}
-    run = resolve(notebook.stem, **{name: values[name] for name in ("scale", "seed", "run_dir") if name in values})
+    own = {name: values[name] for name in ("scale", "seed", "run_dir") if name in values}
+    run = resolve(notebook.stem, device=device, **own)
     if "scale" in values:
         values["scale"] = run.scale
     from tsmlib import store  # heavy, and not needed to refuse a parameter
@@ -168,11 +177,11 @@ def execute(
         hold.enter_context(only_writer(run.dir, run.notebook))
     except store.StoreError as error:
         raise RunError(str(error)) from None
-    with hold, _terminable():
+    with hold, _terminable(), _environment("TSM_DEVICE", run.device):
         began = time.monotonic()
         before = _stamps(run)
         status: dict[str, Any] = {"pid": os.getpid(), "started": _now(), "parameters": values}
-        status |= {"scale": run.scale, "seed": run.seed, "provenance": provenance()}
+        status |= {"scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance()}
         _note(run, {**status, "state": "running"})
         ended: dict[str, Any] = {"state": "interrupted", "error": "stopped before its end"}
         try:
@@ -294,6 +303,19 @@ def _note(run: Run, entry: Mapping[str, Any]) -> None:
             rest = {file: stated for file, stated in other["files"].items() if file not in entry["files"]}
             entries[name] = store.sealed({**other, "files": rest})
     store.write_json(path, entries)
+
+
+@contextlib.contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    """Processes that start meanwhile, a kernel for one, have ``value`` in their environment."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        os.environ.pop(name)
+        if before is not None:
+            os.environ[name] = before
 
 
 @contextlib.contextmanager

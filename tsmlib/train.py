@@ -42,7 +42,7 @@ def fit(
     patience: int = 0,  # validations without improvement before stopping early; 0: never
     seed: int = 0,
     bf16: bool = False,  # matrix products in bfloat16, weights in float32
-    device: str = "cpu",  # where it is trained: "cuda", for one; the model comes back to the processor
+    device: str = "cpu",  # where it is trained, such as "cuda"; the model comes back to the processor
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
 ) -> Curve:
@@ -54,17 +54,13 @@ def fit(
     """
     if steps < 1 or batch_size < 1 or validate_every < 1:
         raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
-    kind = torch.device(device).type
-    model.to(device)
-    optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
-    state = Progress(model, optimizer)
     identity = dict(
         past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final,
         warmup=warmup, clip=clip, validate_every=validate_every, patience=patience, seed=seed, bf16=bf16,
         loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
         data=[_digest(data) for data in (train, validation)],
     )  # fmt: skip
-    generator = torch.Generator()
+    generator, kind = torch.Generator(), torch.device(device).type
     held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, past_len, future_len)))
     draw = batches(
         train.padded(past_len).to(device),
@@ -72,6 +68,8 @@ def fit(
     )  # fmt: skip
     with contextlib.ExitStack() as stack:
         stack.callback(model.to, "cpu")
+        optimizer = torch.optim.Adam(model.to(device).parameters(), lr=lr, fused=True)
+        state = Progress(model, optimizer)
         torch.set_autocast_enabled(kind, False)  # or this on
         stack.callback(torch.set_autocast_enabled, kind, False)
         if checkpoint is not None:

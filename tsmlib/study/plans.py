@@ -97,7 +97,9 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
             "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
             "states": found.states, "predicted": found.predicted, "curve": found.curve,
         } | ({} if found.trace is None else {"trace": found.trace})  # fmt: skip
-        store.save(own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds})
+        store.save(
+            own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds, "device": run.device}
+        )
     return found
 
 

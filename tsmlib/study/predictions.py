@@ -47,7 +47,7 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
         tensors = {f"values.{metric}": value for metric, value in found.values.items()}
         tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
         tensors |= {"pit": found.pit, "outside": found.outside}
-        store.save(path, tensors, kind="scores", header={"made_from": made_from})
+        store.save(path, tensors, kind="scores", header={"made_from": made_from, "device": run.device})
     return _unpacked(store.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
 
 
