@@ -40,10 +40,14 @@ def _fixed() -> dict[str, Any]:
 def _commit(git: Path) -> str:
     """The checked-out commit, read without running git; '' outside a clone."""
     try:
+        if git.is_file():  # in a linked worktree, which names its own folder and that the folder of all
+            git = git.parent / git.read_text().removeprefix("gitdir: ").strip()
         head = (git / "HEAD").read_text().strip()
         if not head.startswith("ref: "):
             return head[:12]
         name = head.removeprefix("ref: ")
+        if (git / "commondir").exists():
+            git = git / (git / "commondir").read_text().strip()
         if (git / name).exists():
             return (git / name).read_text().strip()[:12]
         packed = (git / "packed-refs").read_text().splitlines()
