@@ -63,6 +63,16 @@ def test_a_prior_that_several_arms_share_is_trained_once(run: Run, monkeypatch: 
     assert len(asked) == len(set(asked)) == len(ENV_IDS) + 2
 
 
+def test_the_longest_trainings_begin_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, str]] = []
+    monkeypatch.setattr(study.models, "ahead", lambda run, calls, **_: asked.extend(call[1:] for call in calls))
+    study.train_ahead(run, [(env, "tsm") for env in ENV_IDS])
+    steps = [study.models.schedule(replace(run, scale="paper"), env, model)[0].steps for env, model in asked]
+    assert len(asked) == len(ENV_IDS)
+    assert asked[0][0] == "tsm/ReacherPush-v0"
+    assert steps[0] == max(steps)
+
+
 def test_only_the_paper_scale_makes_anything_ahead(run: Run) -> None:
     study.ahead(replace(run, scale="laptop"), [(write, "a"), (write, "b")])
     assert not list(run.folder("made").iterdir())

@@ -115,8 +115,9 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
 
 
 def train_ahead(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
-    """``ahead`` for models: each (env, model) that is wanted, once."""
-    pairs = dict.fromkeys((_trained_on(env, model), model) for env, model in wanted)
+    """``ahead`` for models: each (env, model) that is wanted, once, the longest trainings first."""
+    pairs = list(dict.fromkeys((_trained_on(env, model), model) for env, model in wanted))
+    pairs.sort(key=lambda pair: -BUDGET[short(imperfections(pair[0])[0])])
     ahead(run, [(load_or_train, *pair) for pair in pairs], progress="models")
 
 
