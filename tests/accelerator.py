@@ -1,31 +1,25 @@
 """An accelerator that the processor imitates, to see that nothing computes with tensors of two devices.
 
-Its tensors say that they are on the device "imitated" and hold their numbers in a tensor of the processor. As on CUDA,
-an operation fails that meets one of them beside a tensor of the processor, but for a single number in elementwise
+Its tensors say that they are on the device "meta" and hold their numbers in a tensor of the processor. As on CUDA, an
+operation fails that meets one of them beside a tensor of the processor, but for a single number in elementwise
 operations and for the index in ``x[index]``; and so does drawing on it from a generator of the processor. There is no
 half precision on it.
 """
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
+from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
-from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-DEVICE = "imitated"
+DEVICE = "meta"  # the one device without numbers of its own that every build of torch can differentiate on
 INDEXED = ("aten::index", "aten::_unsafe_index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
-
-
-class _Backend(_DummyBackendModule):
-    def get_amp_supported_dtype(self) -> list[torch.dtype]:
-        return [torch.bfloat16]
-
-
-_setup_privateuseone_for_python_backend(DEVICE, backend_module=_Backend())
 
 
 class There(Tensor):
@@ -36,7 +30,7 @@ class There(Tensor):
     @staticmethod
     def __new__(cls, here: Tensor) -> There:
         there = Tensor._make_wrapper_subclass(
-            cls, here.shape, here.stride(), here.storage_offset(), dtype=here.dtype, device=f"{DEVICE}:0"
+            cls, here.shape, here.stride(), here.storage_offset(), dtype=here.dtype, device=DEVICE
         )
         there.here = here
         return there
@@ -56,11 +50,26 @@ class There(Tensor):
 
 
 class Accelerator(TorchDispatchMode):
-    """Within it, there is a device "imitated". count: operations that ran on it."""
+    """Within it, "meta" is the accelerator, for autocast (which does nothing) and Adam too. count: operations on it."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.count = 0
+        self.count, self.patches = 0, ExitStack()
+
+    def __enter__(self) -> Accelerator:
+        enable, autocast = torch.set_autocast_enabled, torch.autocast
+        fused = [*optimizer._get_fused_kernels_supported_devices(), DEVICE]
+        for where, name, instead in (
+            (torch, "set_autocast_enabled", lambda kind, on: None if kind == DEVICE else enable(kind, on)),
+            (torch, "autocast", lambda kind, *_, **how: autocast("cpu" if kind == DEVICE else kind, *_, **how)),
+            (optimizer, "_get_fused_kernels_supported_devices", lambda: fused),
+        ):
+            self.patches.enter_context(mock.patch.object(where, name, instead))
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self.patches.close()
+        super().__exit__(*error)
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.count += any(isinstance(leaf, There) for leaf in tree_leaves(args))

@@ -30,7 +30,7 @@ T = TypeVar("T")
 PROCESSOR, HORIZON, TARGETS, REACHER = "cpu", 20, 3, "tsm/Reacher-v0"
 
 
-@pytest.fixture(params=[DEVICE, *["cuda"] * torch.cuda.is_available()])
+@pytest.fixture(params=[pytest.param(DEVICE, id="imitated"), *["cuda"] * torch.cuda.is_available()])
 def device(request: pytest.FixtureRequest) -> str:
     """An accelerator: one that the processor imitates, and a real one where there is one."""
     return request.param
@@ -101,6 +101,7 @@ def test_a_model_trained_on_it_comes_back_the_same(case: Case, device: str) -> N
         assert (found - expected).norm() < 0.01 * moved.norm(), loss
 
 
+@pytest.mark.filterwarnings("ignore:for .* to a meta parameter")  # which would have no numbers
 def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, tmp_path: Path) -> None:
     data, held_out = episodes(MODELS["tsm"], 12, 0), episodes(MODELS["tsm"], 4, 1)
 
