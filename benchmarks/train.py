@@ -1,10 +1,11 @@
 """Training each model as the study trains it, against the same updates written plainly, and against sgemm.
 
-Every call is ``tsmlib.train.fit`` for a few updates, with the loss, the batch and the future of a stage of
-``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on a few windows. The reference is
-the same stage in float32 through ``_plain.PlainTSM``; for models that have no plain form, themselves in the other
-precision. The limit is the time that the matrix products of the very same call take alone, in float32: the share says
-how many of the processor's float32 operations per second training gets.
+Every call is ``tsmlib.train.fit`` for ten updates, with the loss, the batch and the future of a stage of
+``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on so few windows that its share
+is that of the study (2,000 windows every 250 updates). The reference is the same stage in float32 through
+``_plain.PlainTSM``; for models that have no plain form, themselves in the other precision. The limit is the time that
+the matrix products of the very same call take alone, in float32: the share says how many of the processor's float32
+operations per second training gets.
 
     python benchmarks/train.py        or        python -m tsmlib bench train
 """
@@ -31,9 +32,9 @@ Data = tuple[Trajectories, Trajectories]
 
 
 def main() -> None:
-    options = parser(__doc__, rounds=3)
+    options = parser(__doc__, rounds=5)
     options.add_argument("--models", default=",".join([*study.DYNAMICS, "prior"]))
-    options.add_argument("--updates", type=int, default=2, help="in every call (default 2)")
+    options.add_argument("--updates", type=int, default=10, help="in every call (default 10)")
     options.add_argument("--batches", default="128,256,512,1024", help="windows per update, tsm free-running")
     options.add_argument("--batch", type=int, default=0, help="windows per update; 0: as in the schedule (default)")
     options.add_argument("--episodes", type=int, default=200, help="to draw windows from (default 200)")

@@ -14,6 +14,7 @@ from tsmlib import runs, store
 sys.path.insert(0, str(runs.ROOT / "benchmarks" / "choices"))
 
 import as_published
+import spent
 
 ARM = ["--env", "tsm/Reacher-v0"]
 TRIES = [("half the batch",), ("twice the batch, half the updates",)]
@@ -61,3 +62,14 @@ def test_a_run_is_held_against_the_spread_of_the_published_seeds(
     for value, better in ((-3.0, 1), (-5.0, 0)):
         as_published.compare(as_published.read(table("own.csv", (1, value), **earned)), published)
         assert f"{better} of 1 returns are better" in capsys.readouterr().out
+
+
+def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
+    said = {
+        "models/Reacher/tsm+energy.safetensors": "models, Reacher",
+        "models/Reacher-delay5/lstm.safetensors": "models, Reacher-delay5",
+        "models/Reacher/policy-tsm+energy+direct-codes.safetensors": "policies, tsm+energy+direct-codes",
+        "plans/Reacher-oracle-codes-cem-every10.safetensors": "plans, oracle",
+        "plans/Reacher-ensemble+mse-codes-cem-every10.safetensors": "plans, cem-every10",
+    }
+    assert {name: spent.kind(Path(name)) for name in said} == said
