@@ -63,7 +63,7 @@ def by_mj_step(starts: np.ndarray, torques: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    options = parser(__doc__, rounds=3)
+    options = parser(__doc__, rounds=9)
     options.add_argument("--episodes", type=int, default=500, help="in the bulk call (default 500)")
     options.add_argument("--loop-episodes", type=int, default=20, help="in each loop (default 20)")
     arguments = parsed(options)

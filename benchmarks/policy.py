@@ -27,7 +27,7 @@ EPISODES = 20  # of each update and copy, ``improve``'s default
 
 
 def main() -> None:
-    options = parser(__doc__, rounds=3)
+    options = parser(__doc__, rounds=9)
     options.add_argument("--env", default="tsm/Reacher-v0")
     options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
     options.add_argument("--copies", type=int, default=10)
