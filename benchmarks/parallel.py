@@ -28,7 +28,7 @@ def little(run: Run, seed: int, updates: int) -> None:
 
 
 def main() -> None:
-    options = parser(__doc__, rounds=2)
+    options = parser(__doc__, rounds=5)
     options.add_argument("--trainings", type=int, default=4)
     options.add_argument("--updates", type=int, default=40, help="of each (default 40)")
     arguments = parsed(options)

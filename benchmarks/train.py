@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from _plain import PlainTSM
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 
@@ -52,7 +53,7 @@ def main() -> None:
             seen.add(kind)
     if arguments.batches:
         sizes = [int(word) for word in arguments.batches.split(",")]
-        rows += batch_rows(study.fresh(run, "tsm", data[0]), sizes, data, 2)
+        rows += batch_rows(study.fresh(run, "tsm", data[0]), sizes, data, arguments.updates, 2)
     print(f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads")
     save("train", rows)
 
@@ -95,23 +96,27 @@ def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) ->
     )  # fmt: skip
 
 
-def batch_rows(net: Any, sizes: list[int], data: Data, rounds: int) -> list[Row]:
+def batch_rows(net: Any, sizes: list[int], data: Data, updates: int, rounds: int) -> list[Row]:
     """tsm free-running: bfloat16 against float32, batch by batch, per window."""
     ways, products = {}, {}
     for batch in sizes:
         stage = Stage("loss", 1, batch=batch)
         for word, bf16 in (("bfloat16", True), ("float32", False)):
-            ways[f"{word} {batch}"] = training(net, stage, data, updates=1, bf16=bf16)
+            ways[f"{word} {batch}"] = training(net, stage, data, updates=updates, bf16=bf16)
         products[batch] = Products.of(ways[f"float32 {batch}"])
         ways[f"sgemm {batch}"] = products[batch].alone()
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     seconds = interleaved(ways, rounds, warm=False, progress="batches")
+
+    def speed(way: str, batch: int) -> np.ndarray:
+        return updates * batch / seconds[f"{way} {batch}"]
+
     return [
         Row.of(
-            f"train tsm, free-running, {word}, batch {batch}: windows", batch / seconds[f"{word} {batch}"],
+            f"train tsm, free-running, {word}, batch {batch}: windows", speed(word, batch),
             f"{'float32, the same batch' if word == 'bfloat16' else f'float32, batch {sizes[0]}'}",
-            batch / seconds[f"float32 {batch}"] if word == "bfloat16" else sizes[0] / seconds[f"float32 {sizes[0]}"],
-            limit=SGEMM, bound=batch / seconds[f"sgemm {batch}"], peak=peaks[f"{word} {batch}"], env=ENV,
+            speed("float32", batch if word == "bfloat16" else sizes[0]),
+            limit=SGEMM, bound=speed("sgemm", batch), peak=peaks[f"{word} {batch}"], env=ENV,
             sim="mujoco", model="tsm", condition="batch", metric="windows_per_second", horizon=20,
         )
         for batch in sizes

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tsmlib import runs, store
@@ -44,24 +45,35 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
     assert len({row["metric"] for row in rows}) * len(tries) == len(rows)
 
 
-def test_a_run_is_held_against_the_spread_of_the_published_seeds(
+def table(path: Path, *values: tuple[int, float], **columns: Any) -> as_published.Found:
+    row = dict(env="e", sim="mujoco", task="", model="tsm", planner="none", prior="", horizon="", condition="clean")
+    rows = [row | dict(n=1, unit="", scale="paper", seed=seed, value=value) | columns for seed, value in values]
+    store.save_table(path, rows)
+    return as_published.read(path)
+
+
+def test_a_run_is_held_against_the_published_seeds_that_are_not_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def table(name: str, *values: tuple[int, float], **columns: Any) -> Path:
-        row = dict(env="e", sim="mujoco", task="", model="tsm", planner="none", prior="", horizon="", condition="clean")
-        rows = [row | dict(n=1, unit="", scale="paper", seed=seed, value=value) | columns for seed, value in values]
-        store.save_table(tmp_path / name, rows)
-        return tmp_path / name
+    published = table(tmp_path / "all.csv", (0, 0.8), (1, 99.0), (2, 1.2), (3, 1.0), metric="ll_paper")
+    for value, said in ((1.98, "0 of 1 outside"), (2.01, "1 of 1 outside"), (0.5, "of 1, 0 better")):  # 1 + 0.99
+        as_published.compare(table(tmp_path / "own.csv", (1, value), metric="ll_paper"), published)
+        assert said in capsys.readouterr().out
+    as_published.compare(table(tmp_path / "own.csv", (1, 1.0), metric="nrmse"), published)
+    assert "1 not compared" in capsys.readouterr().out
 
-    score, earned = dict(metric="ll_paper"), dict(metric="return_true", planner="cem", horizon=50)
-    published = as_published.read(table("three.csv", (0, 1.0), (1, 1.2), (2, 0.8), **score))
-    for value, outside in ((1.5, 0), (9.0, 1)):
-        as_published.compare(as_published.read(table("own.csv", (1, value), **score)), published)
-        assert f"{outside} of 1 lie outside" in capsys.readouterr().out
-    published = as_published.read(table("one.csv", (0, -4.0), **earned))
-    for value, better in ((-3.0, 1), (-5.0, 0)):
-        as_published.compare(as_published.read(table("own.csv", (1, value), **earned)), published)
-        assert f"{better} of 1 returns are better" in capsys.readouterr().out
+
+def test_returns_are_those_of_plans_and_of_policies_when_they_are_learned(tmp_path: Path) -> None:
+    path, earned = tmp_path / "own.csv", dict(metric="return_true")
+    assert not table(path, (1, -4.0), **earned, condition="along the way")
+    assert not table(path, (1, -4.0), **earned, model="oracle", planner="cem")
+    rows = [
+        dict(env="e", sim="mujoco", task="", model="tsm", planner="policy", prior="codes", horizon=updates, n=1,
+             condition="learning", unit="", scale="paper", seed=1, value=value, copy=copy, **earned)
+        for updates, copy, value in ((0, 0, -9.0), (0, 1, -9.0), (20, 0, -4.0), (20, 1, -2.0))
+    ]  # fmt: skip
+    store.save_table(path, rows, extra=["copy"])
+    assert [list(seeds.values()) for seeds in as_published.read(path).values()] == [[-3.0]]
 
 
 def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
@@ -73,3 +85,10 @@ def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
         "plans/Reacher-ensemble+mse-codes-cem-every10.safetensors": "plans, cem-every10",
     }
     assert {name: spent.kind(Path(name)) for name in said} == said
+
+
+def test_the_plan_that_a_closed_loop_begins_with_is_counted_once(tmp_path: Path) -> None:
+    for name, seconds in (("e-tsm-codes-cem", 3.0), ("e-tsm-codes-cem-every10", 10.0)):
+        path = tmp_path / f"{name}.safetensors"
+        store.save(path, {"actions": np.zeros(1, np.float32)}, kind="plan", header={"seconds": seconds})
+    assert spent.took(path) == 7.0
