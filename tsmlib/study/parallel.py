@@ -1,6 +1,6 @@
 """Several things of a run made at the same time, by processes in which torch has one thread.
 
-Two threads on one small network gain little over one; two networks on a thread each gain nearly all of the second core.
+Two threads on one small network may stand in each other's way; two networks on a thread each use both cores.
 """
 
 from __future__ import annotations
