@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,19 +38,21 @@ Found = dict[tuple, dict[int, float]]  # what was measured -> the value of each 
 def read(path: Path) -> Found:
     """Scores, true returns of plans, and of policies when they are learned; the mean where there are several copies."""
     rows = store.load_table(path)
-    learning = [row["horizon"] for row in rows if (row["planner"], row["condition"]) == ("policy", "learning")]
-    updates = max((updates for updates in learning if updates != ""), default=0)
-    values: dict[tuple, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        score = row["horizon"] in STEPS and row["condition"] in ("clean", "noise", "delay")
+    updates = [row["horizon"] for row in rows if row["condition"] == "learning" and row["horizon"] != ""]
+    learned = max(updates, default=0)
+
+    def wanted(row: dict[str, Any]) -> bool:
+        if row["model"] in ("none", "oracle"):
+            return False
         if row["planner"] == "policy":
-            wanted = row["metric"] == "return_true" and (row["condition"], row["horizon"]) == ("learning", updates)
-        elif row["metric"] == "return_true":
-            wanted = row["condition"] in ("clean", "closed loop")
-        else:
-            wanted = row["metric"] in SCORES and score
-        if wanted and row["model"] not in ("none", "oracle"):
-            values[tuple(row[key] for key in KEYS)][row["seed"]].append(row["value"])
+            return row["metric"] == "return_true" and (row["condition"], row["horizon"]) == ("learning", learned)
+        if row["metric"] == "return_true":
+            return row["condition"] in ("clean", "closed loop")
+        return row["metric"] in SCORES and row["horizon"] in STEPS and row["condition"] in ("clean", "noise", "delay")
+
+    values: dict[tuple, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in filter(wanted, rows):
+        values[tuple(row[key] for key in KEYS)][row["seed"]].append(row["value"])
     return {what: {seed: float(np.mean(copies)) for seed, copies in own.items()} for what, own in values.items()}
 
 
@@ -59,7 +62,7 @@ def compare(run: Found, published: Found) -> None:
     counts: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))  # planner -> compared, better, worse
     for what, own in run.items():
         if len(own) > 1:
-            raise SystemExit(f"the table holds the seeds {sorted(own)}, expected that of one run")
+            raise SystemExit(f"the table holds seeds {sorted(own)}, expected one; name that of a run, in its metrics/")
         ((seed, value),) = own.items()
         known = published.get(what, {})
         others = np.array([v for k, v in known.items() if k != seed])
