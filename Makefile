@@ -31,7 +31,7 @@ test: $(READY)
 	$(TEST) --nbval-lax notebooks
 
 torture: $(READY)
-	$(PY) tests/torture $(PARTS)
+	$(PY) tests/reliability $(PARTS)
 
 bench: $(READY)
 	$(PY) -m tsmlib bench
@@ -41,6 +41,7 @@ lint: $(READY)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+	$(VENV)/bin/lint-imports
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -12,10 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.nets import CausalDecoder, Noise, standard_normal
-from tsmlib.prior import ActionPrior
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.layers import CausalDecoder
+from tsmlib.models.tsm import TSM
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window
-from tsmlib.tsm import TSM
 
 
 class PlainLayer(nn.Module):

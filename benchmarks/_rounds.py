@@ -23,8 +23,9 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from tqdm.auto import tqdm
 
-from tsmlib import runs, store
-from tsmlib.provenance import provenance
+from tsmlib.storage import tables
+from tsmlib.storage.provenance import provenance
+from tsmlib.study import runs
 
 Ways = Mapping[str, Callable[[], object]]
 EXTRA = (
@@ -245,14 +246,14 @@ def save(name: str, rows: Sequence[Row]) -> None:
         measured |= {} if row.peak_bytes is None else {"peak_bytes": row.peak_bytes}
         table.append({**row.columns, **measured, **about})
     path = folder() / f"{name}.csv"
-    store.save_table(path, table, extra=EXTRA)
+    tables.save_table(path, table, extra=EXTRA)
     print(path)
 
 
 def load(path: Path) -> list[tuple[Row, dict[str, Any]]]:
     """The rows of one benchmark, each with the fields that it stands in."""
     found = []
-    for r in store.load_table(path):
+    for r in tables.load_table(path):
         share, peak = (None if r[name] == "" else r[name] for name in ("share", "peak_bytes"))
         ratio = (r["ratio_lowest"], r["ratio_median"], r["ratio_highest"])
         row = Row(

@@ -15,7 +15,9 @@ from typing import Any
 import growth
 from _rounds import EXTRA, Row, figure, folder, load, text
 
-from tsmlib import runs, store, style
+from tsmlib.figures import style
+from tsmlib.storage import files
+from tsmlib.study import runs
 
 ORDER = ("collect", "train", "rollout", "plan", "policy", "score", "seed", "parallel", "growth", "trust")
 DOCS = runs.ROOT / "docs" / "speed.md"
@@ -149,7 +151,7 @@ def publish(found: Found) -> None:
         lines += ["", f"![How cost grows with the size of things](../figures/{PICTURE.name}.png)"]
     before, _, rest = DOCS.read_text().partition(MARKS[0])
     after = rest.partition(MARKS[1])[2]
-    store.write_bytes(DOCS, "\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]).encode())
+    files.write_bytes(DOCS, "\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]).encode())
     print(DOCS.relative_to(runs.ROOT))
 
 

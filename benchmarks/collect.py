@@ -21,7 +21,7 @@ from _rounds import Row, interleaved, parsed, parser, peak_bytes, save
 from _simulator import ENV, raw
 
 import tsmlib.envs  # noqa: F401 - registers the environments
-from tsmlib.collect import collect, once, smooth_torques
+from tsmlib.collection import collect, once, smooth_torques
 from tsmlib.envs.mujoco_arm import load_model
 
 STEPS = 100

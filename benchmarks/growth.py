@@ -14,19 +14,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import _figure
 import numpy as np
 import torch
 from _rounds import Row, folder, interleaved, parsed, parser, peak_bytes, save
 from _simulator import ENV, raw
 from plan import models
 
-from tsmlib import evaluate, rewards, runs, speed_figures, store, study
-from tsmlib.dynamics import rollout
-from tsmlib.policy import OneStepPolicy, episodes_from, improve
-from tsmlib.style import save as save_figure
+from tsmlib import rewards, study
+from tsmlib.evaluation import prediction
+from tsmlib.figures.style import save as save_figure
+from tsmlib.models.base import rollout
+from tsmlib.models.tsm import TSM
+from tsmlib.planning.planners import adam
+from tsmlib.planning.predictors import through_model
+from tsmlib.planning.search_spaces import DirectActions
+from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.networks import OneStepPolicy
+from tsmlib.storage import tables
+from tsmlib.study import runs
 from tsmlib.trajectory import Segment, Window
-from tsmlib.trajopt import DirectActions, adam, through_model
-from tsmlib.tsm import TSM
 
 DX, DU = 10, 2
 Call = Callable[[], object]
@@ -52,13 +59,13 @@ def main() -> None:
         sizes = np.array(list(calls))
         seconds = np.stack([named[str((axis, word, size))] for size in calls], axis=1)  # (R, K)
         if len(sizes) > 1:
-            found = speed_figures.exponents(sizes, seconds)
+            found = _figure.exponents(sizes, seconds)
             peak = max(peaks[axis, word, size] for size in calls)
             many = f"{sizes[0]} to {sizes[-1]}"
             linear = "in proportion (-1)" if axis == "threads" else "linear growth (1)"
             rows.append(
                 Row.of(
-                    f"{speed_figures.WORDS[word]} against {axis}, {many}", found, linear, 1.0,
+                    f"{_figure.WORDS[word]} against {axis}, {many}", found, linear, 1.0,
                     unit="exponent", peak=peak, env=ENV, sim="mujoco", model="tsm", condition=axis, metric="exponent",
                 )
             )  # fmt: skip
@@ -69,24 +76,24 @@ def main() -> None:
         ]
     print(f"{ENV}, {arguments.rounds} rounds, {arguments.threads} threads")
     save("growth", rows)
-    store.save_table(folder() / "growth_rows.csv", points, extra=COLUMNS)
+    tables.save_table(folder() / "growth_rows.csv", points, extra=COLUMNS)
     print(*save_figure(draw(folder()), folder() / "growth"), sep="\n")
 
 
 def draw(place: Path) -> Any:
     """The figure of what stands in ``growth_rows.csv`` of a folder; a size measured alone has no curve."""
     found: dict[str, dict[str, dict[int, dict[int, float]]]] = {}
-    for row in store.load_table(place / "growth_rows.csv"):
+    for row in tables.load_table(place / "growth_rows.csv"):
         by_round = found.setdefault(row["axis"], {}).setdefault(row["curve"], {})
         by_round.setdefault(row["round"], {})[row["size"]] = row["value"]
-    panels: dict[str, dict[str, speed_figures.Curve]] = {}
+    panels: dict[str, dict[str, _figure.Curve]] = {}
     for axis, lines in found.items():
         for word, by_round in lines.items():
             sizes = sorted(by_round[0])
             if len(sizes) > 1:
                 seconds = np.array([[times[size] for size in sizes] for times in by_round.values()])
                 panels.setdefault(axis, {})[word] = (np.array(sizes), seconds)
-    return speed_figures.growth(panels)
+    return _figure.growth(panels)
 
 
 def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable[[int], Call]]]]:
@@ -127,7 +134,7 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
             "train": lambda n: update(tsm(channels=n), 64), "imagine": lambda n: imagine(tsm(channels=n), 200, 10),
         }),
         "samples": ((8, 32, 128), {
-            "score": lambda n: partial(evaluate.score, model, model.features, few, few, samples=n, horizon=30),
+            "score": lambda n: partial(prediction.score, model, model.features, few, few, samples=n, horizon=30),
         }),
         "targets": ((12, 25, 50, 100), {"plan": lambda n: plan(n, task.horizon)}),
         "seeds": ((1, 2, 5, 10), {"learn": lambda n: partial(learn, n)}),

@@ -12,9 +12,10 @@ import torch
 from _rounds import Row, interleaved, parsed, parser, save
 from train import training
 
-from tsmlib import runs, study
-from tsmlib.runs import Run
+from tsmlib import study
+from tsmlib.study import runs
 from tsmlib.study.parallel import cores
+from tsmlib.study.runs import Run
 
 ENV = "tsm/ReacherPush-v0"
 

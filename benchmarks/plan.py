@@ -25,11 +25,15 @@ from _plain import PlainPrior, PlainTSM
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from torch import Tensor
 
-from tsmlib import runs, store, study
-from tsmlib.collect import collect, once
-from tsmlib.prior import ActionPrior
-from tsmlib.trajopt import DirectActions, LatentActions, adam, cem, through_model
-from tsmlib.tsm import TSM
+from tsmlib import study
+from tsmlib.collection import collect, once
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.tsm import TSM
+from tsmlib.planning.planners import adam, cem
+from tsmlib.planning.predictors import through_model
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.storage import artifacts
+from tsmlib.study import runs
 
 ENV = "tsm/ReacherPush-v0"
 
@@ -38,8 +42,8 @@ def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
     """The shipped models; where there are none, untrained ones, which are as fast."""
     folder = run.shipped / study.short(env)
     if all((folder / f"{name}.safetensors").exists() for name in ("tsm", "prior")):
-        tsm = store.load_model(folder / "tsm.safetensors", TSM)
-        return tsm, store.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
+        tsm = artifacts.load_model(folder / "tsm.safetensors", TSM)
+        return tsm, artifacts.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
     data = study.random_data(env, 50, seed=0)
     return study.fresh(run, "tsm", data), study.fresh(run, "prior", data), "untrained"
 

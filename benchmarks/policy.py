@@ -17,9 +17,11 @@ import torch
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from plan import models
 
-from tsmlib import rewards, runs, study
-from tsmlib.dynamics import rollout
-from tsmlib.policy import OneStepPolicy, SegmentPolicy, episodes_from, improve
+from tsmlib import rewards, study
+from tsmlib.models.base import rollout
+from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
+from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
 
 SCHEDULE = 2200  # updates until the rate has decayed to its end, A25

@@ -16,8 +16,9 @@ import torch
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from _simulator import ENV, raw
 
-from tsmlib import runs, study
-from tsmlib.dynamics import rollout
+from tsmlib import study
+from tsmlib.models.base import rollout
+from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
 
 

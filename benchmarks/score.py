@@ -15,8 +15,10 @@ from typing import Any
 import torch
 from _rounds import Row, bandwidth, interleaved, parsed, parser, peak_bytes, save
 
-from tsmlib import evaluate, runs, study
-from tsmlib.dynamics import rollout
+from tsmlib import study
+from tsmlib.evaluation import prediction
+from tsmlib.models.base import rollout
+from tsmlib.study import runs
 from tsmlib.trajectory import Segment, Trajectories
 
 ENV, BYTES = "tsm/ReacherPush-v0", 2**28
@@ -39,7 +41,7 @@ def main() -> None:
         net = study.fresh(run, model, splits[0])
         for samples, data in ((arguments.samples, splits), (arguments.many, pairs)):
             options_of = dict(samples=samples, horizon=horizon)
-            ways[f"{model} {samples}"] = partial(evaluate.score, net, net.features, *data, **options_of)
+            ways[f"{model} {samples}"] = partial(prediction.score, net, net.features, *data, **options_of)
             ways[f"{model} {samples} bare"] = partial(imagine, net, data, **options_of)
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     seconds = interleaved(ways, arguments.rounds, warm=False)
@@ -71,7 +73,7 @@ def imagine(net: Any, data: list[Trajectories], *, samples: int, horizon: int, o
             states[:, observed - net.past_len + 1 : observed + 1], actions[:, observed - net.past_len : observed]
         )
         future = actions[:, observed : observed + horizon]
-        for block in torch.arange(len(states)).repeat(samples).split(evaluate.ROWS):
+        for block in torch.arange(len(states)).repeat(samples).split(prediction.ROWS):
             rollout(net, Segment(*(part[block] for part in past)), future[block], generator=generator)
 
 

@@ -28,12 +28,20 @@ from torch import Tensor
 from tqdm.auto import tqdm
 from train import training
 
-from tsmlib import evaluate, report, rewards, runs, scoreboard, study
-from tsmlib.control import Task
-from tsmlib.envs import DELAY, MUJOCO_IDS, NOISE, imperfect
-from tsmlib.policy import OneStepPolicy, SegmentPolicy, episodes_from, improve
+from tsmlib import rewards, study
+from tsmlib.envs import imperfect
+from tsmlib.envs.spec import DELAY, MUJOCO_IDS, NOISE
+from tsmlib.evaluation import prediction
+from tsmlib.planning.planners import cem, reassess
+from tsmlib.planning.predictors import through_model
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task
+from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
+from tsmlib.study import runs
+from tsmlib.study.results import planning as planning_results
+from tsmlib.study.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
-from tsmlib.trajopt import DirectActions, LatentActions, cem, reassess, through_model
 
 BUDGET = 2 * 2 * 3600.0  # seconds of two cores in two hours
 REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
@@ -114,7 +122,7 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
         yield from trainings(run, env, "prior", data[env], arguments.updates)
         task = study.task(env, "validation")
         for word in models:
-            if word in report.PAPER:
+            if word in planning_results.PAPER:
                 yield from plans(nets[env, word], nets[env, "prior"], task, arguments.little)
         for word in (word for word in models if word in (BEST, "onestep", "multistep", "lstm", "ensemble+mse")):
             yield from policies(nets[env, word], nets[env, "prior"] if word == BEST else None, task, arguments.updates)
@@ -131,8 +139,8 @@ def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) ->
 
 def scores(net: Any, few: Trajectories) -> Iterator[Part]:
     """Open loop and by segments, 1,000 test and 200 validation episodes."""
-    for options in ({"horizon": 90}, {"horizon": 10, "starts": list(scoreboard.SEGMENTS)}):
-        yield Part("score", partial(evaluate.score, net, net.features, few, few, samples=32, **options),
+    for options in ({"horizon": 90}, {"horizon": 10, "starts": list(prediction_results.SEGMENTS)}):
+        yield Part("score", partial(prediction.score, net, net.features, few, few, samples=32, **options),
                    1200 / (2 * len(few)))  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Training each model as the study trains it, against the same updates written plainly, and against sgemm.
 
-Every call is ``tsmlib.train.fit`` for ten updates, with the loss, the batch and the future of a stage of
+Every call is ``tsmlib.training.fit.fit`` for ten updates, with the loss, the batch and the future of a stage of
 ``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on so few windows that its share
 is that of the study (2,000 windows every 250 updates). The reference is the same stage in float32 through
 ``_plain.PlainTSM``; for models that have no plain form, themselves in the other precision. The limit is the time that
@@ -20,11 +20,12 @@ import numpy as np
 from _plain import PlainTSM
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 
-from tsmlib import runs, study
-from tsmlib.study import Stage
-from tsmlib.train import fit
+from tsmlib import study
+from tsmlib.models.tsm import TSM
+from tsmlib.study import runs
+from tsmlib.study.models import Stage
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
-from tsmlib.tsm import TSM
 
 ENV = "tsm/ReacherPush-v0"
 WORDS = {"teacher_forced_loss": "teacher-forced", "loss": "free-running", "energy_loss": "energy score"}

@@ -26,11 +26,13 @@ import torch
 from _rounds import Row, parsed, parser, peak_bytes, save
 from tqdm.auto import tqdm
 
-from tsmlib import runs, store, study
-from tsmlib.checkpoint import Progress
-from tsmlib.train import fit
+from tsmlib import study
+from tsmlib.models.tsm import TSM
+from tsmlib.storage import artifacts
+from tsmlib.study import runs
+from tsmlib.training.checkpoint import Progress
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories, Window
-from tsmlib.tsm import TSM
 
 ENV = "tsm/ReacherPush-v0"
 EVERY = 250  # updates to a checkpoint, at scales laptop and paper
@@ -46,10 +48,10 @@ def main() -> None:
     run = runs.resolve("bench", scale="laptop")
     shipped = run.shipped / study.short(ENV) / "tsm.safetensors"
     expect = study.fingerprint(ENV)
-    existing = store.load_model(shipped, TSM, expect=expect)
+    existing = artifacts.load_model(shipped, TSM, expect=expect)
     seconds: dict[str, list[float]] = {"update": [], "save": [], "load": [], "read": []}
     ratio = np.array([round_of(arguments, run, data, held_out, seconds) for _ in tqdm(range(arguments.rounds))])
-    load_checked = partial(store.load_model, shipped, TSM, expect=expect)
+    load_checked = partial(artifacts.load_model, shipped, TSM, expect=expect)
     peak = peak_bytes(load_checked)
     for _ in range(arguments.loads):
         with timed(seconds["load"]):
@@ -95,7 +97,7 @@ def round_of(
     every = max(1, arguments.steps // 2)
     with (
         tempfile.TemporaryDirectory() as name,
-        mock.patch("tsmlib.train.Progress", type("Timed", (Progress,), {"save": save})),
+        mock.patch("tsmlib.training.fit.Progress", type("Timed", (Progress,), {"save": save})),
     ):
         fit(net, loss, data, held_out, past_len=10, future_len=20, steps=arguments.steps, validate_every=every,
             checkpoint=Path(name) / "run", bf16=True)  # fmt: skip

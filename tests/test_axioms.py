@@ -14,14 +14,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tsmlib import gradients
-from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.collect import smooth_torques
-from tsmlib.dynamics import rollout
-from tsmlib.nets import CausalDecoder, SharedNoise
-from tsmlib.prior import ActionPrior
+from tsmlib.collection import smooth_torques
+from tsmlib.evaluation import gradients
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import rollout
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.layers import CausalDecoder
+from tsmlib.models.tsm import TSM
+from tsmlib.sampling import SharedNoise
 from tsmlib.trajectory import Segment, Window, initial_past
-from tsmlib.tsm import TSM
 
 DU = 2
 B = 5
@@ -353,7 +355,7 @@ def test_a_wide_batch_is_decoded_in_blocks_and_nothing_shows_it(
         return [rollout(model, past, future.actions, generator=generator()), actions]
 
     at_once = everything()
-    monkeypatch.setattr("tsmlib.nets.BLOCK", size)
+    monkeypatch.setattr("tsmlib.models.layers.BLOCK", size)
     for blocks, whole in zip(everything(), at_once, strict=True):
         torch.testing.assert_close(blocks, whole, rtol=1e-12, atol=1e-12)
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.baselines import LSTM, Ensemble, OneStep, states_before
-from tsmlib.dynamics import rollout
-from tsmlib.trajectory import Segment, Window
+from tsmlib.models.base import rollout
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.trajectory import Segment, Window, states_before
 
 DX, DU, NOISE = 3, 2, 0.4
 

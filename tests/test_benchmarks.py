@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from tsmlib import runs, store
 from tsmlib.__main__ import _benchmarks, main
-from tsmlib.nets import CausalDecoder, Encoder
+from tsmlib.models.layers import CausalDecoder, Encoder
+from tsmlib.storage import tables
+from tsmlib.study import runs
 
 sys.path.insert(0, str(runs.ROOT / "benchmarks"))
 
@@ -161,4 +162,4 @@ def test_a_benchmark_that_does_not_exist_is_refused_by_name(capsys: pytest.Captu
 def test_the_page_of_speed_has_a_place_for_its_table() -> None:
     text = (runs.ROOT / "docs" / "speed.md").read_text()
     assert text.count(_table.MARKS[0]) == text.count(_table.MARKS[1]) == 1
-    assert store.COLUMNS[-1] == "scale"  # what benchmarks add comes after
+    assert tables.COLUMNS[-1] == "scale"  # what benchmarks add comes after

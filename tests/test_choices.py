@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsmlib import runs, store
+from tsmlib.storage import artifacts, tables
+from tsmlib.study import runs
 
-sys.path.insert(0, str(runs.ROOT / "benchmarks" / "choices"))
+sys.path.insert(0, str(runs.ROOT / "benchmarks" / "settings"))
 
 import as_published
 import spent
@@ -36,11 +37,11 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    script, table = runs.ROOT / "benchmarks" / "choices" / f"{name}.py", tmp_path / "table.csv"
+    script, table = runs.ROOT / "benchmarks" / "settings" / f"{name}.py", tmp_path / "table.csv"
     options, columns, tries = TINY[name]
     command = [sys.executable, script, "--scale", "smoke", "--out", str(table), *options]
     subprocess.run(command, capture_output=True, text=True, check=True)
-    rows = store.load_table(table)
+    rows = tables.load_table(table)
     assert sorted({tuple(row[column] for column in columns) for row in rows}) == tries
     assert len({row["metric"] for row in rows}) * len(tries) == len(rows)
 
@@ -48,7 +49,7 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
 def table(path: Path, *values: tuple[int, float], **columns: Any) -> as_published.Found:
     row = dict(env="e", sim="mujoco", task="", model="tsm", planner="none", prior="", horizon="", condition="clean")
     rows = [row | dict(n=1, unit="", scale="paper", seed=seed, value=value) | columns for seed, value in values]
-    store.save_table(path, rows)
+    tables.save_table(path, rows)
     return as_published.read(path)
 
 
@@ -72,7 +73,7 @@ def test_returns_are_those_of_plans_and_of_policies_when_they_are_learned(tmp_pa
              condition="learning", unit="", scale="paper", seed=1, value=value, copy=copy, **earned)
         for updates, copy, value in ((0, 0, -9.0), (0, 1, -9.0), (20, 0, -4.0), (20, 1, -2.0))
     ]  # fmt: skip
-    store.save_table(path, rows, extra=["copy"])
+    tables.save_table(path, rows, extra=["copy"])
     assert [list(seeds.values()) for seeds in as_published.read(path).values()] == [[-3.0]]
 
 
@@ -90,5 +91,5 @@ def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
 def test_the_plan_that_a_closed_loop_begins_with_is_counted_once(tmp_path: Path) -> None:
     for name, seconds in (("e-tsm-codes-cem", 3.0), ("e-tsm-codes-cem-every10", 10.0)):
         path = tmp_path / f"{name}.safetensors"
-        store.save(path, {"actions": np.zeros(1, np.float32)}, kind="plan", header={"seconds": seconds})
+        artifacts.save(path, {"actions": np.zeros(1, np.float32)}, kind="plan", header={"seconds": seconds})
     assert spent.took(path) == 7.0

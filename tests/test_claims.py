@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsmlib import claim_report, claims, publish, store
-from tsmlib.claims import DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Tables
-from tsmlib.runs import NOTEBOOKS, ROOT
-from tsmlib.style import interval
+from tsmlib.statistics import interval
+from tsmlib.storage import tables as tables_storage
+from tsmlib.study import publish
+from tsmlib.study.claims import evaluate, report
+from tsmlib.study.claims import figure as claims_figure
+from tsmlib.study.claims.evaluate import DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Tables
+from tsmlib.study.runs import NOTEBOOKS, ROOT
 
 HEAD = """
 [words]
@@ -35,11 +38,11 @@ onestep = { model = "onestep" }
 ENTRY = '[[claim]]\nid = "X1"\nplace = "here"\nstatement = "It is."\nstatistic = "it"\nnotebook = "03_predict"\n'
 
 
-def claim(tmp_path: Path, *lines: str, head: str = HEAD, **options: Any) -> claims.Claim:
+def claim(tmp_path: Path, *lines: str, head: str = HEAD, **options: Any) -> evaluate.Claim:
     """A ledger of one claim, read as the real one is."""
     path = tmp_path / "ledger.toml"
     path.write_text(head + ENTRY + "\n".join(lines))
-    return claims.read(path, **options)[0]
+    return evaluate.read(path, **options)[0]
 
 
 def score(model: str, seed: int, value: float, **columns: Any) -> dict[str, Any]:
@@ -53,12 +56,12 @@ def study(**models: Any) -> Tables:
 
 
 def share(
-    rule: claims.Claim, word: str, effect: float, *, n: int = 10, noise: str = "normal", studies: int = 400
+    rule: evaluate.Claim, word: str, effect: float, *, n: int = 10, noise: str = "normal", studies: int = 400
 ) -> float:
     """How many of the studies, of which each has n seeds and an effect in standard deviations, are given ``word``."""
     rng = np.random.default_rng(0)
     draw = {"normal": rng.standard_normal, "uniform": lambda size: rng.uniform(-(3**0.5), 3**0.5, size)}[noise]
-    given = [claims.judge(rule, study(tsm=common + effect + draw(n), lstm=common)).word
+    given = [evaluate.judge(rule, study(tsm=common + effect + draw(n), lstm=common)).word
              for common in 5 * rng.standard_normal((studies, n))]  # fmt: skip
     return given.count(word) / studies
 
@@ -85,10 +88,10 @@ def test_planted_nulls_are_not_replicated(tmp_path: Path, noise: str, n: int) ->
 def test_better_than_each_means_each(tmp_path: Path) -> None:
     each = claim(tmp_path, 'where = "score"', 'each.rival = ["lstm", "onestep"]', 'rule = ["tsm - rival > 0"]')
     rows = study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[3, 3.2, 3.1])
-    verdict = claims.judge(each, rows)
+    verdict = evaluate.judge(each, rows)
     assert verdict.word == INCONCLUSIVE
     assert verdict.key.check.text == "tsm - onestep > 0"
-    worse = claims.judge(each, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[5, 5.2, 5.1]))
+    worse = evaluate.judge(each, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[5, 5.2, 5.1]))
     assert worse.word == FAILED
     assert "1 of 2 checks fail" in worse.why
 
@@ -109,13 +112,13 @@ def test_a_claim_that_turns_with_the_reading_depends_on_it(tmp_path: Path, paper
     noise = [-0.2, 0.0, 0.2]
     rows = [score("tsm", k, paper + noise[k]) for k in range(3)]
     rows += [score("tsm", k, fair + noise[k], metric="ll_shared") for k in range(3)]
-    verdict = claims.judge(rule, Tables({"03_predict": rows}))
+    verdict = evaluate.judge(rule, Tables({"03_predict": rows}))
     assert verdict.word == word
     assert ("A1b shared" in verdict.why) == (word == DEPENDENT)
 
 
 def test_one_seed_has_no_interval(tmp_path: Path) -> None:
-    verdict = claims.judge(claim(tmp_path, 'where = "score"', 'rule = ["tsm - lstm > 0"]'), study(tsm=[9], lstm=[1]))
+    verdict = evaluate.judge(claim(tmp_path, 'where = "score"', 'rule = ["tsm - lstm > 0"]'), study(tsm=[9], lstm=[1]))
     assert (verdict.word, verdict.key.n, verdict.key.low) == (INCONCLUSIVE, "1 seed", None)
 
 
@@ -133,11 +136,11 @@ def trials(seeds: int, n: int = 20) -> dict[str, list[dict[str, Any]]]:
 def test_trials_are_averaged_inside_a_seed_and_counted_only_where_there_is_one(tmp_path: Path) -> None:
     rule = claim(tmp_path, 'where = "plan"', 'rule = ["mean(tsm) - mean(lstm) > 0"]')
     rows = trials(3)
-    assert claims.judge(rule, Tables(rows)).key.n == "3 seeds"
+    assert evaluate.judge(rule, Tables(rows)).key.n == "3 seeds"
     rows = trials(1)
     values = {m: np.array([r["value"] for r in rows["05_control_rows"] if r["model"] == m]) for m in ("tsm", "lstm")}
     mean, half = interval(values["tsm"] - values["lstm"])  # paired by target
-    key = claims.judge(rule, Tables(rows)).key
+    key = evaluate.judge(rule, Tables(rows)).key
     assert key.n == "20 trials of 1 seed"
     np.testing.assert_allclose([key.value, key.low, key.high], [mean, mean - half, mean + half])
 
@@ -145,7 +148,7 @@ def test_trials_are_averaged_inside_a_seed_and_counted_only_where_there_is_one(t
 def test_a_share_is_of_the_trials_for_which_it_is_true(tmp_path: Path) -> None:
     rows = trials(2)
     wanted = np.mean([row["value"] <= 1 for row in rows["05_control_rows"] if row["model"] == "tsm"])
-    key = claims.judge(claim(tmp_path, 'where = "plan"', 'rule = ["share(tsm <= 1) > 0.5"]'), Tables(rows)).key
+    key = evaluate.judge(claim(tmp_path, 'where = "plan"', 'rule = ["share(tsm <= 1) > 0.5"]'), Tables(rows)).key
     assert key.value == pytest.approx(wanted)
 
 
@@ -153,9 +156,9 @@ def test_a_learning_curve_is_asked_for_its_end_or_its_average(tmp_path: Path) ->
     common = dict(metric="return_true", condition="learning", model="tsm", scale="paper", copy=0)
     rows = [dict(common, seed=k, horizon=h, value=v + k) for k in (0, 1) for h, v in ((0, 1.0), (10, 2.0), (20, 6.0))]
     end = claim(tmp_path, 'where = "learnt"', 'rule = ["mean(tsm) - mean(tsm[average]) > 0"]')
-    assert claims.judge(end, Tables({"05_policies": rows})).key.value == pytest.approx(3.0)
-    with pytest.raises(claims.ClaimError, match="curves of different lengths"):
-        claims.measure(end.readings[""][0], Tables({"05_policies": rows[:-1]}))
+    assert evaluate.judge(end, Tables({"05_policies": rows})).key.value == pytest.approx(3.0)
+    with pytest.raises(evaluate.ClaimError, match="curves of different lengths"):
+        evaluate.measure(end.readings[""][0], Tables({"05_policies": rows[:-1]}))
 
 
 # Rows that are refused -----------------------------------------------------------------------------------------------
@@ -174,7 +177,7 @@ def test_a_learning_curve_is_asked_for_its_end_or_its_average(tmp_path: Path) ->
 def test_rows_are_refused_by_claim_file_and_remedy(tmp_path: Path, change: Any, said: str) -> None:
     rule = claim(tmp_path, 'where = "score"', 'rule = ["tsm - lstm > 0"]')
     rows = [score(model, k, 1.0 + k) for model in ("tsm", "lstm") for k in range(3)]
-    verdict = claims.judge(rule, Tables({"03_predict": change(rows)}))
+    verdict = evaluate.judge(rule, Tables({"03_predict": change(rows)}))
     assert verdict.word == UNTESTABLE
     assert re.search(said, verdict.why)
     assert verdict.why.startswith("X1: ")
@@ -183,7 +186,7 @@ def test_rows_are_refused_by_claim_file_and_remedy(tmp_path: Path, change: Any, 
 
 def test_trials_that_do_not_match_are_refused(tmp_path: Path) -> None:
     rows = trials(1)["05_control_rows"][:-1]
-    verdict = claims.judge(
+    verdict = evaluate.judge(
         claim(tmp_path, 'where = "plan"', 'rule = ["mean(tsm) - mean(lstm) > 0"]'), Tables({"05_control_rows": rows})
     )
     assert verdict.word == UNTESTABLE
@@ -192,8 +195,8 @@ def test_trials_that_do_not_match_are_refused(tmp_path: Path) -> None:
 
 def test_what_fails_fails_whatever_else_is_missing(tmp_path: Path) -> None:
     rule = claim(tmp_path, 'where = "score"', 'each.rival = ["lstm", "onestep"]', 'rule = ["tsm - rival > 0"]')
-    assert claims.judge(rule, study(tsm=[1, 1.1, 1.2], lstm=[3, 3.2, 3.1])).word == FAILED
-    assert claims.judge(rule, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1])).word == UNTESTABLE
+    assert evaluate.judge(rule, study(tsm=[1, 1.1, 1.2], lstm=[3, 3.2, 3.1])).word == FAILED
+    assert evaluate.judge(rule, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1])).word == UNTESTABLE
 
 
 @pytest.mark.parametrize(
@@ -208,7 +211,7 @@ def test_what_fails_fails_whatever_else_is_missing(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_claim_that_cannot_be_read_is_named(tmp_path: Path, line: str, said: str) -> None:
-    with pytest.raises(claims.ClaimError, match=rf"ledger.toml, X1: .*{said}"):
+    with pytest.raises(evaluate.ClaimError, match=rf"ledger.toml, X1: .*{said}"):
         claim(tmp_path, line)
 
 
@@ -219,9 +222,9 @@ def test_a_changed_rule_makes_older_verdicts_void(tmp_path: Path) -> None:
     lines = ('where = "score"', 'rule = ["tsm - lstm > 0"]')
     rule, rows = claim(tmp_path, *lines), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1])
     path = tmp_path / "08_claims.csv"
-    stored = claims.as_rows([claims.judge(rule, rows)], model="tsm", scale="paper")
-    store.save_table(path, stored, extra=claims.EXTRA)
-    assert claims.load(path, [rule]) == {"X1": REPLICATED}
+    stored = evaluate.as_rows([evaluate.judge(rule, rows)], model="tsm", scale="paper")
+    tables_storage.save_table(path, stored, extra=evaluate.EXTRA)
+    assert evaluate.load(path, [rule]) == {"X1": REPLICATED}
     changes = [
         dict(lines=(lines[0], 'rule = ["tsm - lstm > 0.1"]')),
         dict(lines=(lines[0], 'rule = ["tsm - lstm >= 0"]')),
@@ -233,37 +236,37 @@ def test_a_changed_rule_makes_older_verdicts_void(tmp_path: Path) -> None:
     for change in changes:
         other = claim(tmp_path, *change.pop("lines"), **change)
         with pytest.raises(
-            claims.ClaimError, match=r"08_claims.csv: the rule of X1 has changed.*python -m tsmlib run claims"
+            evaluate.ClaimError, match=r"08_claims.csv: the rule of X1 has changed.*python -m tsmlib run claims"
         ):
-            claims.load(path, [other])
+            evaluate.load(path, [other])
     reworded = claim(tmp_path, *lines, 'section = "Elsewhere"')
-    assert claims.load(path, [reworded]) == {"X1": REPLICATED}
+    assert evaluate.load(path, [reworded]) == {"X1": REPLICATED}
 
 
 def test_the_readme_and_what_is_stored_are_what_the_shipped_rows_say() -> None:
-    papers, ours = (publish.shipped_verdicts(model) for model in (claims.PAPERS, claims.OURS))
+    papers, ours = (publish.shipped_verdicts(model) for model in (evaluate.PAPERS, evaluate.OURS))
     again = "the claims in README are not those of data/results; run: python -m tsmlib run claims"
     assert publish.readme_claims(papers, ours) in (ROOT / "README.md").read_text(), again
-    for model, verdicts in ((claims.PAPERS, papers), (claims.OURS, ours)):
+    for model, verdicts in ((evaluate.PAPERS, papers), (evaluate.OURS, ours)):
         ledger = [verdict.claim for verdict in verdicts]
-        stored = claims.load(claims.RESULTS / "08_claims.csv", ledger, model=model)
+        stored = evaluate.load(evaluate.RESULTS / "08_claims.csv", ledger, model=model)
         assert stored == {verdict.claim.id: verdict.word for verdict in verdicts}, again
 
 
 # The ledger itself ---------------------------------------------------------------------------------------------------
 
-LEDGER = claims.read()
+LEDGER = evaluate.read()
 
 
 def test_the_ledger_holds_every_claim_once_and_in_order() -> None:
     assert [c.id for c in LEDGER] == [f"C{i:02d}" for i in range(1, 55)]
     assert all(c.readings[""] for c in LEDGER)
     assert sum(c.headline for c in LEDGER) == 21
-    assert set().union(*(c.why for c in LEDGER)) <= set(claims.VERDICTS)
+    assert set().union(*(c.why for c in LEDGER)) <= set(evaluate.VERDICTS)
 
 
 @pytest.mark.parametrize("claim", LEDGER, ids=lambda c: c.id)
-def test_a_claim_points_to_a_section_and_a_figure_that_exist(claim: claims.Claim) -> None:
+def test_a_claim_points_to_a_section_and_a_figure_that_exist(claim: evaluate.Claim) -> None:
     path = NOTEBOOKS / f"{claim.notebook}.ipynb"
     if not path.exists():
         pytest.skip(f"{claim.notebook} is not there yet")
@@ -273,13 +276,13 @@ def test_a_claim_points_to_a_section_and_a_figure_that_exist(claim: claims.Claim
     assert not claim.section or claim.section in headings, f"{claim.id} in claims.toml: section is one of {headings}"
 
 
-def planted(check: claims.Check, rng: np.random.Generator) -> Tables | None:
+def planted(check: evaluate.Check, rng: np.random.Generator) -> Tables | None:
     """Rows of three seeds for which a check holds clearly; None where chance does not find any."""
     tree = ast.parse(check.expression, mode="eval").body
     side = -1 if check.op[0] == "<" else 1
     for _ in range(400):
         base = {term: rng.uniform(0.1, 3) for term in check.queries}
-        if side * (float(claims._number(tree, base)) - check.margin) > 0.3:
+        if side * (float(evaluate._number(tree, base)) - check.margin) > 0.3:
             break
     else:
         return None
@@ -304,9 +307,9 @@ def test_swapping_the_labels_of_two_models_turns_every_check_that_compares_them(
                 continue
             rows = planted(check, rng)
             assert rows, check.text
-            assert claims.measure(check, rows).state == "holds", check.text
+            assert evaluate.measure(check, rows).state == "holds", check.text
             (other,) = rival
-            swapped = claims.judge(c, rows.relabelled({"tsm": other, other: "tsm"}))
+            swapped = evaluate.judge(c, rows.relabelled({"tsm": other, other: "tsm"}))
             effect = next(effect for effect in swapped.effects[""] if effect.check == check)
             assert effect.state in ("fails", "missing"), check.text
             turned.add((c.id, effect.state))
@@ -315,7 +318,7 @@ def test_swapping_the_labels_of_two_models_turns_every_check_that_compares_them(
 
 
 def test_every_choice_that_the_paper_leaves_open_is_stated_once() -> None:
-    entries = tomllib.loads(claim_report.CHOICES.read_text())["choice"]
+    entries = tomllib.loads(report.CHOICES.read_text())["choice"]
     assert [entry["id"] for entry in entries] == [f"A{i}" for i in range(1, 32)]
     assert all(set(entry) == {"id", "open", "chosen", "why", "otherwise"} for entry in entries)
     named = {reading.split()[0] for c in LEDGER for reading in c.readings if re.match(r"A\d", reading)}
@@ -327,21 +330,21 @@ def test_a_choice_says_which_claims_it_turns(tmp_path: Path) -> None:
     rows = [score("tsm", k, 1.0 + k) for k in range(3)]
     for sign, said in ((1, "not X1"), (-1, "turns X1")):
         fair = [score("tsm", k, sign * (1.0 + k), metric="ll_shared") for k in range(3)]
-        lines = claim_report.choices([claims.judge(rule, Tables({"03_predict": rows + fair}))]).splitlines()
+        lines = report.choices([evaluate.judge(rule, Tables({"03_predict": rows + fair}))]).splitlines()
         assert lines[2].endswith(f"| {said} |")
         assert all(line.endswith("|  |") for line in lines[3:])
 
 
 def test_the_figure_has_a_row_for_every_claim_with_rows(tmp_path: Path) -> None:
     rule = claim(tmp_path, 'where = "score"', 'each.rival = ["lstm", "onestep"]', 'rule = ["tsm - rival > 0"]')
-    verdict = claims.judge(rule, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[1, 1.2, 1.1]))
-    ax = claim_report.effects([verdict]).axes[0]
+    verdict = evaluate.judge(rule, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[1, 1.2, 1.1]))
+    ax = claims_figure.effects([verdict]).axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["X1"]
     marks = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
     assert len(marks) == 2
     assert all(0 < x < 1 for x in marks)
     with pytest.raises(ValueError, match="no claim has rows"):
-        claim_report.effects([claims.judge(rule, Tables({}))])
+        claims_figure.effects([evaluate.judge(rule, Tables({}))])
 
 
 def test_intervals_are_those_of_students_t() -> None:

@@ -14,16 +14,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import control, rewards, study
-from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.control import Task, execute, random_torques, replan, zero_torques
-from tsmlib.envs import DELAY, ENV_IDS, NOISE, imperfect, imperfections
-from tsmlib.nets import Noise
-from tsmlib.prior import ActionPrior
+from tsmlib import rewards, study
+from tsmlib.collection import collect, once, smooth_torques
+from tsmlib.envs import imperfect
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, imperfections
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.tsm import TSM
+from tsmlib.planning import predictors
+from tsmlib.planning.base import Plan
+from tsmlib.planning.execution import execute, replan
+from tsmlib.planning.planners import adam, cem, mppi
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories
-from tsmlib.trajopt import DirectActions, LatentActions, Plan, adam, cem, mppi
-from tsmlib.tsm import TSM
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 
@@ -287,7 +293,7 @@ def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int)
     torch.manual_seed(0)
     task, prior = some_task(horizon=30), ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
     space = LatentActions(prior.requires_grad_(False), 30) if over == "codes" else DirectActions(30, rms=0.3)
-    plan = cem(control.through_simulator(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
+    plan = cem(predictors.through_simulator(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
                iterations=2)  # fmt: skip
     trial = replan(task, None, space, as_it_is, every=every, plan=plan)
     assert trial.plan is not None

@@ -16,14 +16,20 @@ from accelerator import DEVICE, Accelerator
 from test_axioms import DU, MODELS, Case, motion, new_prior
 from torch import Tensor
 
-from tsmlib import evaluate, runs, study
+from tsmlib import study
 from tsmlib.__main__ import main
-from tsmlib.dynamics import rollout
-from tsmlib.policy import OneStepPolicy, SegmentPolicy, controller, improve
+from tsmlib.evaluation import prediction
+from tsmlib.models.base import rollout
+from tsmlib.planning.base import Planner, Space
+from tsmlib.planning.planners import adam, cem
+from tsmlib.planning.predictors import through_model
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.policies.learning import improve
+from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
-from tsmlib.train import fit
+from tsmlib.study import runs
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Segment, Trajectories, initial_past
-from tsmlib.trajopt import DirectActions, LatentActions, Planner, Space, adam, cem, through_model
 
 T = TypeVar("T")
 
@@ -155,8 +161,8 @@ def test_it_scores_as_the_processor_does(case: Case, device: str) -> None:
     data, held_out = episodes(case, 6, 2), episodes(case, 5, 3)
     features = case.model(torch.float32).features
 
-    def scores(place: str) -> evaluate.Scores:
-        return evaluate.score(
+    def scores(place: str) -> prediction.Scores:
+        return prediction.score(
             case.model(torch.float32).to(place), features, data, held_out, samples=3, horizon=20
         )  # fmt: skip
 

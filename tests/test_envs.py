@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tsmlib.envs import ENV_IDS, PYMUNK_IDS, ArmVectorEnv, closest_gap
-from tsmlib.envs.base import BLOCK_CLEARANCE, BLOCK_RING, DT, fingertip
+from tsmlib.envs.arm import ArmVectorEnv
+from tsmlib.envs.geometry import BLOCK_CLEARANCE, BLOCK_RING, DT, closest_gap, fingertip
+from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS
 
 WITH_BLOCK = [env_id for env_id in ENV_IDS if not env_id.endswith("Reacher-v0")]
 N, T = 12, 60

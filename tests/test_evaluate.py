@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import evaluate
-from tsmlib.evaluate import Fitted
-from tsmlib.nets import Features, Noise, standard_normal
+from tsmlib.evaluation import contacts, prediction
+from tsmlib.evaluation.prediction import Fitted
+from tsmlib.models.features import Features
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 N, T, PAST = 300, 25, 3
@@ -79,11 +80,11 @@ FEATURES = Features(2, ())
 
 
 def draw(model: Linear, data: Trajectories, samples: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    return evaluate.predict(model, FEATURES, data, samples=samples, seed=seed, **OPEN)
+    return prediction.predict(model, FEATURES, data, samples=samples, seed=seed, **OPEN)
 
 
 def measured(samples: Tensor, truth: Tensor, fitted: Fitted, copies: int = 1) -> dict[str, Tensor]:
-    return evaluate.measure(samples, truth, fitted, copies, torch.Generator().manual_seed(0))[0]
+    return prediction.measure(samples, truth, fitted, copies, torch.Generator().manual_seed(0))[0]
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -103,7 +104,7 @@ def predicted() -> tuple[Tensor, Tensor]:
 
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
-    return evaluate.fit(*draw(Linear(), episodes(seed=1), samples=400, seed=1), copies=400)
+    return prediction.fit(*draw(Linear(), episodes(seed=1), samples=400, seed=1), copies=400)
 
 
 @pytest.fixture(scope="module")
@@ -138,14 +139,14 @@ def test_every_model_starts_from_the_same_step_however_little_past_it_needs() ->
         past_len = 1
 
     for model in (Mode(), Short(past_len=1)):
-        samples, truth = evaluate.predict(model, FEATURES, episodes(5), samples=1, horizon=4, starts=(10,))
+        samples, truth = prediction.predict(model, FEATURES, episodes(5), samples=1, horizon=4, starts=(10,))
         np.testing.assert_array_equal(truth, episodes(5).states[:, 11:15])
         expected = KEEP.numpy() * episodes(5).states[:, 10] + episodes(5).actions[:, 10]
         np.testing.assert_allclose(samples[0, :, 0], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_segments_start_from_the_true_past() -> None:
-    samples, truth = evaluate.predict(Mode(), FEATURES, episodes(6), samples=1, horizon=5, starts=(5, 10, 20))
+    samples, truth = prediction.predict(Mode(), FEATURES, episodes(6), samples=1, horizon=5, starts=(5, 10, 20))
     assert truth.shape == (18, 5, 2)
     for row, start in ((0, 5), (1, 10), (2, 20), (17, 20)):
         states, actions = episodes(6).states[row // 3], episodes(6).actions[row // 3]
@@ -164,7 +165,7 @@ def test_the_same_seed_draws_the_same_samples() -> None:
 @pytest.mark.parametrize("options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(0,))])
 def test_a_horizon_that_does_not_fit_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"at least one step is observed first, and episodes have {T}"):
-        evaluate.predict(Linear(), FEATURES, episodes(3), samples=1, **options)
+        prediction.predict(Linear(), FEATURES, episodes(3), samples=1, **options)
 
 
 def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_repeated() -> None:
@@ -175,7 +176,7 @@ def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_r
 
     seen: list[Segment] = []
     data = episodes(3)
-    evaluate.predict(Recorder(), FEATURES, data, samples=1, horizon=5, starts=(2,))
+    prediction.predict(Recorder(), FEATURES, data, samples=1, horizon=5, starts=(2,))
     states, actions = seen[0]
     assert torch.equal(states[:3, : PAST - 2], torch.from_numpy(data.states[:, :1]).expand(-1, PAST - 2, -1))
     assert torch.equal(states[:3, PAST - 2 :], torch.from_numpy(data.states[:, 1:3]))
@@ -197,7 +198,7 @@ def test_what_does_not_belong_together_is_not_scored(
     features: Features, validation: dict[str, Any], samples: int, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        evaluate.score(
+        prediction.score(
             Linear(), features, episodes(3), replace(episodes(3, seed=1), **validation), samples=samples, **OPEN
         )
 
@@ -217,7 +218,7 @@ def test_scores_are_in_units_of_the_training_data_without_what_never_moves() -> 
         def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
             return past.states[:, -1:].expand(-1, actions.shape[1], -1)
 
-    scores = evaluate.score(Copy(), features, data, data, samples=2, **OPEN)
+    scores = prediction.score(Copy(), features, data, data, samples=2, **OPEN)
     assert scores.pit.shape == (50, HORIZON, 2)
     in_cm = (data.states[:, PAST + 1 :, :2] - data.states[:, PAST : PAST + 1, :2]) / data.states[..., :2].std((0, 1))
     np.testing.assert_allclose(scores.against_horizon()["nrmse"], np.sqrt((in_cm**2).mean((0, 2))), rtol=0.01)
@@ -258,19 +259,19 @@ def test_the_likelihood_with_a_variance_per_step_and_dimension_is_the_analytic_o
 
 def test_the_floor_of_a_model_without_noise_is_its_error() -> None:
     error = 0.05 * normal(4000, 3, 2)
-    floor = evaluate.fit_floor(torch.zeros(5, 4000, 3, 2), error)
+    floor = prediction.fit_floor(torch.zeros(5, 4000, 3, 2), error)
     assert floor == pytest.approx(error.square().mean().item(), rel=1e-5)
     assert floor == pytest.approx(0.05**2, rel=0.05)
 
 
 def test_residual_noise_is_told_apart_from_the_spread_of_the_samples() -> None:
     samples, truth = 0.8 * normal(200, 4000, 1, 2), math.hypot(0.8, 0.6) * normal(4000, 1, 2, seed=1)
-    own = evaluate.fit_own(samples, truth)
+    own = prediction.fit_own(samples, truth)
     torch.testing.assert_close(own, torch.full((1, 2), 0.36), rtol=0.3, atol=0)
     exact = gaussian(truth, torch.ones(2)).mean()
-    assert evaluate.ll_own(samples, truth, own).mean() == pytest.approx(exact.item(), abs=0.02)
+    assert prediction.ll_own(samples, truth, own).mean() == pytest.approx(exact.item(), abs=0.02)
     for share in (0.7, 1.4):
-        assert evaluate.ll_own(samples, truth, share * own).mean() < evaluate.ll_own(samples, truth, own).mean()
+        assert prediction.ll_own(samples, truth, share * own).mean() < prediction.ll_own(samples, truth, own).mean()
 
 
 def test_the_own_density_of_the_system_is_the_analytic_one(
@@ -282,15 +283,15 @@ def test_the_own_density_of_the_system_is_the_analytic_one(
 
 def test_thirty_iterations_are_enough() -> None:
     samples, truth = normal(100, 200, 1, 4), 1.1 * normal(200, 1, 4, seed=1)
-    short, long = (evaluate.fit_own(samples, truth, iterations=n) for n in (30, 200))
-    assert evaluate.ll_own(samples, truth, long).mean() - evaluate.ll_own(samples, truth, short).mean() < 0.01
+    short, long = (prediction.fit_own(samples, truth, iterations=n) for n in (30, 200))
+    assert prediction.ll_own(samples, truth, long).mean() - prediction.ll_own(samples, truth, short).mean() < 0.01
 
 
 def test_two_modes_are_told_from_one_in_between() -> None:
     side = torch.where(normal(600, 1, 1) > 0, 1.0, -1.0)
     samples = torch.where(normal(100, 600, 1, 1, seed=1) > 0, 1.0, -1.0)
     truth = side + 0.1 * normal(600, 1, 1, seed=2)
-    scores = measured(samples, truth, evaluate.fit(samples, truth, copies=1))
+    scores = measured(samples, truth, prediction.fit(samples, truth, copies=1))
     exact = math.log(0.5) - 0.5 * (1 + math.log(2 * math.pi * 0.1**2))  # half a nat of Gaussian, and which side
     assert scores["ll_own"].mean() == pytest.approx(exact, abs=0.05)
     assert scores["ll_own"].mean() > scores["ll_paper"].mean() + 1
@@ -303,9 +304,9 @@ def test_what_few_samples_cost_in_the_papers_likelihood_is_known(count: int) -> 
     exact = gaussian(truth, torch.ones(dims))
     loss = (exact - gaussian(truth - samples.mean(0), samples.var(0)))[:, 0]
     error = loss.std().item() / math.sqrt(trials)
-    assert loss.mean() == pytest.approx(evaluate.fit_loss(count, dims), abs=4 * error)
-    assert evaluate.fit_loss(1000, dims) == pytest.approx(dims / 1000, rel=0.02)
-    assert evaluate.fit_loss(3, dims) == math.inf
+    assert loss.mean() == pytest.approx(prediction.fit_loss(count, dims), abs=4 * error)
+    assert prediction.fit_loss(1000, dims) == pytest.approx(dims / 1000, rel=0.02)
+    assert prediction.fit_loss(3, dims) == math.inf
 
 
 # Proper scores -------------------------------------------------------------------------------------------------------
@@ -326,13 +327,13 @@ def slow_distances(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 def test_energy_score_and_crps_are_those_of_a_double_loop() -> None:
     samples, truth = normal(7, 4, 3, 2), normal(4, 3, 2, seed=1)
     slow = slow_distances(samples, truth)
-    for fast, exact in zip(evaluate.distances(samples, truth, shifts=6), slow, strict=True):
+    for fast, exact in zip(prediction.distances(samples, truth, shifts=6), slow, strict=True):
         torch.testing.assert_close(fast, exact)
 
 
 def test_a_few_shifts_of_many_samples_are_unbiased() -> None:
     samples, truth = normal(8, 20_000, 1, 3), normal(20_000, 1, 3, seed=1)
-    for fast, slow in zip(evaluate.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True):
+    for fast, slow in zip(prediction.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True):
         difference = (fast - slow)[:, 0]
         assert difference.std() > 0.01
         assert difference.mean() == pytest.approx(0, abs=4 * difference.std().item() / math.sqrt(20_000))
@@ -340,12 +341,12 @@ def test_a_few_shifts_of_many_samples_are_unbiased() -> None:
 
 def test_the_scores_of_a_normal_are_its_crps() -> None:
     samples, truth = 0.7 * normal(4000, 1, 5, 1), torch.linspace(-1, 1, 5)[None, :, None]
-    for score in evaluate.distances(samples, truth):
+    for score in prediction.distances(samples, truth):
         torch.testing.assert_close(score, crps_of(truth[..., 0], 0.7), rtol=0, atol=0.03)
 
 
 def test_a_single_sample_is_scored_by_its_distance() -> None:
-    energy, crps = evaluate.distances(torch.zeros(1, 1, 1, 2), torch.tensor([[[3.0, -4.0]]]))
+    energy, crps = prediction.distances(torch.zeros(1, 1, 1, 2), torch.tensor([[[3.0, -4.0]]]))
     assert energy.item() == 5.0
     assert crps.item() == 3.5
 
@@ -353,16 +354,16 @@ def test_a_single_sample_is_scored_by_its_distance() -> None:
 def test_the_true_distribution_scores_best(predicted: tuple[Tensor, Tensor]) -> None:
     samples, truth = (part[..., ::5, :] for part in predicted)
     centre = samples.mean(0)
-    best = evaluate.distances(samples, truth)
+    best = prediction.distances(samples, truth)
     for width in (0.5, 2.0):
-        for score, other in zip(best, evaluate.distances(centre + width * (samples - centre), truth), strict=True):
+        for score, other in zip(best, prediction.distances(centre + width * (samples - centre), truth), strict=True):
             assert other.mean() > score.mean()
 
 
 def test_residual_noise_makes_a_forecast_of_a_point() -> None:
     truth = 0.3 * normal(3000, 2, 1)
     point = torch.zeros(1, 3000, 2, 1)
-    fitted = evaluate.fit(point, truth, copies=200)
+    fitted = prediction.fit(point, truth, copies=200)
     assert fitted.noise.sqrt().median() == pytest.approx(0.3, rel=0.25)  # the next one of the grid
     scores = measured(point, truth, fitted, copies=200)
     assert scores["energy_score"].mean() == pytest.approx(0.3 * math.sqrt(2 / math.pi), rel=0.02)  # E|x|
@@ -373,7 +374,7 @@ def test_residual_noise_makes_a_forecast_of_a_point() -> None:
 def test_samples_that_are_right_get_no_noise_and_narrow_ones_get_what_they_lack(fitted: Fitted) -> None:
     assert fitted.noise.sqrt().median() < 0.15  # the system's own noise builds up to 0.3 .. 0.7
     samples, truth = 0.8 * normal(60, 3000, 1, 2), normal(3000, 1, 2, seed=1)
-    assert evaluate.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
+    assert prediction.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
 
 
 # Coverage ------------------------------------------------------------------------------------------------------------
@@ -386,17 +387,17 @@ def test_the_truth_lies_within_the_interval_as_often_as_stated(values: dict[str,
 
 @pytest.mark.parametrize("count", [19, 200])
 def test_few_samples_cover_as_often_as_many(count: int) -> None:
-    pit = evaluate.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
-    for level in evaluate.LEVELS:
-        assert evaluate.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
+    pit = prediction.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
+    for level in prediction.LEVELS:
+        assert prediction.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
 
 
 def test_overconfidence_shows(predicted: tuple[Tensor, Tensor]) -> None:
     samples, truth = predicted
     centre = samples.mean(0)
-    pit = evaluate.rank(centre + 0.5 * (samples - centre), truth, torch.Generator())
+    pit = prediction.rank(centre + 0.5 * (samples - centre), truth, torch.Generator())
     inside = math.erf(0.5 * 1.2816 / math.sqrt(2))  # of the 80 % interval at half the width
-    assert evaluate.coverage(pit, 0.8).mean() == pytest.approx(inside, abs=0.02)
+    assert prediction.coverage(pit, 0.8).mean() == pytest.approx(inside, abs=0.02)
 
 
 # The whole -----------------------------------------------------------------------------------------------------------
@@ -404,11 +405,11 @@ def test_overconfidence_shows(predicted: tuple[Tensor, Tensor]) -> None:
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate, "ROWS", 160)  # 8 trajectories of 20 samples
+    monkeypatch.setattr(prediction, "ROWS", 160)  # 8 trajectories of 20 samples
 
 
-def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) -> evaluate.Scores:
-    return evaluate.score(model, FEATURES, data, episodes(40, seed=1), samples=samples, **{**OPEN, **options})
+def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) -> prediction.Scores:
+    return prediction.score(model, FEATURES, data, episodes(40, seed=1), samples=samples, **{**OPEN, **options})
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -416,7 +417,7 @@ def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) ->
 def test_scoring_block_by_block_is_scoring_all_samples_at_once(model: Linear) -> None:
     scores = run(model, episodes(21))
     samples, truth = draw(model, episodes(21), samples=20)
-    whole, pit = evaluate.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
+    whole, pit = prediction.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
     torch.testing.assert_close(scores.pit, pit, rtol=0, atol=1 / 21)  # ranks are drawn between two samples
     assert set(scores.values) == set(whole)
     for metric, value in scores.values.items():
@@ -473,9 +474,9 @@ def test_the_caller_chooses_what_to_average_over() -> None:
     curve = scores.against_horizon(steps)["energy_score"]
     assert curve[7] == pytest.approx(energy[3:5, 7].mean().item())
     assert curve[6].isnan()
-    expected = [evaluate.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in evaluate.LEVELS]
+    expected = [prediction.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in prediction.LEVELS]
     torch.testing.assert_close(scores.calibration(steps), torch.stack(expected))
-    torch.testing.assert_close(scores.calibration(half)[9], evaluate.coverage(scores.pit[:15], 0.5).mean())
+    torch.testing.assert_close(scores.calibration(half)[9], prediction.coverage(scores.pit[:15], 0.5).mean())
 
 
 def test_segments_are_scored_as_the_horizon_is() -> None:
@@ -509,11 +510,11 @@ def test_a_rollout_that_leaves_the_physical_range_is_reported() -> None:
 
     outside = run(Off(), episodes(5)).outside
     assert outside.tolist() == [1, 0, 0, 0, 0]
-    low, high = evaluate.physical_range(episodes(5), episodes(40, seed=1))
+    low, high = prediction.physical_range(episodes(5), episodes(40, seed=1))
     states = np.concatenate([episodes(5).states, episodes(40, seed=1).states]).reshape(-1, 2)
     np.testing.assert_allclose(low, 1.5 * states.min(0) - 0.5 * states.max(0), rtol=1e-4)
     turned = replace(episodes(5), angles=(0,))
-    low, high = evaluate.physical_range(turned)
+    low, high = prediction.physical_range(turned)
     assert high[0] > 1e30
     assert high[1] < 30
 
@@ -525,7 +526,7 @@ def test_a_step_touches_if_the_arm_is_at_the_block_before_or_after_it() -> None:
     states = np.zeros((1, 5, 10))  # the arm lies along x
     states[..., 6:8] = 0.0, 0.15
     states[0, 2, 6:8] = 0.1, 0.02
-    steps = evaluate.contact_steps(states, "tsm/ReacherPush-v0")
+    steps = contacts.contact_steps(states, "tsm/ReacherPush-v0")
     assert steps.tolist() == [[False, True, True, False]]
-    assert evaluate.after_first(steps).tolist() == [[False, True, True, True]]
-    assert evaluate.cut(steps, (0, 2), 2).tolist() == [[False, True], [True, False]]
+    assert contacts.after_first(steps).tolist() == [[False, True, True, True]]
+    assert prediction.cut(steps, (0, 2), 2).tolist() == [[False, True], [True, False]]

@@ -9,13 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import gradients, study
-from tsmlib.control import Task
-from tsmlib.nets import Noise, standard_normal
-from tsmlib.prior import ActionPrior
+from tsmlib import study
+from tsmlib.evaluation import gradients
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.tsm import TSM
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment
-from tsmlib.trajopt import DirectActions, LatentActions
-from tsmlib.tsm import TSM
 
 
 class Lying(torch.autograd.Function):

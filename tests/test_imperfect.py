@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from tsmlib import study
-from tsmlib.envs import DELAY, ENV_IDS, NOISE, fingerprint, imperfect, imperfections
-from tsmlib.envs.base import HALF_RANGE
+from tsmlib.envs import fingerprint, imperfect
+from tsmlib.envs.geometry import HALF_RANGE
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, imperfections
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 

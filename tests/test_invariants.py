@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib.collect import smooth_torques
-from tsmlib.envs import closest_gap
-from tsmlib.envs.base import fingertip
-from tsmlib.invariants import broken, novelty, roughness, shares, within, worst
+from tsmlib.collection import smooth_torques
+from tsmlib.envs.geometry import closest_gap, fingertip
+from tsmlib.evaluation.actions import novelty, roughness, within
+from tsmlib.evaluation.exploitation import broken, shares, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
 

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import evaluate, latent, study
-from tsmlib.envs import closest_gap
-from tsmlib.envs.base import BLOCK_RADIUS, WALL, fingertip
-from tsmlib.latent import Deflections, Seen
-from tsmlib.nets import Features, kl_from_standard_normal
+from tsmlib import statistics, study
+from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
+from tsmlib.evaluation import contacts, exploitation, futures, latent, prediction
+from tsmlib.evaluation.contacts import Deflections
+from tsmlib.evaluation.futures import Seen
+from tsmlib.models.features import Features
+from tsmlib.models.layers import kl_from_standard_normal
+from tsmlib.models.tsm import TSM
+from tsmlib.study.results import latent as latent_results
 from tsmlib.trajectory import Segment, Trajectories, Window
-from tsmlib.tsm import TSM
 
 PUSH = "tsm/ReacherPush-v0"
 
@@ -90,7 +93,7 @@ def test_each_dimension_of_a_linear_decoder_matters_by_its_own_weight() -> None:
 def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder_listens(
     model: TSM, test_data: Trajectories
 ) -> None:
-    seen = latent.look(model, test_data, samples=2, horizon=10)
+    seen = futures.look(model, test_data, samples=2, horizon=10)
     with torch.no_grad():
         for weight in model.decoder.codes.parameters():
             kept = weight.clone()
@@ -102,24 +105,24 @@ def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder
 
 
 def test_windows_hold_the_states_that_scores_are_taken_from(model: TSM, test_data: Trajectories) -> None:
-    seen = latent.look(model, test_data, samples=2, horizon=30)
+    seen = futures.look(model, test_data, samples=2, horizon=30)
     whole = test_data.padded(0)
-    assert torch.equal(seen.window.future.states, evaluate.cut(whole.states, latent.STARTS, 30))
+    assert torch.equal(seen.window.future.states, prediction.cut(whole.states, futures.STARTS, 30))
     assert torch.equal(seen.window.past.states[1], whole.states[0, 30:40])  # the second window of the first episode
     assert seen.samples.shape == (2, 120, 30, 10)
-    touched = evaluate.cut(evaluate.contact_steps(test_data.states, PUSH), latent.STARTS, 30)
-    assert torch.equal(seen.touched, touched)
+    touched = prediction.cut(contacts.contact_steps(test_data.states, PUSH), futures.STARTS, 30)
+    assert torch.equal(contacts.touched(seen), touched)
     assert touched.any()
 
 
 def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(model: TSM, test_data: Trajectories) -> None:
-    seen, episodes = latent.about_to_touch(model, test_data, samples=2, horizon=20)
+    seen, episodes = contacts.about_to_touch(model, test_data, samples=2, horizon=20)
     assert 3 <= len(episodes) < len(test_data)
-    near = closest_gap(seen.window.future.states.numpy(), PUSH) < latent.NEAR
-    assert near[:, latent.LEAD - 1].all()
-    assert not near[:, : latent.LEAD - 1].any()
+    near = closest_gap(seen.window.future.states.numpy(), PUSH) < exploitation.NEAR
+    assert near[:, contacts.LEAD - 1].all()
+    assert not near[:, : contacts.LEAD - 1].any()
     with pytest.raises(ValueError, match="none of the 40 episodes"):
-        latent.about_to_touch(model, test_data, samples=1, horizon=90)
+        contacts.about_to_touch(model, test_data, samples=1, horizon=90)
 
 
 def test_every_step_counts_alike_however_often_it_occurs() -> None:
@@ -131,9 +134,9 @@ def test_every_step_counts_alike_however_often_it_occurs() -> None:
 
 def test_ranks_agree_disagree_or_say_nothing() -> None:
     x = torch.tensor([3.0, 1.0, 2.0, 5.0])
-    assert latent.spearman(x, x**3) == pytest.approx(1)
-    assert latent.spearman(x, -x) == pytest.approx(-1)
-    assert latent.spearman(x, torch.ones(4)) == 0
+    assert statistics.spearman(x, x**3) == pytest.approx(1)
+    assert statistics.spearman(x, -x) == pytest.approx(-1)
+    assert statistics.spearman(x, torch.ones(4)) == 0
 
 
 def test_groups_are_sorted_by_spread() -> None:
@@ -154,7 +157,7 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     net: Any = SimpleNamespace(
         segment_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
     )
-    rows = latent.code_rows(net, seen, rng(), model="tsm+energy", seed=0, scale="smoke")
+    rows = latent_results.code_rows(net, seen, rng(), model="tsm+energy", seed=0, scale="smoke")
     value = {(row["metric"], row["condition"]): row["value"] for row in rows}
     assert value["spread_ratio", "segments"] == pytest.approx(5, rel=0.05)
     assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
@@ -170,7 +173,7 @@ def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> N
         segment_len=10, latent_dim=1, features=Features(10, ()), encode=lambda states: (still, still),
         decode=lambda past, u, z: past.states + noise * torch.randn(past.states.shape, generator=draw),
     )  # fmt: skip
-    rows = latent.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
+    rows = latent_results.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
     [variance] = [row["value"] for row in rows if row["metric"] == "fixed_code_variance"]
     assert variance == pytest.approx(noise**2 / 2, rel=0.2)  # of two, about their mean
 
@@ -182,10 +185,10 @@ def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> N
     limit = WALL - BLOCK_RADIUS
     future[0, 7, 6:10] = torch.tensor([limit - 0.02, 0.2, 1.5, 0.0])  # 2 cm from the wall, fast
     future[0, 8:, 6:10] = torch.tensor([limit - 0.015, 0.2, -0.6, 0.0])  # and already on its way back
-    true, samples = latent.contacts(seen)["object"]
+    true, samples = contacts.contacts(seen)["object"]
     assert true[0].nonzero().flatten().tolist() == [4]
     assert not samples.any()
-    assert latent.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
+    assert contacts.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
 
 
 def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
@@ -193,20 +196,20 @@ def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
     truth[0, 5] = truth[1, 15] = True
     samples = torch.zeros(4, 2, 20, dtype=torch.bool)
     samples[0, 0, 5] = samples[1, 0, 7] = samples[2, 0, 8] = samples[0, 1, 13] = True
-    everything = latent.recall(truth, samples, range(20))
+    everything = contacts.recall(truth, samples, range(20))
     assert everything == {"n": 2, "recall": 3 / 8, "majority": 0.5, "precision": 3 / 4}
-    assert latent.recall(truth, samples, range(10))["recall"] == 0.5
-    assert math.isnan(latent.recall(truth, samples, range(16, 20))["recall"])
+    assert contacts.recall(truth, samples, range(10))["recall"] == 0.5
+    assert math.isnan(contacts.recall(truth, samples, range(16, 20))["recall"])
 
 
 def test_a_planted_deflection_is_read_off_in_degrees() -> None:
     seen = scene(2, steps=30)
-    step = latent.LEAD - 1 + latent.AHEAD
+    step = contacts.LEAD - 1 + contacts.AHEAD
     seen.window.future.states[:, step:, 6] += 0.05  # along x
     way = 0.05 * torch.tensor([math.cos(math.radians(30)), math.sin(math.radians(30))])
     seen.samples[:, 0, step:, 6:8] += way
     seen.samples[0, 1, step:, 7] += 0.1  # one sample to the left and twice as far, the other stays
-    found = latent.deflections(seen)
+    found = contacts.deflections(seen)
     torch.testing.assert_close(torch.rad2deg(found.off[:, 0]), torch.tensor([30.0, 30.0]))
     assert torch.rad2deg(found.off[0, 1]) == pytest.approx(90)
     assert found.still == 0.25
@@ -229,7 +232,7 @@ def test_intervals_of_honest_directions_hold_the_truth_as_often_as_they_should()
 def test_where_nothing_was_moved_there_are_no_deflections_to_tell_of() -> None:
     found = Deflections(torch.zeros(5, 0), torch.zeros(0), torch.zeros(5, 0))
     assert [len(end) for end in found.interval()] == [0, 0]
-    assert latent.deflection_rows(found, PUSH, model="tsm", seed=0, scale="smoke") == []
+    assert latent_results.deflection_rows(found, PUSH, model="tsm", seed=0, scale="smoke") == []
 
 
 def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:
@@ -243,7 +246,7 @@ def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -
 
 
 def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(model: TSM, test_data: Trajectories) -> None:
-    seen = latent.look(model, test_data.take(slice(1)), samples=1, horizon=30)
+    seen = futures.look(model, test_data.take(slice(1)), samples=1, horizon=30)
     window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
     z = torch.randn(1, 3, generator=rng())
     once = latent.futures(model, window, z, 30)
@@ -274,16 +277,18 @@ def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() ->
     row = dict(env=PUSH, model="tsm", condition="object", metric="recall", horizon=10)
     rows = [dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, horizon=h)
             for k in (0, 1) for m in ("recall", "precision", "chance") for h in (10, 20, 30)]  # fmt: skip
-    found = latent.recall_panels(rows, PUSH)
+    found = latent_results.recall_panels(rows, PUSH)
     assert list(found) == ["arm touches object"]
     np.testing.assert_allclose(found["arm touches object"]["tsm"]["recall"], [[0.5] * 3, [0.6] * 3])
-    assert latent.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
+    assert latent_results.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
     kl = dict(env=PUSH, model="tsm", condition="segments contact", metric="kl", seed=0, value=2.0)
-    assert latent.use_panels([kl], [PUSH])["KL per segment"]["Push, with a touch"]["tsm"].tolist() == [2.0]
+    assert latent_results.use_panels([kl], [PUSH])["KL per segment"]["Push, with a touch"]["tsm"].tolist() == [2.0]
 
 
 def test_bars_stand_beside_the_mean_over_seeds() -> None:
     row = dict(metric="kl", condition="segments", env="tsm/Reacher-v0", model="tsm")
-    table = latent.reached([dict(row, value=0.02), dict(row, value=0.04), dict(row, model="lstm", value=9.0)], ["tsm"])
+    table = latent_results.reached(
+        [dict(row, value=0.02), dict(row, value=0.04), dict(row, model="lstm", value=9.0)], ["tsm"]
+    )
     assert "| `tsm/Reacher-v0`: kl | at most 0.1 | 0.03 |" in table
     assert "9" not in table.replace("0.9", "")

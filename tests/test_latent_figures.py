@@ -13,8 +13,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib import figures, style
+from tsmlib import figures
 from tsmlib.envs.render import draw_scene
+from tsmlib.figures import style
 
 LABELS = ("tsm", "tsm+energy+direct")
 DRAW = partial(draw_scene, env_id="tsm/ReacherPush-v0")

@@ -7,10 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import likeness, study
-from tsmlib.collect import smooth_torques
-from tsmlib.control import Trial
-from tsmlib.prior import ActionPrior
+from tsmlib import statistics, study
+from tsmlib.collection import smooth_torques
+from tsmlib.evaluation import actions as actions_evaluation
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.planning.execution import Trial
+from tsmlib.study.results import action_prior as action_prior_results
 
 
 def smooth(n: int, seed: int, rms: float = 0.1) -> Tensor:
@@ -19,49 +21,51 @@ def smooth(n: int, seed: int, rms: float = 0.1) -> Tensor:
 
 def test_a_spectrum_integrates_to_the_mean_square_and_peaks_where_a_sine_is() -> None:
     actions = smooth(300, 0)
-    frequency, power = likeness.spectrum(actions - actions.mean(1, keepdim=True))
+    frequency, power = actions_evaluation.spectrum(actions - actions.mean(1, keepdim=True))
     total = (actions - actions.mean(1, keepdim=True)).square().mean()
     assert power.sum() * (frequency[1] - frequency[0]) == pytest.approx(float(total), rel=1e-3)
     sine = torch.sin(2 * torch.pi * 8 * 0.02 * torch.arange(50))[None, :, None]
-    frequency, power = likeness.spectrum(sine)
+    frequency, power = actions_evaluation.spectrum(sine)
     assert frequency[power.argmax()] == pytest.approx(8)
 
 
 def test_an_auc_is_the_chance_to_rank_right() -> None:
     low, high = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0, 5.0])
-    assert likeness.auc(high, low) == 1
-    assert likeness.auc(low, high) == 0
-    assert likeness.auc(low, low) == 0.5
-    assert likeness.auc(torch.tensor([2.0, 5.0]), torch.tensor([1.0, 2.0, 3.0])) == pytest.approx(4.5 / 6)
+    assert statistics.auc(high, low) == 1
+    assert statistics.auc(low, high) == 0
+    assert statistics.auc(low, low) == 0.5
+    assert statistics.auc(torch.tensor([2.0, 5.0]), torch.tensor([1.0, 2.0, 3.0])) == pytest.approx(4.5 / 6)
 
 
 def test_what_is_drawn_alike_is_not_told_apart_and_planted_differences_are() -> None:
     draw = torch.Generator().manual_seed(0)
     first, second = (torch.randn(400, 3, generator=draw, dtype=torch.double) for _ in range(2))
-    assert likeness.told_apart(first, second) == pytest.approx(0.5, abs=0.06)
-    assert likeness.told_apart(first + torch.tensor([2.0, 0, 0]), second) > 0.85
-    assert likeness.told_apart(0.2 * first, second) > 0.85  # the same mean, only narrower
+    assert statistics.told_apart(first, second) == pytest.approx(0.5, abs=0.06)
+    assert statistics.told_apart(first + torch.tensor([2.0, 0, 0]), second) > 0.85
+    assert statistics.told_apart(0.2 * first, second) > 0.85  # the same mean, only narrower
     with pytest.raises(ValueError, match="9 and 400 rows are too few"):
-        likeness.told_apart(first[:9], second)
+        statistics.told_apart(first[:9], second)
 
 
 def test_data_are_like_data_and_sharp_torques_are_not() -> None:
     held_out, train = smooth(200, 1), smooth(200, 2)
-    value = {r["metric"]: r["value"] for r in likeness.rows(smooth(100, 3), held_out, train, env="e")}
+    value = {r["metric"]: r["value"] for r in action_prior_results.rows(smooth(100, 3), held_out, train, env="e")}
     assert value["change_ratio"] == pytest.approx(1, abs=0.1)
     assert value["auc"] == pytest.approx(0.5, abs=0.12)
     sharp = 0.3 * torch.randn(100, 50, 2, generator=torch.Generator().manual_seed(0)).sign()
-    found = {r["metric"]: r["value"] for r in likeness.rows(sharp, held_out, train, env="e")}
+    found = {r["metric"]: r["value"] for r in action_prior_results.rows(sharp, held_out, train, env="e")}
     assert found["auc"] > 0.99
-    assert found["change_ratio"] > likeness.SHARPER
+    assert found["change_ratio"] > action_prior_results.SHARPER
     assert found["novelty"] > 2 * value["novelty"]
-    few = likeness.rows(sharp[:5], held_out, train, env="e")
+    few = action_prior_results.rows(sharp[:5], held_out, train, env="e")
     assert "auc" not in {row["metric"] for row in few}
 
 
 def test_gentle_torques_of_the_same_shape_differ_in_size_alone() -> None:
     held_out, train = smooth(200, 1), smooth(200, 2)
-    value = {r["metric"]: r["value"] for r in likeness.rows(smooth(100, 3, rms=0.03), held_out, train, env="e")}
+    value = {
+        r["metric"]: r["value"] for r in action_prior_results.rows(smooth(100, 3, rms=0.03), held_out, train, env="e")
+    }
     assert value["auc"] > 0.95
     assert value["auc_shape"] == pytest.approx(0.5, abs=0.12)
 
@@ -69,12 +73,12 @@ def test_gentle_torques_of_the_same_shape_differ_in_size_alone() -> None:
 def test_torques_of_the_prior_begin_at_rest_and_stay_within_bounds() -> None:
     torch.manual_seed(0)
     prior = ActionPrior(2, channels=8).fit_scale(smooth(50, 0))
-    drawn = likeness.drawn(prior, 7, 50, torch.Generator().manual_seed(0))
+    drawn = actions_evaluation.drawn(prior, 7, 50, torch.Generator().manual_seed(0))
     assert drawn.shape == (7, 50, 2)
     assert drawn.abs().max() <= 1
-    again = likeness.told_again(prior, smooth(7, 0))
+    again = actions_evaluation.told_again(prior, smooth(7, 0))
     assert again.shape == (7, 50, 2)
-    alone = likeness.told_again(prior, smooth(7, 0)[:1, :10])
+    alone = actions_evaluation.told_again(prior, smooth(7, 0)[:1, :10])
     torch.testing.assert_close(again[:1, :10], alone)  # later segments do not matter
 
 
@@ -84,20 +88,22 @@ def test_what_codes_cost_is_counted_per_target() -> None:
     plans = smooth(20, 5)
     over_actions = Trial(plans, torch.zeros(20, 51, 6), -torch.ones(20), torch.full((20,), 0.01))
     over_codes = Trial(plans, torch.zeros(20, 51, 6), -torch.ones(20) - distance, torch.full((20,), 0.03))
-    rows, found = likeness.cost_of_prior(task, over_codes, over_actions, smooth(100, 1), smooth(200, 2), seed=0)
+    rows, found = action_prior_results.cost_of_prior(
+        task, over_codes, over_actions, smooth(100, 1), smooth(200, 2), seed=0
+    )
     value = {row["metric"]: row["value"] for row in rows}
     torch.testing.assert_close(found["lost"], distance, atol=1e-6, rtol=0)
     assert value["lost_with_distance"] == pytest.approx(1)
     assert value["further"] == pytest.approx(0.02)
     assert value["outside"] <= 0.3
     wild = Trial(torch.ones(20, 50, 2), over_actions.states, over_actions.true, over_actions.final_distance)
-    rows, _ = likeness.cost_of_prior(task, over_codes, wild, smooth(100, 1), smooth(200, 2), seed=0)
+    rows, _ = action_prior_results.cost_of_prior(task, over_codes, wild, smooth(100, 1), smooth(200, 2), seed=0)
     assert {row["metric"]: row["value"] for row in rows}["outside"] == 1
 
 
 def test_a_table_has_a_line_per_method_and_a_mean_over_seeds() -> None:
     row = dict(env="e", metric="change", model="tsm", planner="cem", prior="codes", condition="clean", n=100)
-    table = likeness.board([dict(row, value=0.1), dict(row, value=0.3)], "e")
+    table = action_prior_results.board([dict(row, value=0.1), dict(row, value=0.3)], "e")
     (line,) = [line for line in table.splitlines() if line.startswith("| tsm")]
     assert "| tsm, cem over codes | 100 |" in line
     assert "| 0.2 |" in line

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import store, study
-from tsmlib.control import Task, execute
-from tsmlib.nets import Features
-from tsmlib.policy_report import learning_curves
+from tsmlib import study
+from tsmlib.models.features import Features
+from tsmlib.planning.execution import execute
+from tsmlib.planning.tasks import Task
 from tsmlib.rewards import push, reach
-from tsmlib.runs import ROOT
+from tsmlib.storage import tables
+from tsmlib.study.results.policies import learning_curves
+from tsmlib.study.runs import ROOT
 
 FOLDER = ROOT / "benchmarks" / "model_free"
 needs_sb3 = pytest.mark.skipif(
@@ -118,7 +120,7 @@ def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path
     model_free.Table(path).put(key, task, records(0, 500, 1000))
     kept = model_free.Table(path).kept(key, 1000)
     assert [row["value"] for row in kept if row["metric"] == "return_true"] == [-1.0, -2.0, -3.0]
-    assert len(store.load_table(path)) == (4 * 2 + 3) * len(model_free.UNITS)
+    assert len(tables.load_table(path)) == (4 * 2 + 3) * len(model_free.UNITS)
 
 
 def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
@@ -127,7 +129,7 @@ def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
         key = dict(env=task.env, model="trpo", condition="learning", configuration="std=0.14", seed=seed)
         table.put(key, task, [record | {"seconds": 99.0} for record in records(0, 500, 1000)])
     table.put(key | {"condition": "search"}, task, records(200))
-    curves = learning_curves(store.load_table(table.path))["reach"]["trpo"]
+    curves = learning_curves(tables.load_table(table.path))["reach"]["trpo"]
     assert curves["return_true"].tolist() == [[-1.0, -2.0, -3.0]] * 3
     assert curves["samples"].tolist() == [0, 500, 1000]
     assert curves["seconds"].tolist() == [-1.0, -2.0, -3.0]  # the processor's
@@ -178,7 +180,7 @@ def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureF
         model_free.main([*command, "--out", str(path)])
     first, second = capsys.readouterr().out.split(f"{path}\n")[:2]
     assert first == second
-    rows = store.load_table(path)
+    rows = tables.load_table(path)
     assert {row["seed"] for row in rows if row["condition"] == "learning"} == {0, 1}
     assert len({row["configuration"] for row in rows if row["condition"] == "search"}) == 6
     assert len({row["configuration"] for row in rows if row["condition"] == "learning"}) == 1

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from tsmlib.envs import MUJOCO_IDS, SimulationUnstable, closest_gap, mujoco_arm
-from tsmlib.envs.base import (
+from tsmlib.envs import mujoco_arm
+from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.envs.geometry import (
     ARM_RADIUS,
     BLOCK_DECAY,
     BLOCK_RADIUS,
@@ -21,9 +22,11 @@ from tsmlib.envs.base import (
     LINK_LENGTHS,
     RESTITUTION,
     WALL,
+    closest_gap,
     fingertip,
 )
 from tsmlib.envs.mujoco_arm import MujocoArm, load_model
+from tsmlib.envs.spec import MUJOCO_IDS
 
 REACHER, OBSTACLE, PUSH = MUJOCO_IDS
 DATA_RMS = 0.05  # rms of the torques that data are collected with

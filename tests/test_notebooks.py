@@ -11,7 +11,8 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import parameters, runs, store
+from tsmlib.storage import manifest, tables
+from tsmlib.study import notebooks, parameters, runs
 
 NOTEBOOKS = list(runs.notebooks().values())
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -61,11 +62,11 @@ def test_a_notebook_takes_a_scale_a_seed_and_a_folder(path: Path) -> None:
 def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
     for path in NOTEBOOKS:
-        runs.execute(path, scale="smoke", progress=False)
-        rows = store.load_table(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv")
+        notebooks.execute(path, scale="smoke", progress=False)
+        rows = tables.load_table(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv")
         assert rows
         assert {row["scale"] for row in rows} == {"smoke"}
-    status = store.read_json(tmp_path / "smoke" / "seed0" / "status.json")
+    status = manifest.read_json(tmp_path / "smoke" / "seed0" / "status.json")
     assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
-    store.verify(tmp_path)
+    manifest.verify(tmp_path)
     assert not list(tmp_path.rglob("*.tmp-*"))

@@ -10,11 +10,14 @@ import torch
 from torch import Tensor
 
 from tsmlib import rewards, study
-from tsmlib.control import Task, execute, zero_torques
-from tsmlib.prior import ActionPrior
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.tsm import TSM
+from tsmlib.planning.execution import execute
+from tsmlib.planning.planners import adam, cem, mppi
+from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.rewards import Reward
-from tsmlib.trajopt import DirectActions, LatentActions, adam, cem, mppi, through_model, through_simulator
-from tsmlib.tsm import TSM
 
 REACHER, N, T = "tsm/Reacher-v0", 3, 20
 ANGLE = torch.linspace(0, math.pi / 2, T)

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from tsmlib import runs, study
-from tsmlib.envs import ENV_IDS
-from tsmlib.runs import Run, RunError
+from tsmlib import study
+from tsmlib.envs.spec import ENV_IDS
+from tsmlib.study import runs
+from tsmlib.study.runs import Run, RunError
 
 
 def write(run: Run, name: str) -> None:

@@ -16,11 +16,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import runs, store, study
-from tsmlib.control import Trial
-from tsmlib.dynamics import rollout
-from tsmlib.nets import Features, SharedNoise
-from tsmlib.runs import ROOT
+from tsmlib import study
+from tsmlib.models.base import rollout
+from tsmlib.models.features import Features
+from tsmlib.planning.execution import Trial
+from tsmlib.sampling import SharedNoise
+from tsmlib.storage import tables
+from tsmlib.study import runs
+from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment, Trajectories
 
 FOLDER = ROOT / "benchmarks" / "peers"
@@ -177,7 +180,7 @@ def test_rows_of_the_same_model_are_replaced(tmp_path: Path) -> None:
     path = tmp_path / "peers_pets.csv"
     for model, value in (("pets", 1.0), ("pets+mse", 2.0), ("pets", 3.0)):
         pets.table(path, [dict(env="arm", model=model, seed=0, metric="nrmse", value=value)])
-    assert {row["model"]: row["value"] for row in store.load_table(path)} == {"pets": 3.0, "pets+mse": 2.0}
+    assert {row["model"]: row["value"] for row in tables.load_table(path)} == {"pets": 3.0, "pets+mse": 2.0}
 
 
 # Beside ours: speed.py --------------------------------------------------------------------------------------------

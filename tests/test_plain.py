@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.nets import CausalDecoder
-from tsmlib.prior import ActionPrior
-from tsmlib.runs import ROOT
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.layers import CausalDecoder
+from tsmlib.models.tsm import TSM
+from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment, Window
-from tsmlib.tsm import TSM
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 

@@ -13,27 +13,22 @@ import torch
 from torch import Tensor
 
 import tsmlib.envs  # noqa: F401 - registers the environments
-from tsmlib import runs, store, study
-from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.collect import collect
-from tsmlib.dynamics import rollout, stepper
-from tsmlib.nets import CausalDecoder, Noise, SeparateNoise, standard_normal
-from tsmlib.policy import (
-    LearningCurve,
-    OneStepPolicy,
-    SegmentPolicy,
-    controller,
-    discounted,
-    episodes_from,
-    imagine,
-    improve,
-    learning_rate,
-)
-from tsmlib.prior import ActionPrior
+from tsmlib import study
+from tsmlib.collection import collect
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import rollout, stepper
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.layers import CausalDecoder
+from tsmlib.models.tsm import TSM
+from tsmlib.policies.learning import LearningCurve, discounted, episodes_from, imagine, improve, learning_rate
+from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
-from tsmlib.train import TrainingStopped
+from tsmlib.sampling import Noise, SeparateNoise, standard_normal
+from tsmlib.storage import artifacts, files
+from tsmlib.study import runs
+from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
-from tsmlib.tsm import TSM
 
 DX, DU, H, DT = 6, 2, 4, 0.5
 SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
@@ -344,7 +339,7 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
     assert again.predicted == curve.predicted
     assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
-    with pytest.raises(store.StoreError, match="another run: horizon is 5 in the file, expected 6. Delete"):
+    with pytest.raises(files.StoreError, match="another run: horizon is 5 in the file, expected 6. Delete"):
         learn(anew, horizon=6, **settings)
 
 
@@ -374,12 +369,12 @@ def test_targets_fill_the_disc_evenly_and_starts_are_among_those_given() -> None
 def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
     actor, path = policy(kind, copies=2), tmp_path / "policy.safetensors"
     actor.features.fit(normal(5, 8, 4))
-    store.save_model(path, actor.float(), {"fingerprint": {"env": "tsm/Reacher-v0"}})
-    again = store.load_model(path, type(actor), expect={"env": "tsm/Reacher-v0"})
+    artifacts.save_model(path, actor.float(), {"fingerprint": {"env": "tsm/Reacher-v0"}})
+    again = artifacts.load_model(path, type(actor), expect={"env": "tsm/Reacher-v0"})
     past, target = Segment(*(part.float() for part in some_past(4, 4))), torch.ones(4, 2)
     assert torch.equal(controller(again, target)(past), controller(actor, target)(past))
-    with pytest.raises(store.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
-        store.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v0"})
+    with pytest.raises(files.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
+        artifacts.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v0"})
 
 
 @pytest.mark.parametrize("prior", ["codes", "actions"])

@@ -12,9 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib import policy_report, style
-from tsmlib.policy_figures import AXES, figure7
-from tsmlib.style import interval
+from tsmlib.figures import style
+from tsmlib.figures.policies import AXES, figure7
+from tsmlib.statistics import interval
+from tsmlib.study.results import policies as policies_results
 
 LABELS = ("tsm codes", "tsm actions", "tsm+energy+direct codes", "onestep actions", "lstm actions")
 FLOORS = {"reach": {"oracle codes cem": -4.2, "oracle actions cem": -4.1, "zero": -12.0}}
@@ -182,7 +183,7 @@ def header(seed: int = 0, copies: int = 2, records: int = 3, **changed: Any) -> 
 
 
 def rows(**options: Any) -> list[dict[str, Any]]:
-    return policy_report.learning_rows(header(**options), samples=50_000, train_seconds=100.0)
+    return policies_results.learning_rows(header(**options), samples=50_000, train_seconds=100.0)
 
 
 def test_rows_hold_every_record_of_every_copy_and_the_cost() -> None:
@@ -197,7 +198,7 @@ def test_rows_hold_every_record_of_every_copy_and_the_cost() -> None:
 
 
 def test_rows_become_curves_again_with_copies_and_seeds_as_lines() -> None:
-    curves = policy_report.learning_curves([*rows(), *rows(seed=1), {"condition": "clean"}])["reach"]["tsm codes"]
+    curves = policies_results.learning_curves([*rows(), *rows(seed=1), {"condition": "clean"}])["reach"]["tsm codes"]
     assert curves["return_true"].tolist() == [[0, -1, -2], [-1, -2, -3], [-1, -2, -3], [-2, -3, -4]]
     assert curves["iterations"].tolist() == [0, 220, 440]
     assert curves["seconds"].tolist() == [100, 150, 200]  # training of the model comes first
@@ -206,11 +207,11 @@ def test_rows_become_curves_again_with_copies_and_seeds_as_lines() -> None:
 
 
 def test_rows_survive_a_table(tmp_path: Any) -> None:
-    from tsmlib import store
+    from tsmlib.storage import tables
 
     path = tmp_path / "learning.csv"
-    store.save_table(path, rows(), extra=policy_report.EXTRA)
-    before, after = policy_report.learning_curves(rows()), policy_report.learning_curves(store.load_table(path))
+    tables.save_table(path, rows(), extra=policies_results.EXTRA)
+    before, after = policies_results.learning_curves(rows()), policies_results.learning_curves(tables.load_table(path))
     for word, values in before["reach"]["tsm codes"].items():
         np.testing.assert_array_equal(after["reach"]["tsm codes"][word], values)
 
@@ -225,22 +226,22 @@ def test_rows_survive_a_table(tmp_path: Any) -> None:
 )
 def test_rows_that_do_not_belong_together_are_refused(more: list[dict[str, Any]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        policy_report.learning_curves([*rows(), *more])
+        policies_results.learning_curves([*rows(), *more])
 
 
 def test_seeds_that_stopped_early_are_left_out_of_a_growing_table() -> None:
     growing = [*rows(), *rows(seed=1, records=2), *rows(seed=2, records=2, model="lstm")]
-    curves = policy_report.learning_curves(policy_report.finished(growing))["reach"]
+    curves = policies_results.learning_curves(policies_results.finished(growing))["reach"]
     assert {label: len(own["return_true"]) for label, own in curves.items()} == {"tsm codes": 2, "lstm codes": 2}
-    assert policy_report.learning_curves(policy_report.finished(rows())).keys() == {"reach"}
+    assert policies_results.learning_curves(policies_results.finished(rows())).keys() == {"reach"}
 
 
 def test_samples_to_reach_a_level_are_read_off_the_mean_curve() -> None:
     curves = {"return_true": np.array([[-10.0, -6.0, -4.0], [-10.0, -8.0, -4.0]]), "samples": np.array([0, 100, 200])}
-    assert policy_report.reached(curves, -10.0) == 0
-    assert policy_report.reached(curves, -8.5) == 50
-    assert policy_report.reached(curves, -5.5) == 150
-    assert policy_report.reached(curves, -3.0) is None
+    assert policies_results.reached(curves, -10.0) == 0
+    assert policies_results.reached(curves, -8.5) == 50
+    assert policies_results.reached(curves, -5.5) == 150
+    assert policies_results.reached(curves, -3.0) is None
 
 
 def ended(*means: float, prior: bool = True) -> dict[str, np.ndarray]:
@@ -255,7 +256,7 @@ def ended(*means: float, prior: bool = True) -> dict[str, np.ndarray]:
 def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all_come_to() -> None:
     curves = {"tsm codes": ended(-12, -4, -3), "ppo": ended(-13, -8, -2, prior=False)}
     curves |= {"trpo": ended(-13, -13, -9, prior=False)}
-    rows = policy_report.plateau_rows(curves, steps=50, env="tsm/Reacher-v0")  # from -12 to -3: 90 % is -3.9
+    rows = policies_results.plateau_rows(curves, steps=50, env="tsm/Reacher-v0")  # from -12 to -3: 90 % is -3.9
     found = {(row["model"], row["metric"]): row["value"] for row in rows}
     assert found["tsm", "samples_to_90"] == pytest.approx(50 * 110)
     assert found["tsm", "env_samples_to_90"] == 5000
@@ -263,44 +264,46 @@ def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all
     assert found["ppo", "samples_to_90"] == found["ppo", "env_samples_to_90"] == pytest.approx(100 + 410 / 6)
     assert found["trpo", "samples_to_90"] == 200  # never: all that it took
     assert {row["horizon"] for row in rows if "horizon" in row} == set()
-    assert len(policy_report.plateaus([row | {"task": "reach"} for row in rows]).splitlines()) == 5
+    assert len(policies_results.plateaus([row | {"task": "reach"} for row in rows]).splitlines()) == 5
 
 
 def test_policies_that_gain_nothing_have_no_plateau() -> None:
-    assert policy_report.plateau_rows({"tsm codes": ended(-4, -4.5), "ppo": ended(-9, -2, prior=False)}, steps=50) == []
-    assert policy_report.plateau_rows({}, steps=50) == []
-    assert policy_report.plateaus([]) == ""
+    assert (
+        policies_results.plateau_rows({"tsm codes": ended(-4, -4.5), "ppo": ended(-9, -2, prior=False)}, steps=50) == []
+    )
+    assert policies_results.plateau_rows({}, steps=50) == []
+    assert policies_results.plateaus([]) == ""
 
 
 def test_what_belongs_to_no_point_of_a_curve_is_passed_over(tmp_path: Any) -> None:
     more = [{**rows()[0], "metric": "samples_to_90", "horizon": ""}]
-    more += policy_report.learning_rows(header(), samples=50_000, train_seconds=100.0, within_data=[0.25, 0.75])
+    more += policies_results.learning_rows(header(), samples=50_000, train_seconds=100.0, within_data=[0.25, 0.75])
     assert [(row["copy"], row["value"], row["horizon"]) for row in more if row["metric"] == "within_data"] == [
         (0, 0.25, 440), (1, 0.75, 440),
     ]  # fmt: skip
     more.append({column: value for column, value in more[0].items() if column != "horizon"})  # not yet from a table
-    curves = policy_report.learning_curves(more)["reach"]["tsm codes"]
+    curves = policies_results.learning_curves(more)["reach"]["tsm codes"]
     np.testing.assert_array_equal(
-        curves["return_true"], policy_report.learning_curves(rows())["reach"]["tsm codes"]["return_true"]
+        curves["return_true"], policies_results.learning_curves(rows())["reach"]["tsm codes"]["return_true"]
     )
 
 
 def test_the_report_has_one_line_per_policy_with_its_last_record() -> None:
-    text = policy_report.report(policy_report.learning_curves([*rows(), *rows(seed=2)]))
+    text = policies_results.report(policies_results.learning_curves([*rows(), *rows(seed=2)]))
     assert "| reach | TSM, codes | 4 | -3.500 ±" in text
     assert "| 50,000 | 200 |" in text
     assert len(text.splitlines()) == 3
 
 
 def test_references_are_the_oracles_and_zero_torque() -> None:
-    from tsmlib import store
-    from tsmlib.runs import ROOT
+    from tsmlib.storage import tables
+    from tsmlib.study.runs import ROOT
 
-    rows = store.load_table(ROOT / "data" / "results" / "05_control.csv")
-    found = policy_report.references(row for row in rows if row["sim"] == "mujoco")
+    rows = tables.load_table(ROOT / "data" / "results" / "05_control.csv")
+    found = policies_results.references(row for row in rows if row["sim"] == "mujoco")
     assert {"reach", "push"} <= set(found)
     for levels in (found["reach"], found["push"]):
         assert max(levels.values()) > levels["zero"]
         assert {label.split()[0] for label in levels} == {"oracle", "zero"}
     with pytest.raises(ValueError, match="of one of them"):
-        policy_report.references([*rows, *(row | {"env": row["env"].replace("tsm/", "tsm/Pymunk")} for row in rows)])
+        policies_results.references([*rows, *(row | {"env": row["env"].replace("tsm/", "tsm/Pymunk")} for row in rows)])

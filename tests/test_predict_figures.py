@@ -11,7 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib import axes, figures, gallery, predict_figures, style
+from tsmlib import figures, statistics
+from tsmlib.figures import axes, rollouts, style
+from tsmlib.figures import data as data_figures
+from tsmlib.figures import prediction as prediction_figures
 
 MODELS = ("tsm", "tsm+energy", "tsm+teacher", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse")
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
@@ -78,10 +81,10 @@ def test_every_figure_is_laid_out_without_warnings_and_none_is_left_open(name: s
 
 
 def test_every_figure_of_predictions_is_tested_and_reached_from_figures() -> None:
-    modules = vars(predict_figures) | vars(gallery)
+    modules = vars(prediction_figures) | vars(rollouts)
     public = {name for name, value in modules.items() if getattr(value, "__wrapped__", None)}
     assert public == {name.partition(",")[0] for name in EVERY}
-    assert all(getattr(figures, name) is modules[name] for name in public)
+    assert all(getattr(data_figures, name) is modules[name] for name in public)
 
 
 def test_every_model_has_its_colour_and_marker_in_every_figure() -> None:
@@ -101,7 +104,7 @@ def test_figure5_marks_the_mean_over_seeds_and_its_interval() -> None:
     seeds = np.array([1.0, 2.0, 4.0])
     (ax,) = figures.figure5({ENVS[0]: {"tsm": seeds, "lstm": seeds + 1}}).axes
     bar, mark = (line.get_ydata() for line in lines(ax, "tsm"))
-    mean, half = style.interval(seeds)
+    mean, half = statistics.interval(seeds)
     np.testing.assert_allclose(mark, [mean])
     np.testing.assert_allclose(bar, [mean - half, mean + half])
 

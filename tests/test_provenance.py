@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tsmlib.provenance import _commit
+from tsmlib.storage.provenance import _commit
 
 git = shutil.which("git")
 

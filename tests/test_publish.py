@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from tsmlib import publish, store
-from tsmlib.runs import Run, RunError
+from tsmlib.storage import files, manifest
+from tsmlib.storage import tables as tables_storage
+from tsmlib.study import publish
+from tsmlib.study.runs import Run, RunError
 
 
 def seed(base: Path, k: int, state: str = "complete") -> Run:
@@ -17,9 +19,9 @@ def seed(base: Path, k: int, state: str = "complete") -> Run:
     for notebook in publish.POOLED:
         row: dict[str, Any] = dict(metric="kl", value=k, seed=k, scale="paper", env="tsm/Reacher-v0")
         more = {"dimension": 1} if notebook == "04_latent" else {}
-        store.save_table(run.metrics / f"{notebook}.csv", [row | more], extra=list(more))
+        tables_storage.save_table(run.metrics / f"{notebook}.csv", [row | more], extra=list(more))
     entries = {notebook: {"state": state, "files": {}} for notebook in publish.POOLED}
-    store.write_json(run.dir / store.STATUS, {name: store.sealed(entry) for name, entry in entries.items()})
+    manifest.write_json(run.dir / files.STATUS, {name: manifest.sealed(entry) for name, entry in entries.items()})
     return run
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tsmlib.envs import PYMUNK_IDS, SimulationUnstable, closest_gap
-from tsmlib.envs.base import (
+from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.geometry import (
     BLOCK_DECAY,
     BLOCK_MASS,
     BLOCK_RADIUS,
@@ -17,10 +17,11 @@ from tsmlib.envs.base import (
     GEAR,
     LINK_LENGTHS,
     WALL,
-    ArmVectorEnv,
+    closest_gap,
     fingertip,
 )
 from tsmlib.envs.pymunk_arm import ARMATURE, DAMPING, ELBOW_MASS
+from tsmlib.envs.spec import PYMUNK_IDS
 
 REACHER, OBSTACLE, PUSH = PYMUNK_IDS
 N, T = 40, 100

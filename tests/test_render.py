@@ -6,9 +6,10 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from tsmlib.envs import ENV_IDS, PYMUNK_IDS, render
-from tsmlib.envs.base import fingertip
+from tsmlib.envs import render
+from tsmlib.envs.geometry import fingertip
 from tsmlib.envs.render import EXTENT, draw_scene, render_array
+from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS
 
 
 def a_state(env_id: str, q: tuple[float, float] = (0.5, 1.0), block: tuple[float, float] = (-0.1, -0.15)) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -12,8 +13,9 @@ import pytest
 import yaml
 
 import tsmlib
-from tsmlib import publish, store
-from tsmlib.runs import ROOT
+from tsmlib.storage import manifest
+from tsmlib.study import publish
+from tsmlib.study.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = sorted((ROOT / "tsmlib").rglob("*.py"))
@@ -36,7 +38,8 @@ def test_the_lock_holds_exact_versions_and_no_addresses() -> None:
 
 
 def test_the_lock_covers_every_dependency() -> None:
-    wanted = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]
+    extras = PROJECT["optional-dependencies"].values()
+    wanted = [*PROJECT["dependencies"], *(line for lines in extras for line in lines)]
     names = {re.split(r"[<>=!~\[ ]", line)[0].lower().replace("_", "-") for line in wanted}
     assert names <= {name.lower().replace("_", "-") for name in pins()}
 
@@ -87,64 +90,19 @@ def test_nothing_can_execute_what_it_reads(path: Path) -> None:
             assert called not in ("eval", "exec", "torch.load", "torch.save", "np.load", "np.save", "yaml.load"), called
 
 
-def uses() -> dict[str, set[str]]:
-    """Module -> the other modules of the package that it imports; ``envs`` is one module."""
-    found: dict[str, set[str]] = {}
-    for path in MODULES:
-        name = path.relative_to(ROOT / "tsmlib").with_suffix("").parts[0]
-        found.setdefault(name, set()).update(n.split(".")[1] for n in imported(path) if n.startswith("tsmlib."))
-    return {name: needs - {name} for name, needs in found.items()}
-
-
-PICTURES = {"style", "axes", "diagrams", "film", "figures", "gallery", "knobs"}
-PICTURES |= {"latent_figures", "plan_figures", "policy_figures", "predict_figures", "prior_figures", "robust_figures"}
-PICTURES |= {"speed_figures"}
-ALONE = {"disk", "envs", "rewards", "nets", "trajectory"}
-
-
-def test_the_lowest_modules_import_nothing_else_of_the_package() -> None:
-    assert {name: needs for name, needs in uses().items() if name in ALONE} == {name: set() for name in ALONE}
-
-
-def test_figures_know_nothing_but_figures() -> None:
-    needs = uses()
-    assert needs["style"] == needs["film"] == {"disk"}
-    for name in ("diagrams", "plan_figures", "axes"):
-        assert needs[name] == {"style"}, name
-    for name in ("predict_figures", "gallery", "latent_figures", "prior_figures", "speed_figures"):
-        assert needs[name] == {"axes", "style"}, name
-    assert needs["robust_figures"] == {"axes", "policy_figures", "style"}
-    assert needs["figures"] <= PICTURES
-
-
-def test_what_computes_draws_nothing() -> None:
-    for name, needs in uses().items():
-        if name not in PICTURES | {"report", "scoreboard", "policy_report", "robust_report", "claims", "claim_report"}:
-            assert not needs & PICTURES, name
-
-
-def test_what_notebooks_share_is_used_by_nothing_below_them() -> None:
-    assert {name for name, needs in uses().items() if "study" in needs} <= {"publish", "__main__"}
-
-
 def test_imports_point_one_way() -> None:
-    """Nobody imports what is above it, so every module can be read knowing only those below."""
-    left = uses()
-    assert left["store"] == {"disk", "provenance", "trajectory"}
-    assert left["runs"] <= {"store", "disk", "provenance", "parameters"}
-    assert not left["disk"] | left["provenance"] | left["parameters"]
-    while left:  # a round that finds nothing means a circle
-        free = [name for name, needs in left.items() if not needs & set(left)]
-        assert free, f"imports go in a circle among {sorted(left)}"
-        for name in free:
-            del left[name]
+    """The contracts of pyproject.toml: layers, figures that take arrays, models that know no physics."""
+    done = subprocess.run(
+        [str(Path(sys.executable).with_name("lint-imports"))], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.skipif(not (ROOT / "data").exists(), reason="nothing ships")
 def test_everything_that_ships_is_intact_and_listed() -> None:
     shipped = {path for path in (ROOT / "data").rglob("*") if path.is_file() and not path.name.startswith(".")}
-    again = "python -c 'from tsmlib import store; store.write_manifest(\"data\")'"
-    assert not shipped or set(store.verify(ROOT / "data")) == shipped, f"list what is new: {again}"
+    again = "python -c 'from tsmlib.storage import manifest; manifest.write_manifest(\"data\")'"
+    assert not shipped or set(manifest.verify(ROOT / "data")) == shipped, f"list what is new: {again}"
 
 
 def test_what_running_leaves_behind_is_ignored() -> None:

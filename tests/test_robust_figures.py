@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib import style
-from tsmlib.robust_figures import advantage_map, figure8, filtering, imperfect_episode
-from tsmlib.style import interval
+from tsmlib.figures import style
+from tsmlib.figures.robustness import advantage_map, figure8, filtering, imperfect_episode
+from tsmlib.statistics import interval
 
 STEPS, DT = 20, 0.02
 FLOOR = {"random": -13.5, "zero": -12.1}

@@ -11,15 +11,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import figures, robust_report, robustness, study
-from tsmlib.baselines import OneStep
-from tsmlib.dynamics import rollout
-from tsmlib.envs import NOISE, imperfect
-from tsmlib.envs.base import HALF_RANGE, fingertip
-from tsmlib.nets import Noise
-from tsmlib.robustness import KalmanFilter, WithoutPastActions, errors, rmse
+from tsmlib import figures, study
+from tsmlib.envs import imperfect
+from tsmlib.envs.geometry import HALF_RANGE, fingertip
+from tsmlib.envs.spec import NOISE
+from tsmlib.evaluation import filtering
+from tsmlib.evaluation.filtering import KalmanFilter, errors, rmse
+from tsmlib.models.base import rollout
+from tsmlib.models.baselines import OneStep
+from tsmlib.models.tsm import TSM
+from tsmlib.sampling import Noise
+from tsmlib.study.predictions import WithoutPastActions
+from tsmlib.study.results import robustness as robustness_results
 from tsmlib.trajectory import Segment, Trajectories
-from tsmlib.tsm import TSM
 
 REACHER = "tsm/Reacher-v0"
 NOISY, LATE = imperfect(REACHER, noise=NOISE), imperfect(REACHER, delay=5)
@@ -90,7 +94,7 @@ def test_the_raw_observation_is_off_by_the_noise(test_data: Pair) -> None:
 )  # fmt: skip
 def test_a_condition_names_what_is_imperfect(noise: float, delay: int, word: str) -> None:
     for env in (REACHER, "tsm/PymunkObstacle-v0"):
-        assert robustness.condition(imperfect(env, noise=noise, delay=delay)) == word
+        assert robustness_results.condition(imperfect(env, noise=noise, delay=delay)) == word
 
 
 def test_rows_of_an_imperfect_arm_become_rows_of_the_plain_one() -> None:
@@ -100,7 +104,7 @@ def test_rows_of_an_imperfect_arm_become_rows_of_the_plain_one() -> None:
         for env in (NOISY, imperfect(obstacle, noise=0.1, delay=5), REACHER)
         for subset in ("clean", "learning", "segments", "contact")
     ]
-    found = robustness.renamed(given)
+    found = robustness_results.renamed(given)
     assert [row["env"] for row in found] == [REACHER] * 4 + [obstacle] * 4 + [REACHER] * 4
     assert [row["condition"] for row in found] == [
         "noise", "noise", "noise, segments", "noise, contact",
@@ -178,7 +182,7 @@ def linear_arm(n: int = 4, steps: int = 30, noise: float = 0.0, seed: int = 0) -
 @pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_without_a_fingertip_the_filter_is_the_textbooks(monkeypatch: pytest.MonkeyPatch, weight: float) -> None:
     scale = np.array([1.0, 2.0, 3.0, 4.0])
-    monkeypatch.setattr(robustness, "HALF_RANGE", (*scale, 1e5, 1e5))  # of the fingertip nothing is learned
+    monkeypatch.setattr(filtering, "HALF_RANGE", (*scale, 1e5, 1e5))  # of the fingertip nothing is learned
     transition, clean = linear_arm()
     spread = np.random.default_rng(1).normal(size=(4, 4))
     process, sigma = 0.1 * spread @ spread.T, 0.3
@@ -243,7 +247,7 @@ def test_a_filter_that_knows_everything_is_never_wrong_now_or_ahead() -> None:
         states.append(np.concatenate([states[-1], u, np.ones((5, 1))], 1) @ a)
     known = np.stack(states, 1)
     data = episodes(np.concatenate([known, fingertip(known[..., :2])], -1), actions)
-    now, ahead = robustness.filter_errors(KalmanFilter(a, 1e-9 * np.eye(4), 0.01), data, data)
+    now, ahead = filtering.filter_errors(KalmanFilter(a, 1e-9 * np.eye(4), 0.01), data, data)
     assert (now.shape, ahead.shape) == ((45, 6), (45, 10, 6))
     np.testing.assert_allclose(now, 0, atol=1e-5)
     np.testing.assert_allclose(ahead, 0, atol=1e-5)
@@ -252,16 +256,16 @@ def test_a_filter_that_knows_everything_is_never_wrong_now_or_ahead() -> None:
 def test_on_an_arm_the_filter_beats_averages_and_averages_beat_the_raw_observation(
     kalman: KalmanFilter, held_out: Pair, test_data: Pair
 ) -> None:
-    now, ahead = robustness.filter_errors(kalman.tuned(*held_out), *test_data)
-    average = robustness.exponential_errors(robustness.tuned_exponential(*held_out), *test_data)
-    raw = robustness.exponential_errors(0.0, *test_data)
+    now, ahead = filtering.filter_errors(kalman.tuned(*held_out), *test_data)
+    average = filtering.exponential_errors(filtering.tuned_exponential(*held_out), *test_data)
+    raw = filtering.exponential_errors(0.0, *test_data)
     assert rmse(now) < 0.8 * rmse(average) < 0.8 * rmse(raw)
     assert rmse(ahead[:, 0]) < rmse(average)
     assert rmse(now) < rmse(ahead[:, 0]) < rmse(ahead[:, 9])
 
 
 def test_the_weight_is_the_best_of_five_on_validation(kalman: KalmanFilter, held_out: Pair) -> None:
-    tried = {w: rmse(robustness.filter_errors(dataclasses.replace(kalman, weight=w), *held_out)[0])
+    tried = {w: rmse(filtering.filter_errors(dataclasses.replace(kalman, weight=w), *held_out)[0])
              for w in (0.1, 0.3, 1.0, 3.0, 10.0)}  # fmt: skip
     assert kalman.tuned(*held_out).weight == min(tried, key=lambda w: tried[w])
     assert len({round(value, 6) for value in tried.values()}) == 5
@@ -272,27 +276,27 @@ def test_the_weight_is_the_best_of_five_on_validation(kalman: KalmanFilter, held
 
 def test_an_exponential_filter_that_keeps_nothing_is_the_raw_observation(test_data: Pair) -> None:
     noisy, clean = test_data
-    found = robustness.exponential_errors(0.0, noisy, clean)
-    raw = np.concatenate([errors(noisy.states[:, t], clean.states[:, t]) for t in robustness.STARTS])
+    found = filtering.exponential_errors(0.0, noisy, clean)
+    raw = np.concatenate([errors(noisy.states[:, t], clean.states[:, t]) for t in filtering.STARTS])
     np.testing.assert_array_equal(found, raw)
 
 
 def test_an_exponential_filter_is_its_sum(test_data: Pair) -> None:
     noisy, clean = (data.take(slice(3)) for data in test_data)
     x, keep = noisy.states.astype(float), 0.7
-    for row, t in enumerate(robustness.STARTS):
+    for row, t in enumerate(filtering.STARTS):
         mean = keep**t * x[:, 0] + sum((1 - keep) * keep ** (t - s) * x[:, s] for s in range(1, t + 1))
-        found = robustness.exponential_errors(keep, noisy, clean)[3 * row : 3 * row + 3]
+        found = filtering.exponential_errors(keep, noisy, clean)[3 * row : 3 * row + 3]
         np.testing.assert_allclose(found, errors(mean, clean.states[:, t]), atol=1e-6)
 
 
 def test_what_is_kept_is_the_best_of_eleven_on_validation(held_out: Pair) -> None:
-    tried = {keep: rmse(robustness.exponential_errors(keep, *held_out)) for keep in np.linspace(0, 0.9, 11)}
-    best = robustness.tuned_exponential(*held_out)
+    tried = {keep: rmse(filtering.exponential_errors(keep, *held_out)) for keep in np.linspace(0, 0.9, 11)}
+    best = filtering.tuned_exponential(*held_out)
     assert best == min(tried, key=lambda keep: tried[keep])
     assert 0 < best < 0.9
     clean = held_out[1]
-    assert robustness.tuned_exponential(clean, clean) == 0  # nothing to filter
+    assert filtering.tuned_exponential(clean, clean) == 0  # nothing to filter
 
 
 # Models --------------------------------------------------------------------------------------------------------------
@@ -305,7 +309,7 @@ class Knows:
 
     def __init__(self, clean: Trajectories, off: float = 0.0, noise: float = 0.0) -> None:
         self.truth = {clean.actions[i, t : t + 10].tobytes(): clean.states[i, t + 1 : t + 11]
-                      for i in range(len(clean)) for t in robustness.STARTS}  # fmt: skip
+                      for i in range(len(clean)) for t in filtering.STARTS}  # fmt: skip
         self.off, self.noise, self.stochastic = torch.from_numpy(off * UNIT), noise, noise > 0
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
@@ -317,27 +321,27 @@ class Knows:
 
 def test_a_model_that_knows_the_truth_makes_no_errors(test_data: Pair) -> None:
     noisy, clean = test_data
-    found = robustness.model_errors(Knows(clean), noisy, clean)  # type: ignore[arg-type]
+    found = filtering.model_errors(Knows(clean), noisy, clean)  # type: ignore[arg-type]
     assert found.shape == (9 * 40, 10, 6)
     np.testing.assert_allclose(found, 0, atol=1e-6)
-    off = robustness.model_errors(Knows(clean, off=0.1), noisy, clean)  # type: ignore[arg-type]
+    off = filtering.model_errors(Knows(clean, off=0.1), noisy, clean)  # type: ignore[arg-type]
     np.testing.assert_allclose(off, 0.1, atol=1e-5)
 
 
 def test_errors_are_those_of_the_samples_mean(test_data: Pair) -> None:
     noisy, clean = test_data
-    found = robustness.model_errors(Knows(clean, noise=0.3), noisy, clean, samples=16)  # type: ignore[arg-type]
+    found = filtering.model_errors(Knows(clean, noise=0.3), noisy, clean, samples=16)  # type: ignore[arg-type]
     assert rmse(found) == pytest.approx(0.3 / 4, rel=0.03)
 
 
 def test_other_episodes_are_refused(kalman: KalmanFilter, held_out: Pair, test_data: Pair) -> None:
     noisy, (_, clean) = test_data[0].take(slice(20)), held_out
     for call in (
-        lambda: robustness.model_errors(Knows(clean), noisy, clean),  # type: ignore[arg-type]
-        lambda: robustness.filter_errors(kalman, noisy, clean),
-        lambda: robustness.exponential_errors(0.5, noisy, clean),
+        lambda: filtering.model_errors(Knows(clean), noisy, clean),  # type: ignore[arg-type]
+        lambda: filtering.filter_errors(kalman, noisy, clean),
+        lambda: filtering.exponential_errors(0.5, noisy, clean),
         lambda: kalman.tuned(noisy, clean),
-        lambda: robustness.tuned_exponential(noisy, clean.take(slice(5))),
+        lambda: filtering.tuned_exponential(noisy, clean.take(slice(5))),
     ):
         with pytest.raises(ValueError, match=f"episodes of {NOISY} and of {REACHER} hold other torques"):
             call()
@@ -354,7 +358,7 @@ def test_rows_of_errors_tell_steps_and_parts_apart() -> None:
     ahead = np.zeros((2, 3, 6))
     ahead[:, 1, 2:4] = [[0.3, 0.4], [0.0, 0.5]]  # the velocities, two steps ahead
     now = np.full((2, 6), 0.2)
-    rows = robustness.error_rows(NOISY, "lstm", ahead, now, seed=3, scale="smoke")
+    rows = robustness_results.error_rows(NOISY, "lstm", ahead, now, seed=3, scale="smoke")
     found = by(rows)
     assert len(rows) == len(found) == 4 * (1 + 1 + 3)
     whole = math.sqrt(0.5 / 12)  # 0.09 + 0.16 + 0.25 over two episodes of six dimensions
@@ -372,8 +376,8 @@ def test_rows_of_errors_tell_steps_and_parts_apart() -> None:
 
 def test_what_was_not_measured_has_no_rows() -> None:
     now = np.full((2, 6), 0.2)
-    assert {row["horizon"] for row in robustness.error_rows(LATE, "exponential", None, now)} == {0}
-    assert 0 not in {row.get("horizon") for row in robustness.error_rows(LATE, "tsm", now[:, None])}
+    assert {row["horizon"] for row in robustness_results.error_rows(LATE, "exponential", None, now)} == {0}
+    assert 0 not in {row.get("horizon") for row in robustness_results.error_rows(LATE, "tsm", now[:, None])}
 
 
 def policy_header(env: str = NOISY, last: int = 880) -> dict[str, Any]:
@@ -385,14 +389,14 @@ def policy_header(env: str = NOISY, last: int = 880) -> dict[str, Any]:
 
 def test_a_target_is_reached_within_five_centimetres() -> None:
     distances = torch.tensor([[0.01, 0.06, 0.049, 0.3], [0.0, 0.01, 0.02, 0.03]])
-    rows = robustness.policy_rows(policy_header(), distances)
+    rows = robustness_results.policy_rows(policy_header(), distances)
     assert [(row["copy"], row["value"]) for row in rows] == [(0, 0.5), (1, 1.0)]
     (row, _) = rows
     assert row.items() >= dict(
         env=REACHER, sim="mujoco", task="reach", model="tsm", planner="policy", prior="codes", condition="noise",
         horizon=880, n=4, seed=4, scale="smoke", metric="success50", unit="share",
     ).items()  # fmt: skip
-    strict = robustness.policy_rows(policy_header(REACHER), distances, level=0.02)
+    strict = robustness_results.policy_rows(policy_header(REACHER), distances, level=0.02)
     assert [(row["metric"], row["condition"], row["value"]) for row in strict] == [
         ("success20", "clean", 0.25), ("success20", "clean", 0.5),
     ]  # fmt: skip
@@ -422,7 +426,7 @@ LEARNED = [
 
 
 def test_the_board_shows_the_last_record_that_counts() -> None:
-    head, _, ours, theirs = robust_report.board(LEARNED, last=500).splitlines()
+    head, _, ours, theirs = robustness_results.board(LEARNED, last=500).splitlines()
     assert head.startswith(
         "| policy | clean: earned | clean: final distance (m) | clean: within 0.05 m | noise: earned"
     )
@@ -431,17 +435,23 @@ def test_the_board_shows_the_last_record_that_counts() -> None:
         f"| TSM, codes | -4 ± {half:.2g} |  |  | -5 |  | 0.65 ± 0.64 | -7.5 ± 6.4 |  | 0.55 ± 0.64 |"
     )
     assert theirs == f"| LSTM, actions |  |  |  | -7 ± {half:.2g} |  |  |  |  |  |"
-    assert "| TSM, codes | -1 |" in robust_report.board(LEARNED, last=660)
+    assert "| TSM, codes | -1 |" in robustness_results.board(LEARNED, last=660)
 
 
 def test_what_is_lost_is_a_share_of_the_gain_over_random_torques() -> None:
-    assert robust_report.lost(LEARNED, "tsm codes", "noise", 500, random=-14.0) == pytest.approx((-4 + 5) / (-4 + 14))
-    assert robust_report.lost(LEARNED, "tsm codes", "delay", 500, random=-14.0) == pytest.approx((-4 + 7.5) / (-4 + 14))
-    assert robust_report.lost(LEARNED, "tsm codes", "noise", 300, random=-15.0) == pytest.approx(0.1)  # -5 against -6
+    assert robustness_results.lost(LEARNED, "tsm codes", "noise", 500, random=-14.0) == pytest.approx(
+        (-4 + 5) / (-4 + 14)
+    )
+    assert robustness_results.lost(LEARNED, "tsm codes", "delay", 500, random=-14.0) == pytest.approx(
+        (-4 + 7.5) / (-4 + 14)
+    )
+    assert robustness_results.lost(LEARNED, "tsm codes", "noise", 300, random=-15.0) == pytest.approx(
+        0.1
+    )  # -5 against -6
 
 
 def test_learning_curves_are_a_line_for_each_copy() -> None:
-    curves = robust_report.learning_curves(LEARNED, last=500)
+    curves = robustness_results.learning_curves(LEARNED, last=500)
     assert {condition: list(own) for condition, own in curves.items()} == {
         "clean": ["tsm codes"], "noise": ["tsm codes", "lstm actions"], "delay": ["tsm codes"],
     }  # fmt: skip
@@ -453,7 +463,7 @@ def test_learning_curves_are_a_line_for_each_copy() -> None:
 
 def test_two_seeds_of_a_copy_are_two_lines() -> None:
     more = [*LEARNED, *({**row, "seed": 1} for row in earned({"delay": [[-12, -7, -6]]}))]
-    assert robust_report.learning_curves(more, last=500)["delay"]["tsm codes"]["return_true"].tolist() == [
+    assert robustness_results.learning_curves(more, last=500)["delay"]["tsm codes"]["return_true"].tolist() == [
         [-12, -6, -8], [-12, -6, -7], [-12, -7, -6],
     ]  # fmt: skip
 
@@ -473,7 +483,7 @@ def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_empty_where_nothing_was_
         *scored("tsm", "noise, contact", [4.0], obstacle), *scored("lstm", "noise, contact", [5.0], obstacle),
         *scored("tsm", "clean", [9.0], obstacle), *scored("lstm", "clean", [0.0], obstacle),
     ]  # fmt: skip
-    found = robust_report.advantage(rows, "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
+    found = robustness_results.advantage(rows, "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
     none = np.nan
     assert list(found) == ["plain arm: minus one-step", "plain arm: minus LSTM",
                            "after contact: minus one-step", "after contact: minus LSTM"]  # fmt: skip
@@ -488,12 +498,12 @@ def test_rows_of_the_plain_arm_find_their_place_on_the_map_once_renamed() -> Non
     obstacle = "tsm/ReacherObstacle-v0"
     own = [*scored("tsm", "contact", [4.0], obstacle), *scored("lstm", "contact", [1.5], obstacle)]
     own += [{**row, "env": imperfect(obstacle, delay=5), "value": 2 * row["value"]} for row in own]
-    found = robust_report.advantage(robustness.renamed(own), "tsm", ["lstm"], [0.0], [0, 5])
+    found = robustness_results.advantage(robustness_results.renamed(own), "tsm", ["lstm"], [0.0], [0, 5])
     np.testing.assert_array_equal(found["after contact: minus LSTM"], [[2.5, 5.0]])
 
 
 def test_a_bar_is_reached_or_it_is_not() -> None:
-    found = robust_report.bars(LEARNED, "tsm codes", 500, random=-14.0)
+    found = robustness_results.bars(LEARNED, "tsm codes", 500, random=-14.0)
     assert list(found.values()) == [
         ("at most 20 %", "10.0%", True), ("at least 60 %", "65%", True),
         ("at most 20 %", "35.0%", False), ("at least 60 %", "55%", False),

@@ -19,10 +19,12 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import papermill_plugin, parameters, runs, study
+from tsmlib import study
 from tsmlib.__main__ import main
-from tsmlib.envs import ENV_IDS
-from tsmlib.runs import ParameterError, RunError, resolve
+from tsmlib.envs.spec import ENV_IDS
+from tsmlib.study import notebooks, papermill_plugin, parameters, runs
+from tsmlib.study.parameters import ParameterError
+from tsmlib.study.runs import RunError, resolve
 
 PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
 
@@ -199,7 +201,7 @@ def test_a_notebook_that_does_not_reach_its_end_failed(place: Path, how: str) ->
     source, message = UNFINISHED[how]
     notebook = write_notebook(place / "notebooks" / "01_first.ipynb", source, "print('after')")
     with pytest.raises(RunError, match=rf"01_first failed: [\s\S]*{message}[\s\S]*See .*01_first.ipynb"):
-        runs.execute(notebook, progress=False)
+        notebooks.execute(notebook, progress=False)
     assert status(place)["01_first"]["state"] == "failed"
     assert message in status(place)["01_first"]["error"]
 
@@ -220,8 +222,9 @@ def start(place: Path) -> subprocess.Popen[bytes]:
     code = (
         # SIGINT would be ignored where the tests themselves run in the background.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        "import sys; from pathlib import Path; from tsmlib import runs; from tsmlib.__main__ import main;"
-        f"runs.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
+        "import sys; from pathlib import Path;"
+        "from tsmlib.study import notebooks, runs; from tsmlib.__main__ import main;"
+        f"runs.NOTEBOOKS = notebooks.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=runs.ROOT, stderr=subprocess.DEVNULL)
     wait_for(lambda: (place / "inside").exists() and bool((place / "inside").read_text()))
@@ -258,13 +261,13 @@ def test_one_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
     try:
         second = runs.notebooks()["second"]
         with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid} on .*, 01_first, since"):
-            runs.execute(second, progress=False)
+            notebooks.execute(second, progress=False)
         assert set(status(place)) == {"01_first"}
     finally:
         process.kill()
         process.wait()
     assert status(place)["01_first"]["state"] == "running"
-    runs.execute(second, progress=False)
+    notebooks.execute(second, progress=False)
     assert status(place)["02_second"]["state"] == "complete"
     with contextlib.suppress(ProcessLookupError):  # a kernel also ends by itself once its parent is gone
         os.kill(int((place / "inside").read_text()), signal.SIGKILL)
@@ -300,7 +303,9 @@ def clone(tmp_path: Path) -> Path:
     info = tmp_path / "tsmlib-9.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tsmlib\nVersion: 9\n")
-    (info / "entry_points.txt").write_text("[papermill.io]\ntsmlib-default-output = tsmlib.papermill_plugin:handler\n")
+    (info / "entry_points.txt").write_text(
+        "[papermill.io]\ntsmlib-default-output = tsmlib.study.papermill_plugin:handler\n"
+    )
     return tmp_path
 
 

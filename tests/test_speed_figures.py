@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from tsmlib.speed_figures import exponents, growth
+from _figure import exponents, growth
 
 SIZES = np.array([1, 2, 4, 8])
 

@@ -18,9 +18,11 @@ import pytest
 import safetensors.torch
 import torch
 
-from tsmlib import store
-from tsmlib.runs import Run, RunError, _note, require
-from tsmlib.store import StoreError
+from tsmlib.storage import artifacts, files, tables
+from tsmlib.storage import manifest as manifest_storage
+from tsmlib.storage.files import StoreError
+from tsmlib.study.notebooks import _note, require
+from tsmlib.study.runs import Run, RunError
 from tsmlib.trajectory import Trajectories
 
 NAMES = ("joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y")
@@ -55,7 +57,7 @@ FINGERPRINT = {"env": "tsm/Reacher-v0", "names": NAMES, "dt": 0.02}
 def saved(tmp_path: Path) -> Path:
     path = tmp_path / "thing.safetensors"
     tensors = {"a": torch.arange(6.0).reshape(2, 3), "n": torch.tensor([3])}
-    store.save(path, tensors, kind="thing", header={"seed": 7})
+    artifacts.save(path, tensors, kind="thing", header={"seed": 7})
     return path
 
 
@@ -66,9 +68,9 @@ def test_arrays_and_header_come_back_as_they_were(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "er" / "x.safetensors"
     header = {"seed": 7, "text": 'quotes " and "tsmlib":"{\\"sha256\\":\\"', "nested": {"list": [1, 2.5, None]}}
     tensors = {"a": torch.randn(3, 4), "b": np.arange(5), "c": np.float32(2.0) * np.ones((2, 0)), "d": torch.ones(())}
-    store.save(path, tensors, kind="thing", header=header)
-    found, found_header = store.load(path, kind="thing")
-    assert found_header == header == store.read_header(path)
+    artifacts.save(path, tensors, kind="thing", header=header)
+    found, found_header = artifacts.load(path, kind="thing")
+    assert found_header == header == artifacts.read_header(path)
     assert set(found) == set(tensors)
     for name, value in tensors.items():
         assert torch.equal(found[name], torch.as_tensor(value))
@@ -77,8 +79,8 @@ def test_arrays_and_header_come_back_as_they_were(tmp_path: Path) -> None:
 
 def test_a_view_is_stored_as_its_own_values(tmp_path: Path) -> None:
     whole = torch.arange(12.0).reshape(3, 4)
-    store.save(tmp_path / "x.safetensors", {"t": whole.T, "row": whole[1]}, kind="k", header={})
-    found, _ = store.load(tmp_path / "x.safetensors", kind="k")
+    artifacts.save(tmp_path / "x.safetensors", {"t": whole.T, "row": whole[1]}, kind="k", header={})
+    found, _ = artifacts.load(tmp_path / "x.safetensors", kind="k")
     assert torch.equal(found["t"], whole.T)
     assert torch.equal(found["row"], whole[1])
 
@@ -89,14 +91,14 @@ def test_any_safetensors_reader_opens_an_artefact(saved: Path) -> None:
 
 def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("x", "y"):
-        store.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories(), {"seed": 1})
-    assert store.sha256(tmp_path / "x.safetensors") == store.sha256(tmp_path / "y.safetensors")
+        artifacts.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories(), {"seed": 1})
+    assert manifest_storage.sha256(tmp_path / "x.safetensors") == manifest_storage.sha256(tmp_path / "y.safetensors")
 
 
 def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
     before = some_trajectories()
-    store.save_trajectories(tmp_path / "x.safetensors", before, {"seed": 1})
-    after = store.load_trajectories(tmp_path / "x.safetensors", env="tsm/Reacher-v0")
+    artifacts.save_trajectories(tmp_path / "x.safetensors", before, {"seed": 1})
+    after = artifacts.load_trajectories(tmp_path / "x.safetensors", env="tsm/Reacher-v0")
     np.testing.assert_array_equal(after.states, before.states)
     np.testing.assert_array_equal(after.actions, before.actions)
     assert after.states.dtype == after.actions.dtype == np.float32
@@ -107,8 +109,8 @@ def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
 
 def test_a_loaded_model_computes_the_same(tmp_path: Path) -> None:
     model = Line(inputs=3, outputs=2)
-    store.save_model(tmp_path / "m.safetensors", model, {"fingerprint": FINGERPRINT})
-    again = store.load_model(tmp_path / "m.safetensors", Line, expect=FINGERPRINT)
+    artifacts.save_model(tmp_path / "m.safetensors", model, {"fingerprint": FINGERPRINT})
+    again = artifacts.load_model(tmp_path / "m.safetensors", Line, expect=FINGERPRINT)
     x = torch.randn(4, 3)
     assert torch.equal(model.linear(x), again.linear(x))
 
@@ -118,8 +120,8 @@ def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
         {"env": "tsm/Reacher-v0", "metric": "success", "value": np.float32(0.5), "n": 100, "seed": np.int64(0)},
         {"env": 'a "b", c', "metric": "return_true", "value": -1e-30, "target": 3},
     ]
-    store.save_table(tmp_path / "t.csv", rows, extra=("target",))
-    found = store.load_table(tmp_path / "t.csv")
+    tables.save_table(tmp_path / "t.csv", rows, extra=("target",))
+    found = tables.load_table(tmp_path / "t.csv")
     assert found[0]["value"] == 0.5
     assert found[0]["n"] == 100
     assert found[0]["horizon"] == found[0]["target"] == ""
@@ -130,8 +132,8 @@ def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
 
 def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
     value = {"b": [1, 2.5, None, "ü"], "a": {}}
-    store.write_json(tmp_path / "x.json", value)
-    assert store.read_json(tmp_path / "x.json") == value
+    manifest_storage.write_json(tmp_path / "x.json", value)
+    assert manifest_storage.read_json(tmp_path / "x.json") == value
 
 
 # Damage is found -----------------------------------------------------------------------------------------------------
@@ -146,14 +148,14 @@ def damage_is_refused(path: Path, damaged: bytes, load: Callable[[Path], Any]) -
 def loaders(tmp_path: Path) -> dict[Path, Callable[[Path], Any]]:
     """One artefact of each kind, and what loads it."""
     trajectories, model, table = (tmp_path / name for name in ("t.safetensors", "m.safetensors", "shipped/x.csv"))
-    store.save_trajectories(trajectories, some_trajectories(), {"seed": 1})
-    store.save_model(model, Line(inputs=3), {"fingerprint": FINGERPRINT})
-    store.save_table(table, [{"metric": "success", "value": 0.5}])
-    store.write_manifest(table.parent)
+    artifacts.save_trajectories(trajectories, some_trajectories(), {"seed": 1})
+    artifacts.save_model(model, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    tables.save_table(table, [{"metric": "success", "value": 0.5}])
+    manifest_storage.write_manifest(table.parent)
     return {
-        trajectories: store.load_trajectories,
-        model: lambda path: store.load_model(path, Line),
-        table: store.load_table,
+        trajectories: artifacts.load_trajectories,
+        model: lambda path: artifacts.load_model(path, Line),
+        table: tables.load_table,
     }
 
 
@@ -182,21 +184,21 @@ def test_no_cut_append_or_zeroed_block_goes_unnoticed(tmp_path: Path, which: int
 
 
 def test_a_flipped_bit_in_a_manifest_is_found(tmp_path: Path) -> None:
-    store.save_table(tmp_path / "x.csv", [{"metric": "success", "value": 0.5}])
-    store.write_manifest(tmp_path)
-    manifest = tmp_path / store.MANIFEST
+    tables.save_table(tmp_path / "x.csv", [{"metric": "success", "value": 0.5}])
+    manifest_storage.write_manifest(tmp_path)
+    manifest = tmp_path / files.MANIFEST
     data = manifest.read_bytes()
     for bit in range(8 * len(data)):
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
-        damage_is_refused(manifest, bytes(flipped), lambda _: store.verify(tmp_path))
+        damage_is_refused(manifest, bytes(flipped), lambda _: manifest_storage.verify(tmp_path))
 
 
 def test_a_foreign_safetensors_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.safetensors"
     safetensors.torch.save_file({"a": torch.ones(2)}, path)
     with pytest.raises(StoreError, match="not written by tsmlib"):
-        store.load(path, kind="thing")
+        artifacts.load(path, kind="thing")
 
 
 def test_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
@@ -207,7 +209,7 @@ def test_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
     path = tmp_path / "x.safetensors"
     path.write_bytes(pickle.dumps({"weights": Payload()}))
     with pytest.raises(StoreError, match=r"x\.safetensors"):
-        store.load(path, kind="model")
+        artifacts.load(path, kind="model")
     assert not (tmp_path / "canary").exists()
 
 
@@ -232,18 +234,18 @@ def test_loading_starts_no_process_and_opens_no_connection(tmp_path: Path) -> No
 
 def test_a_missing_file_names_the_command_that_makes_it(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"none\.safetensors does not exist.*python -m tsmlib run collect"):
-        store.load_trajectories(tmp_path / "none.safetensors")
+        artifacts.load_trajectories(tmp_path / "none.safetensors")
 
 
 def test_another_kind_is_refused(saved: Path) -> None:
     with pytest.raises(StoreError, match="holds 'thing', expected 'trajectories'"):
-        store.load_trajectories(saved)
+        artifacts.load_trajectories(saved)
 
 
 def test_trajectories_of_another_environment_are_refused(tmp_path: Path) -> None:
-    store.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
+    artifacts.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
     with pytest.raises(StoreError, match="of tsm/Reacher-v0, expected tsm/ReacherPush-v0"):
-        store.load_trajectories(tmp_path / "x.safetensors", env="tsm/ReacherPush-v0")
+        artifacts.load_trajectories(tmp_path / "x.safetensors", env="tsm/ReacherPush-v0")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -253,21 +255,21 @@ def test_a_value_that_is_not_finite_is_neither_written_nor_read(
     path, array = tmp_path / "x.safetensors", np.ones((2, 3))
     array[1, 2] = value
     with pytest.raises(StoreError, match=r"'w' for .*not finite, the first at index \(1, 2\)"):
-        store.save(path, {"w": array}, kind="model", header={})
+        artifacts.save(path, {"w": array}, kind="model", header={})
     assert not any(tmp_path.iterdir())
     with monkeypatch.context() as patch:  # a file that someone else made
-        patch.setattr(store, "_require_finite", lambda *_: None)
-        store.save(path, {"w": array}, kind="model", header={})
+        patch.setattr(artifacts, "_require_finite", lambda *_: None)
+        artifacts.save(path, {"w": array}, kind="model", header={})
     with pytest.raises(StoreError, match=r"index \(1, 2\)"):
-        store.load(path, kind="model")
+        artifacts.load(path, kind="model")
 
 
 def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    artifacts.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
     wrong = {**FINGERPRINT, "env": "tsm/ReacherPush-v0", "past_len": 10}
     with pytest.raises(StoreError) as caught:
-        store.load_model(path, Line, expect=wrong)
+        artifacts.load_model(path, Line, expect=wrong)
     message = str(caught.value)
     assert "env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'" in message
     assert "past_len is 'not stated' in the file, expected 10" in message
@@ -276,39 +278,39 @@ def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: P
 
 def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    store.save_model(path, Line(inputs=3))
+    artifacts.save_model(path, Line(inputs=3))
     with pytest.raises(StoreError, match="holds a 'Line', expected a Curve"):
-        store.load_model(path, Curve)
-    tensors, header = store.load(path, kind="model")
-    store.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
+        artifacts.load_model(path, Curve)
+    tensors, header = artifacts.load(path, kind="model")
+    artifacts.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
     with pytest.raises(StoreError, match="does not fit the present Line"):
-        store.load_model(path, Line)
-    store.save(path, tensors, kind="model", header={**header, "config": {"colour": 4}})
+        artifacts.load_model(path, Line)
+    artifacts.save(path, tensors, kind="model", header={**header, "config": {"colour": 4}})
     with pytest.raises(StoreError, match="does not fit the present Line"):
-        store.load_model(path, Line)
+        artifacts.load_model(path, Line)
 
 
 def test_a_header_that_is_not_json_is_refused(saved: Path) -> None:
     before = saved.read_bytes()
     for header in ({"f": print}, {"x": float("nan")}, {"t": torch.ones(1)}, {("a",): 1}):
         with pytest.raises(StoreError, match=r"thing\.safetensors cannot be written"):
-            store.save(saved, {"a": torch.ones(1)}, kind="thing", header=header)
+            artifacts.save(saved, {"a": torch.ones(1)}, kind="thing", header=header)
     assert saved.read_bytes() == before
 
 
 def test_a_table_with_a_wrong_column_or_number_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="unknown columns \\['modle'\\]"):
-        store.save_table(tmp_path / "t.csv", [{"modle": "tsm"}])
+        tables.save_table(tmp_path / "t.csv", [{"modle": "tsm"}])
     with pytest.raises(StoreError, match="value = nan"):
-        store.save_table(tmp_path / "t.csv", [{"metric": "success", "value": float("nan")}])
+        tables.save_table(tmp_path / "t.csv", [{"metric": "success", "value": float("nan")}])
     assert not any(tmp_path.iterdir())
 
 
 def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
-    for text in ("", "a,b\n1,2\n", ",".join(store.COLUMNS) + "\n1,2\n", ",".join(store.COLUMNS) + '\n"1'):
+    for text in ("", "a,b\n1,2\n", ",".join(tables.COLUMNS) + "\n1,2\n", ",".join(tables.COLUMNS) + '\n"1'):
         (tmp_path / "t.csv").write_text(text)
         with pytest.raises(StoreError, match=r"t\.csv"):
-            store.load_table(tmp_path / "t.csv")
+            tables.load_table(tmp_path / "t.csv")
 
 
 # Writing is all or nothing -------------------------------------------------------------------------------------------
@@ -325,7 +327,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(saved: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
         with pytest.raises(StoreError, match=r"cannot write .*thing\.safetensors \(\d+ bytes\): File too large"):
-            store.save(saved, {"a": torch.zeros(10_000)}, kind="thing", header={})
+            artifacts.save(saved, {"a": torch.zeros(10_000)}, kind="thing", header={})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, ignored)
@@ -344,7 +346,7 @@ def test_a_fault_while_writing_leaves_the_old_file_and_nothing_else(
     before = saved.read_bytes()
     with monkeypatch.context() as patch, pytest.raises((StoreError, KeyboardInterrupt)) as caught:
         patch.setattr(os, call, fail)
-        store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+        artifacts.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
     if isinstance(fault, OSError):
         assert "No space left" in str(caught.value)
         assert str(saved) in str(caught.value)
@@ -357,15 +359,15 @@ def test_data_reaches_the_disk_before_its_name_does(saved: Path, monkeypatch: py
     for name in ("fsync", "replace"):
         real = getattr(os, name)
         monkeypatch.setattr(os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a))[1])
-    store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+    artifacts.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
     assert calls == ["fsync", "replace", "fsync"]
 
 
 def test_an_unwritable_folder_is_one_clear_message(saved: Path) -> None:
     with pytest.raises(StoreError, match="cannot write .*TSM_RUN_DIR"):
-        store.save(saved / "inside" / "x.safetensors", {"a": torch.ones(1)}, kind="thing", header={})
+        artifacts.save(saved / "inside" / "x.safetensors", {"a": torch.ones(1)}, kind="thing", header={})
     with pytest.raises(StoreError, match="cannot write"):
-        store.write_json("/proc/nowhere/x.json", {})
+        manifest_storage.write_json("/proc/nowhere/x.json", {})
 
 
 def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
@@ -375,7 +377,7 @@ def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
     os.waitpid(child, 0)
     left = saved.with_name(f".{saved.name}.tmp-{child}")
     left.write_bytes(b"half")
-    store.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
+    artifacts.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
     assert only(saved.parent) == [saved.name]
 
 
@@ -384,27 +386,27 @@ def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
 
 def test_verify_follows_an_artefact_to_what_it_was_made_from(tmp_path: Path) -> None:
     data, model = tmp_path / "data.safetensors", tmp_path / "models" / "m.safetensors"
-    store.save_trajectories(data, some_trajectories())
-    store.save_model(model, Line(inputs=3), {"inputs": {"../data.safetensors": store.sha256(data)}})
-    assert {path.name for path in store.verify(model)} == {"m.safetensors", "data.safetensors"}
-    store.save_trajectories(data, some_trajectories(n=4))
+    artifacts.save_trajectories(data, some_trajectories())
+    artifacts.save_model(model, Line(inputs=3), {"inputs": {"../data.safetensors": manifest_storage.sha256(data)}})
+    assert {path.name for path in manifest_storage.verify(model)} == {"m.safetensors", "data.safetensors"}
+    artifacts.save_trajectories(data, some_trajectories(n=4))
     with pytest.raises(StoreError, match="data.safetensors has SHA-256"):
-        store.verify(model)
+        manifest_storage.verify(model)
     data.unlink()
-    assert [path.name for path in store.verify(model)] == ["m.safetensors"]
+    assert [path.name for path in manifest_storage.verify(model)] == ["m.safetensors"]
 
 
 def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
     for name in "abc":
-        store.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories())
-    store.save_table(tmp_path / "t.csv", [])
-    store.write_manifest(tmp_path)
-    assert len(store.verify(tmp_path)) == 5
+        artifacts.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories())
+    tables.save_table(tmp_path / "t.csv", [])
+    manifest_storage.write_manifest(tmp_path)
+    assert len(manifest_storage.verify(tmp_path)) == 5
     (tmp_path / "a.safetensors").write_bytes(b"")
     (tmp_path / "b.safetensors").unlink()
     (tmp_path / "t.csv").write_text("x")
     with pytest.raises(StoreError) as caught:
-        store.verify(tmp_path)
+        manifest_storage.verify(tmp_path)
     for name in ("a.safetensors", "b.safetensors", "t.csv"):
         assert name in str(caught.value)
     assert "c.safetensors" not in str(caught.value)
@@ -413,15 +415,15 @@ def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
 def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> None:
     run = Run("05_control", "smoke", 0, tmp_path)
     table = run.metrics / "05_control.csv"
-    store.save_table(table, [{"metric": "success", "value": 0.5}])
-    _note(run, {"state": "complete", "files": store.listing(run.dir, [table])})
-    assert table in store.verify(tmp_path)
+    tables.save_table(table, [{"metric": "success", "value": 0.5}])
+    _note(run, {"state": "complete", "files": manifest_storage.listing(run.dir, [table])})
+    assert table in manifest_storage.verify(tmp_path)
     assert require(run, "05_control")["state"] == "complete"
     table.write_text(table.read_text().replace("0.5", "0.9"))
     with pytest.raises(StoreError, match="05_control.csv has SHA-256"):
-        store.verify(tmp_path)
+        manifest_storage.verify(tmp_path)
     with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed after its run was complete"):
-        store.load_table(table)
+        tables.load_table(table)
     with pytest.raises(RunError, match="python -m tsmlib run control --scale smoke --seed 0"):
         require(run, "05_control")
     with pytest.raises(RunError, match="02_train in .* is not run, expected complete"):
@@ -431,19 +433,19 @@ def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> No
 def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "m.safetensors"
     expect = {**FINGERPRINT, "noise": 0.0}
-    store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    artifacts.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
     with pytest.raises(StoreError, match="noise is 'not stated' in the file, expected 0.0"):
-        store.load_model(path, Line, expect=expect)
+        artifacts.load_model(path, Line, expect=expect)
     with monkeypatch.context() as patch:
-        patch.setattr(store, "SCHEMA", 1)
-        store.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
-    store.load_model(path, Line, expect=expect)
+        patch.setattr(artifacts, "SCHEMA", 1)
+        artifacts.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
+    artifacts.load_model(path, Line, expect=expect)
     with pytest.raises(StoreError, match="dt is 0.02 in the file, expected 0.01"):
-        store.load_model(path, Line, expect={**expect, "dt": 0.01})
+        artifacts.load_model(path, Line, expect={**expect, "dt": 0.01})
 
 
 def test_an_artefact_states_what_made_it(saved: Path) -> None:
-    found = store.read_provenance(saved)
+    found = artifacts.read_provenance(saved)
     assert found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
     assert found["threads"] == torch.get_num_threads()
     assert {"code", "commit", "cpu", "mujoco", "numpy"} <= set(found)
@@ -457,9 +459,9 @@ def test_a_model_as_large_as_a_forger_likes_is_refused_without_making_it(tmp_pat
         (10**12, "inputs is 1000000000000, expected sizes of at most 10000"),
     ):
         forged.inputs = inputs
-        store.save_model(path, forged)
+        artifacts.save_model(path, forged)
         with pytest.raises(StoreError, match=said):
-            store.load_model(path, Line)
+            artifacts.load_model(path, Line)
 
 
 @pytest.mark.parametrize(
@@ -469,19 +471,19 @@ def test_a_missing_file_names_the_command_that_makes_it_for_its_own_run(
     tmp_path: Path, where: str, options: str
 ) -> None:
     with pytest.raises(StoreError, match=f"does not exist. Make it: python -m tsmlib run train{options}$"):
-        store.load_model(tmp_path / where / "tsm.safetensors", Line)
+        artifacts.load_model(tmp_path / where / "tsm.safetensors", Line)
 
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
     entries = {"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}
-    store.write_json(tmp_path / store.MANIFEST, store.sealed({"files": entries}))
+    manifest_storage.write_json(tmp_path / files.MANIFEST, manifest_storage.sealed({"files": entries}))
     with pytest.raises(StoreError, match="outside its own folder"):
-        store.verify(tmp_path)
+        manifest_storage.verify(tmp_path)
 
 
 def test_verify_does_not_vouch_for_what_it_cannot_check(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(StoreError, match="nothing to check"):
-        store.verify(tmp_path / "notes.txt")
+        manifest_storage.verify(tmp_path / "notes.txt")
     with pytest.raises(StoreError, match="does not exist"):
-        store.verify(tmp_path / "nothing")
+        manifest_storage.verify(tmp_path / "nothing")

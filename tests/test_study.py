@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import control, runs, store, study
-from tsmlib.envs import DELAY, NOISE, imperfect
-from tsmlib.prior import ActionPrior
-from tsmlib.runs import ParameterError, Run
-from tsmlib.store import StoreError
-from tsmlib.trajopt import DirectActions, adam, cem, sampled_starts
-from tsmlib.tsm import TSM
+from tsmlib import study
+from tsmlib.envs import imperfect
+from tsmlib.envs.spec import DELAY, NOISE
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.tsm import TSM
+from tsmlib.planning import tasks
+from tsmlib.planning.planners import adam, cem, sampled_starts
+from tsmlib.planning.search_spaces import DirectActions
+from tsmlib.storage import artifacts
+from tsmlib.storage.files import StoreError
+from tsmlib.study import runs
+from tsmlib.study.parameters import ParameterError
+from tsmlib.study.runs import Run
 
 REACHER = "tsm/Reacher-v0"
 
@@ -162,7 +168,7 @@ def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pyt
 # Plans ---------------------------------------------------------------------------------------------------------------
 
 
-def some_task(n: int = 2) -> control.Task:
+def some_task(n: int = 2) -> tasks.Task:
     return study.task(REACHER, "validation").take(n)
 
 
@@ -315,7 +321,7 @@ def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place
     with pytest.raises(StoreError, match=f"env is '{REACHER}' in the file, expected '{env}'"):
         study.load_or_train(run, env, "tsm")
     kept = {key: header[key] for key in ("model", "seed", "scale", "curves", "seconds")}
-    store.save_model(other, model, kept | {"fingerprint": study.data.fingerprint(env)})
+    artifacts.save_model(other, model, kept | {"fingerprint": study.data.fingerprint(env)})
     assert study.load_or_train(run, env, "tsm")[1]["fingerprint"]["env"] == env
     shutil.copy(other, there)
     with pytest.raises(StoreError, match=f"env is '{env}' in the file, expected '{REACHER}'"):

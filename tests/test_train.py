@@ -13,12 +13,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tsmlib import store
-from tsmlib.checkpoint import load_generation
-from tsmlib.prior import ActionPrior
-from tsmlib.train import Curve, TrainingStopped, fit, fixed_windows, schedule
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.tsm import TSM
+from tsmlib.storage import files
+from tsmlib.training.checkpoint import Curve, TrainingStopped, load_generation
+from tsmlib.training.fit import fit, fixed_windows, schedule
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window
-from tsmlib.tsm import TSM
 
 H = 4
 SIZES = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
@@ -205,7 +205,7 @@ def test_a_checkpoint_of_another_run_is_refused_naming_what_differs(
     content, model = folder_bytes(checkpoint), new_tsm()
     before = weights(model)
     with pytest.raises(
-        store.StoreError, match=f"run/.*safetensors is the checkpoint of another run: {message}. Delete"
+        files.StoreError, match=f"run/.*safetensors is the checkpoint of another run: {message}. Delete"
     ):
         train(model, checkpoint=checkpoint, **other)
     assert folder_bytes(checkpoint) == content
@@ -219,11 +219,11 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
 def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -> None:
     checkpoint, model = tmp_path / "run", new_tsm()
     train(model, checkpoint=checkpoint)
-    with pytest.raises(store.StoreError, match="loss is 'loss' in the file, expected 'teacher_forced_loss'"):
+    with pytest.raises(files.StoreError, match="loss is 'loss' in the file, expected 'teacher_forced_loss'"):
         train(model, model.teacher_forced_loss, checkpoint=checkpoint)
     elsewhere = replace(TRAIN, env="tsm/Other-v0").take(slice(0, 20))
     with pytest.raises(
-        store.StoreError,
+        files.StoreError,
         match="env is 'tsm/Made-v0' in the file, expected 'tsm/Other-v0'; episodes is 30 in the file, expected 20",
     ):
         fit(model, model.loss, elsewhere, HELD_OUT, **SIZES, checkpoint=checkpoint)
@@ -236,7 +236,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
     )
     train(new_tsm(), checkpoint=checkpoint)
     with pytest.raises(
-        store.StoreError, match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew"
+        files.StoreError, match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew"
     ):
         train(wider, checkpoint=checkpoint)
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.dynamics import rollout
-from tsmlib.nets import Noise
+from tsmlib.models.base import rollout
+from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, batches, initial_past, windows
 
 A = torch.tensor([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]])

@@ -14,29 +14,18 @@ from torch import Tensor
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
-from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.collect import smooth_torques
-from tsmlib.nets import Noise, standard_normal
-from tsmlib.prior import ActionPrior
+from tsmlib.collection import smooth_torques
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.tsm import TSM
+from tsmlib.planning.base import Plan, Predict
+from tsmlib.planning.planners import adam, cem, evaluate, expected_return, iterations_to, mppi, sampled_starts, stopped
+from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.rewards import Reward
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window, initial_past
-from tsmlib.trajopt import (
-    DirectActions,
-    LatentActions,
-    Plan,
-    Predict,
-    adam,
-    cem,
-    evaluate,
-    expected_return,
-    iterations_to,
-    mppi,
-    sampled_starts,
-    stopped,
-    through_model,
-    through_simulator,
-)
-from tsmlib.tsm import TSM
 
 T, B, DT = 10, 3, 0.5
 PLANNERS = ("adam", "cem", "mppi")

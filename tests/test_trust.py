@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from torture import files, pipelines, simulators, training
-from torture.__main__ import CHECKS
-from torture.world import Outcome
+from reliability import files, pipelines, simulators, training
+from reliability.__main__ import CHECKS
+from reliability.world import Outcome
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for _, check, quick, _ in part}

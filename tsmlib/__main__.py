@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tsmlib import parameters, runs
+from tsmlib.study import notebooks, parameters, runs
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _publish(parameters.convert("seed", arguments.seed))
             case _:
                 return _run(arguments)
-    except runs.ParameterError as error:
+    except parameters.ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except (runs.RunError, ValueError) as error:  # ValueError: StoreError
@@ -59,7 +59,7 @@ def _run(arguments: argparse.Namespace) -> int:
     present = runs.notebooks()
     word = arguments.notebook
     if word != "all" and word not in present:
-        raise runs.ParameterError(
+        raise parameters.ParameterError(
             f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
         )
     seed = parameters.convert("seed", arguments.seed)
@@ -68,7 +68,7 @@ def _run(arguments: argparse.Namespace) -> int:
     for item in arguments.given:
         name, equals, text = item.partition("=")
         if not equals or name in given or name in ("scale", "seed"):
-            raise runs.ParameterError(
+            raise parameters.ParameterError(
                 f"-p {item!r:.80}: expected NAME=VALUE, each name once, and --scale and --seed for these two."
             )
         given[name] = text
@@ -77,14 +77,14 @@ def _run(arguments: argparse.Namespace) -> int:
         parameters.typed(notebook, given)
         runs.resolve(notebook.stem, scale=arguments.scale, seed=seed, device=arguments.device)
     for notebook in chosen:
-        print(runs.execute(notebook, scale=arguments.scale, seed=seed, device=arguments.device, given=given))
+        print(notebooks.execute(notebook, scale=arguments.scale, seed=seed, device=arguments.device, given=given))
     return 0
 
 
 def _verify(path: Path) -> int:
-    from tsmlib import store
+    from tsmlib.storage import manifest
 
-    files = store.verify(path)
+    files = manifest.verify(path)
     for file in files:
         print(f"ok  {file}")
     print(f"{len(files)} files are as they were made")
@@ -92,7 +92,7 @@ def _verify(path: Path) -> int:
 
 
 def _publish(seed: int) -> int:
-    from tsmlib import publish
+    from tsmlib.study import publish
 
     publish.publish(runs.resolve("publish", scale="paper", seed=seed))
     return 0
@@ -107,7 +107,7 @@ def _benchmarks() -> dict[str, Path]:
 def _bench(name: str) -> int:
     present, table = _benchmarks(), runs.ROOT / "benchmarks" / "_table.py"
     if name not in ("all", "table", *present):
-        raise runs.ParameterError(
+        raise parameters.ParameterError(
             f"no benchmark is called {name!r:.80}; there are {', '.join(present)}, all of them, or table."
         )
     commands: list[tuple[Any, ...]] = [(present[word],) for word in present if name in ("all", word)]

@@ -145,3 +145,8 @@ def batches(
         episodes = torch.randint(n, (batch_size,), generator=generator)
         starts = torch.randint(last_start + 1, (batch_size,), generator=generator)
         yield windows(segment, episodes, starts, past_len, future_len)
+
+
+def states_before(window: Window) -> Tensor:
+    """x_t .. x_{t+K-1}, the states in which the future's actions are taken: (B, K, dx)."""
+    return torch.cat([window.past.states[:, -1:], window.future.states[:, :-1]], dim=1)

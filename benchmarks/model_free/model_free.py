@@ -26,9 +26,12 @@ import torch
 from tqdm.auto import tqdm
 
 import tsmlib.envs  # noqa: F401 - registers the environments
-from tsmlib import store, study
-from tsmlib.control import TOLERANCE, Task, execute, sim_of
-from tsmlib.runs import ROOT
+from tsmlib import study
+from tsmlib.envs.spec import sim_of
+from tsmlib.planning.execution import execute
+from tsmlib.planning.tasks import TOLERANCE, Task
+from tsmlib.storage import tables
+from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment
 
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v0")
@@ -219,7 +222,7 @@ class Table:
     """The rows of all finished runs, in a file. A run is known by environment, algorithm, condition, setting, seed."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.rows = path, store.load_table(path) if path.exists() else []
+        self.path, self.rows = path, tables.load_table(path) if path.exists() else []
 
     def kept(self, key: Mapping[str, Any], steps: int) -> list[dict[str, Any]]:
         """The rows of a run, if it took at least ``steps``."""
@@ -236,7 +239,7 @@ class Table:
         ]
         others = [row for row in self.rows if any(row[name] != value for name, value in key.items())]
         self.rows = [*others, *new]
-        store.save_table(self.path, self.rows, extra=EXTRA)
+        tables.save_table(self.path, self.rows, extra=EXTRA)
         return new
 
 

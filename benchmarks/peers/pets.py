@@ -25,9 +25,14 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
-from tsmlib import evaluate, parameters, runs, scoreboard, store, study
-from tsmlib.envs import ENV_IDS
-from tsmlib.nets import Features, Noise, standard_normal
+from tsmlib import study
+from tsmlib.envs.spec import ENV_IDS
+from tsmlib.evaluation import prediction
+from tsmlib.models.features import Features
+from tsmlib.sampling import Noise, standard_normal
+from tsmlib.storage import tables
+from tsmlib.study import parameters, runs
+from tsmlib.study.results import prediction as prediction_results
 from tsmlib.trajectory import Segment, Trajectories
 
 MODELS = {"gaussian": "pets", "mse": "pets+mse"}  # --form -> word in the column "model"
@@ -231,8 +236,8 @@ def table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write ``rows`` to ``path``, in place of those of the same model, environment and seed that it holds."""
     key = ("env", "model", "seed")
     new = {tuple(row[name] for name in key) for row in rows}
-    kept = store.load_table(path) if path.exists() else []
-    store.save_table(path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows])
+    kept = tables.load_table(path) if path.exists() else []
+    tables.save_table(path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows])
 
 
 def run_of(folder: Path) -> runs.Run:
@@ -264,14 +269,14 @@ def main() -> None:
     print(f"{arguments.env}, {word}: " + ", ".join(f"{name} {value:,.4g}" for name, value in took.items()))
     began = time.perf_counter()
     splits, options = (test, validation), dict(samples=arguments.samples, seed=arguments.seed)
-    open_loop = evaluate.score(peer, features, *splits, progress=f"{word}, open loop", **options)
-    options |= dict(starts=scoreboard.SEGMENTS, horizon=10)
-    segments = evaluate.score(peer, features, *splits, progress=f"{word}, segments", **options)
+    open_loop = prediction.score(peer, features, *splits, progress=f"{word}, open loop", **options)
+    options |= dict(starts=prediction_results.SEGMENTS, horizon=10)
+    segments = prediction.score(peer, features, *splits, progress=f"{word}, segments", **options)
     print(f"{arguments.samples} samples of {len(test)} trajectories scored in {time.perf_counter() - began:.0f} s")
     for metric, curve in open_loop.against_horizon().items():
         print(f"    {metric:18} at 10 steps {curve[9]:9.3f}   at 80 steps {curve[79]:9.3f}")
     common = dict(seed=arguments.seed, scale=run.scale)
-    rows = scoreboard.rows(arguments.env, word, open_loop, segments, test, **common)
+    rows = prediction_results.rows(arguments.env, word, open_loop, segments, test, **common)
     about = {name: rows[0][name] for name in ("env", "sim", "model", "planner", "condition")} | common
     rows += [dict(about, metric=name, value=value, unit=UNITS.get(name, "")) for name, value in took.items()]
     path = arguments.out or run.metrics / "peers_pets.csv"

@@ -1,10 +1,10 @@
 """mbrl-lib's PETS beside this package's models and planners: how fast each trains, and how fast and well each plans.
 
-Training: mbrl-lib's ``ModelTrainer`` and ``GaussianMLP`` (see pets.py) beside ``tsmlib.train.fit`` and an ``Ensemble``
+Training: mbrl-lib's ``ModelTrainer`` and ``GaussianMLP`` (see pets.py) beside ``fit`` and an ``Ensemble``
 of the same size, in transitions per second. Planning: the same targets of the frozen push task, open loop over 50
 steps, by mbrl-lib's ``CEMOptimizer`` through its ensemble, one target at a time, as its examples plan; by the planners
-of ``tsmlib.trajopt`` through the shipped models, all targets at once; and crosswise. All plans are executed in the true
-simulator. Everything is timed in turns within one process, in processor seconds of one thread.
+of ``tsmlib.planning`` through the shipped models, all targets at once; and both ways. All plans are executed in the
+true simulator. Everything is timed in turns within one process, in processor seconds of one thread.
 
     OMP_NUM_THREADS=1 build/peers/bin/python benchmarks/peers/speed.py
 
@@ -27,14 +27,20 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib import runs, store, study
-from tsmlib.baselines import Ensemble
-from tsmlib.control import Task, Trial, execute, zero_torques
-from tsmlib.nets import Features
-from tsmlib.style import interval
-from tsmlib.train import fit
+from tsmlib import study
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.features import Features
+from tsmlib.planning.base import Space
+from tsmlib.planning.execution import Trial, execute
+from tsmlib.planning.planners import adam, cem, expected_return
+from tsmlib.planning.predictors import through_model
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task, zero_torques
+from tsmlib.statistics import interval
+from tsmlib.storage import artifacts, tables
+from tsmlib.study import runs
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
-from tsmlib.trajopt import DirectActions, LatentActions, Space, adam, cem, expected_return, through_model
 
 ENV = "tsm/ReacherPush-v0"
 OURS = {"gaussian": "ensemble", "mse": "ensemble+mse"}  # as pets.MODELS
@@ -134,7 +140,7 @@ def speeds(trainers: Sequence[Trainer], clock: Clock, *, transitions: int, round
 class Way:
     """A way to plan: who searches what, through which model.
 
-    planner: mbrl-cem (mbrl-lib's), or cem or adam of ``tsmlib.trajopt``. prior: what is searched, actions or codes.
+    planner: mbrl-cem (mbrl-lib's), or cem or adam of ``tsmlib.planning``. prior: what is searched, actions or codes.
     model: pets (mbrl-lib's ensemble), or a word of ``tsmlib.study``. samples: of the model for every candidate.
     bound: of what mbrl-cem searches, half of which is the standard deviation that it starts with.
     """
@@ -433,15 +439,15 @@ def trained(
     """mbrl-lib's model after ``seconds`` of processor time: from the run's folder, else trained now and kept there."""
     path = run.folder("peers") / f"{pets.MODELS[form]}.safetensors"
     inputs = {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
-    made_from = {"form": form, "seconds": seconds, "data": store.digest(inputs)}
+    made_from = {"form": form, "seconds": seconds, "data": artifacts.digest(inputs)}
     if path.exists():
-        weights, header = store.load(path, kind="peer")
+        weights, header = artifacts.load(path, kind="peer")
         if header["made_from"] == made_from:
             model, _ = pets.fresh(form, features, data, seed=0)  # the statistics of its inputs are not weights
             model.load_state_dict(weights)
             return model.eval()
     model, took = pets.train(form, features, data, validation, seconds=seconds, seed=0)
-    store.save(path, model.state_dict(), kind="peer", header={"made_from": made_from, "took": took})
+    artifacts.save(path, model.state_dict(), kind="peer", header={"made_from": made_from, "took": took})
     return model
 
 
@@ -478,7 +484,7 @@ def main() -> None:
     rows += planning(found, task)
     verdicts(found)
     path = run.dir.parents[1] / "bench" / "peers.csv"
-    store.save_table(path, [dict(row, seed=0) for row in rows])
+    tables.save_table(path, [dict(row, seed=0) for row in rows])
     print(path)
 
 

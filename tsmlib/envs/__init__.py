@@ -5,34 +5,21 @@ whole action sequences at once. The state is the observation, and its layout is 
 ``imperfect`` names the same arms with noisy sensors or delayed actions (section 5.3.3).
 """
 
-import re
+from __future__ import annotations
+
 from typing import Any
 
 import gymnasium
-import numpy as np
 
-from tsmlib.envs.base import (
-    DT,
-    HALF_RANGE,
-    STATE_NAMES,
-    STATE_UNITS,
-    ArmEnv,
-    ArmVectorEnv,
-    SimulationUnstable,
-    closest_gap,
-    task_of,
-)
-from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise
-
-MUJOCO_IDS = ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v0")
-PYMUNK_IDS = ("tsm/PymunkReacher-v0", "tsm/PymunkObstacle-v0", "tsm/PymunkPush-v0")
-ENV_IDS = MUJOCO_IDS + PYMUNK_IDS
+from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
+from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, PYMUNK_IDS, has_block, imperfections
+from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise, _half_range
 
 for _id in ENV_IDS:
     if _id not in gymnasium.registry:
         gymnasium.register(
             _id,
-            entry_point="tsmlib.envs.base:ArmEnv",
+            entry_point="tsmlib.envs.arm:ArmEnv",
             vector_entry_point="tsmlib.envs.mujoco_arm:MujocoArm"
             if _id in MUJOCO_IDS
             else "tsmlib.envs.pymunk_arm:PymunkArm",
@@ -41,14 +28,11 @@ for _id in ENV_IDS:
         )
 
 
-NOISE, DELAY = 0.25, 5  # section 5.3.3: sigma on data scaled to [-1, 1]; steps
-
-
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
     """The id of the same arm behind `SensorNoise` and `ActionDelay`, registered where it is not yet.
 
-    noise: sigma, in units of data scaled to [-1, 1] (``base.HALF_RANGE``). delay: tau in steps. Both of the paper's,
-    ``NOISE`` and ``DELAY``, are registered for every arm. ValueError where they make no sense.
+    noise: sigma, in units of data scaled to [-1, 1] (``geometry.HALF_RANGE``). delay: tau in steps. Both of the
+    paper's, ``NOISE`` and ``DELAY``, are registered for every arm. ValueError where they make no sense.
     """
     if env_id not in ENV_IDS:
         raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}; noise and delay are added to one of these")
@@ -70,36 +54,6 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
     return name
 
 
-def imperfections(env_id: str) -> tuple[str, float, int]:
-    """The plain arm behind an id, the noise of its sensors and the delay of its actions. ValueError for another id."""
-    parts = re.fullmatch(r"(.*?)(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v0", env_id)
-    arm, noise, delay = parts.groups() if parts else ("", None, None)
-    if f"{arm}-v0" not in ENV_IDS:
-        raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them")
-    return f"{arm}-v0", float(noise or 0.0), int(delay or 0)
-
-
-def _imperfect_arm(env_id: str, noise: float, delay: int, **kwargs: Any) -> gymnasium.Env:
-    arm = gymnasium.make(env_id, disable_env_checker=True, **kwargs).unwrapped
-    return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
-
-
-def _imperfect_arms(num_envs: int, env_id: str, noise: float, delay: int, **kwargs: Any) -> ImperfectArms:
-    arms = gymnasium.make_vec(env_id, num_envs=num_envs, **kwargs)
-    return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
-
-
-def _half_range(env_id: str) -> np.ndarray:
-    if task_of(env_id) == "obstacle":  # it does not move, and nobody measures how fast
-        return np.array([*HALF_RANGE[:8], 0.0, 0.0])
-    return np.array(HALF_RANGE[: 10 if has_block(env_id) else 6])
-
-
-def has_block(env: str) -> bool:
-    """Whether there is an obstacle or object, and so something that the arm can touch."""
-    return task_of(env) != "reacher"
-
-
 def fingerprint(env_id: str) -> dict[str, Any]:
     """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit."""
     arm, noise, delay = imperfections(env_id)
@@ -114,22 +68,16 @@ def fingerprint(env_id: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _imperfect_arm(env_id: str, noise: float, delay: int, **kwargs: Any) -> gymnasium.Env:
+    arm = gymnasium.make(env_id, disable_env_checker=True, **kwargs).unwrapped
+    return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
+
+
+def _imperfect_arms(num_envs: int, env_id: str, noise: float, delay: int, **kwargs: Any) -> ImperfectArms:
+    arms = gymnasium.make_vec(env_id, num_envs=num_envs, **kwargs)
+    return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
+
+
 for _id in ENV_IDS:
     imperfect(_id, noise=NOISE)
     imperfect(_id, delay=DELAY)
-
-__all__ = [
-    "DELAY",
-    "ENV_IDS",
-    "MUJOCO_IDS",
-    "NOISE",
-    "PYMUNK_IDS",
-    "ArmEnv",
-    "ArmVectorEnv",
-    "SimulationUnstable",
-    "closest_gap",
-    "fingerprint",
-    "has_block",
-    "imperfect",
-    "imperfections",
-]

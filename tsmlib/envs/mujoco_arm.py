@@ -19,26 +19,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
-
 import gymnasium.envs.mujoco
 import mujoco
 import mujoco.rollout
 import numpy as np
 
-from tsmlib.envs.base import (
-    BLOCK_DECAY,
-    BLOCK_MASS,
-    BLOCK_RADIUS,
-    DT,
-    RESTITUTION,
-    WALL,
-    ArmVectorEnv,
-    SimulationUnstable,
-    fingertip,
-    task_of,
-)
+from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_MASS, BLOCK_RADIUS, DT, RESTITUTION, WALL, fingertip
+from tsmlib.envs.spec import task_of
+
+if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from tsmlib.envs.base import (
+from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.geometry import (
     ARM_RADIUS,
     BLOCK_DECAY,
     BLOCK_MASS,
@@ -31,8 +32,6 @@ from tsmlib.envs.base import (
     LINK_LENGTHS,
     RESTITUTION,
     WALL,
-    ArmVectorEnv,
-    SimulationUnstable,
 )
 
 SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies

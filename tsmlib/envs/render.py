@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsmlib.envs.base import ARM_RADIUS, BLOCK_RADIUS, LINK_LENGTHS, WALL, arm_points, task_of
+from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_RADIUS, LINK_LENGTHS, WALL, arm_points
+from tsmlib.envs.spec import task_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,6 +10,9 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
+from tsmlib.envs.geometry import HALF_RANGE
+from tsmlib.envs.spec import has_block, task_of
+
 NOISE_STREAM = 1  # keeps the noise apart from the draws that the environment makes from the same seed
 
 
@@ -134,3 +137,9 @@ class ImperfectArms(VectorWrapper):
             return states.copy()
         drawn = np.stack([generator.standard_normal(states.shape[1:]) for generator in self._noise])
         return states + self.sigma * self.scale * drawn
+
+
+def _half_range(env_id: str) -> np.ndarray:
+    if task_of(env_id) == "obstacle":  # it does not move, and nobody measures how fast
+        return np.array([*HALF_RANGE[:8], 0.0, 0.0])
+    return np.array(HALF_RANGE[: 10 if has_block(env_id) else 6])

@@ -9,10 +9,11 @@ import gymnasium
 import torch
 
 import tsmlib.envs
-from tsmlib import store
-from tsmlib.collect import collect, once, smooth_torques
-from tsmlib.envs import has_block
-from tsmlib.runs import ParameterError, Run
+from tsmlib.collection import collect, once, smooth_torques
+from tsmlib.envs.spec import has_block
+from tsmlib.storage import artifacts
+from tsmlib.study.parameters import ParameterError
+from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
 SPLITS = ("train", "validation", "test")
@@ -43,12 +44,12 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     n = sizes(run, env)[split]
     path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
     if path.exists():
-        return store.load_trajectories(path, env=env, expect=fingerprint(env))
+        return artifacts.load_trajectories(path, env=env, expect=fingerprint(env))
     if run.seed in HELD_OUT_SEED.values():
         raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
     seed = HELD_OUT_SEED.get(split, run.seed)
     data = random_data(env, n, seed=seed)
-    store.save_trajectories(
+    artifacts.save_trajectories(
         path, data, {"split": split, "seed": seed, "scale": run.scale, "fingerprint": fingerprint(env)}
     )
     return data

@@ -12,16 +12,18 @@ from typing import Any
 
 import torch
 
-from tsmlib import store
-from tsmlib.baselines import LSTM, Ensemble, OneStep
-from tsmlib.envs import has_block, imperfections
-from tsmlib.prior import ActionPrior
-from tsmlib.runs import Run
+from tsmlib.envs.spec import has_block, imperfections
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.tsm import TSM
+from tsmlib.storage import artifacts, manifest
+from tsmlib.storage import files as files_storage
 from tsmlib.study.data import dataset, fingerprint, short
 from tsmlib.study.parallel import ahead
-from tsmlib.train import fit
+from tsmlib.study.runs import Run
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
-from tsmlib.tsm import TSM
 
 CLASSES: dict[str, Any] = {  # by the first part of a model's word; what follows a + is an option of the class
     "tsm": TSM, "onestep": OneStep, "multistep": OneStep, "lstm": LSTM, "ensemble": Ensemble, "prior": ActionPrior,
@@ -100,17 +102,17 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     shipped = run.shipped / short(env) / f"{model}.safetensors"
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            header = store.read_header(path)
+            header = artifacts.read_header(path)
             if header.get("model") != model:
-                raise store.StoreError(
+                raise files_storage.StoreError(
                     f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it"
                 )
             planned = _plain(schedule(replace(run, scale=header.get("scale", run.scale)), env, model))
             if (found := header.get("schedule", planned)) != planned:
-                raise store.StoreError(
+                raise files_storage.StoreError(
                     f"{path} was trained by another schedule: {found}, expected {planned}. Restore or delete it"
                 )
-            return store.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
+            return artifacts.load_model(path, CLASSES[model.partition("+")[0]], expect=fingerprint(env)), header
     return train(run, env, model, own)
 
 
@@ -152,10 +154,10 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
         "seconds": sum(c["seconds"][-1] for c in curves.values()),  # of processor time
         "inputs": _inputs(run, env, path),
     }  # fmt: skip
-    store.save_model(path, net, header)
+    artifacts.save_model(path, net, header)
     for stage in schedule(run, env, model):
         shutil.rmtree(path.with_name(f"{model}-{stage.loss}.checkpoint"))
-    return net, store.read_header(path)
+    return net, artifacts.read_header(path)
 
 
 def bf16_pays(model: str, stage: Stage) -> bool:
@@ -171,7 +173,7 @@ def _plain(stages: list[Stage]) -> list[dict[str, Any]]:
 def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
     """The data that a model in ``path`` was trained on: file, relative to the model, and SHA-256."""
     files = [run.data / short(env) / f"{split}.safetensors" for split in ("train", "validation")]
-    return {Path(os.path.relpath(file, path.parent)).as_posix(): store.sha256(file) for file in files}
+    return {Path(os.path.relpath(file, path.parent)).as_posix(): manifest.sha256(file) for file in files}
 
 
 def fresh(run: Run, model: str, data: Trajectories) -> Any:

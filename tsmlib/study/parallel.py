@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from tsmlib.runs import Run, RunError
+from tsmlib.study.runs import Run, RunError
 
 
 def ahead(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:

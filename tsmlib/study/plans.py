@@ -11,28 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from tsmlib import store
-from tsmlib.control import Task, Trial, execute, random_torques, replan, zero_torques
-from tsmlib.runs import Run
+from tsmlib.planning.base import Plan, Planner, Predict, Space
+from tsmlib.planning.execution import Trial, execute, replan
+from tsmlib.planning.planners import adam, cem, mppi, reassess, sampled_starts, stopped
+from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.storage import artifacts
 from tsmlib.study.data import short
 from tsmlib.study.models import load_or_train
 from tsmlib.study.predictions import RESULTS
-from tsmlib.trajopt import (
-    DirectActions,
-    LatentActions,
-    Plan,
-    Planner,
-    Predict,
-    Space,
-    adam,
-    cem,
-    mppi,
-    reassess,
-    sampled_starts,
-    stopped,
-    through_model,
-    through_simulator,
-)
+from tsmlib.study.runs import Run
 
 PLANNERS = ("adam", "adam+starts", "cem", "mppi")
 VERSION = 2  # of planners and kept plans; others are made again
@@ -76,7 +65,7 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
     posed = {"version": VERSION, "task": task.name, "env": task.env, "horizon": task.horizon, "every": every}
     made_from = posed | {
         "seed": run.seed, "candidates": candidates, "iterations": steps,
-        "weights": {word: store.digest(net.state_dict()) for word, net in nets.items()},
+        "weights": {word: artifacts.digest(net.state_dict()) for word, net in nets.items()},
     }  # fmt: skip
     own, shipped = run.folder("plans") / name, RESULTS / name
     if task.own is None and (kept := _kept(own, task, made_from)):
@@ -97,7 +86,7 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
             "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
             "states": found.states, "predicted": found.predicted, "curve": found.curve,
         } | ({} if found.trace is None else {"trace": found.trace})  # fmt: skip
-        store.save(
+        artifacts.save(
             own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds, "device": run.device}
         )
     return found
@@ -179,7 +168,7 @@ def _kept(path: Path, task: Task, wanted: dict[str, Any]) -> Plan | None:
     """The plan in ``path`` if it was made as ``wanted`` for this task, or for more targets that begin with its."""
     if not path.exists():
         return None
-    tensors, header = store.load(path, kind="plan")
+    tensors, header = artifacts.load(path, kind="plan")
     n, made_from = len(task), header.get("made_from", {})
     if any(made_from.get(word) != value for word, value in wanted.items()):
         return None

@@ -10,13 +10,16 @@ from typing import Any
 
 import torch
 
-from tsmlib import rewards, store
-from tsmlib.control import TOLERANCE, Task, execute
-from tsmlib.invariants import within
-from tsmlib.policy import OneStepPolicy, SegmentPolicy, controller, episodes_from, imagine, improve
-from tsmlib.runs import Run
+from tsmlib import rewards
+from tsmlib.evaluation.actions import within
+from tsmlib.planning.execution import execute
+from tsmlib.planning.tasks import TOLERANCE, Task
+from tsmlib.policies.learning import episodes_from, imagine, improve
+from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
+from tsmlib.storage import artifacts
 from tsmlib.study.data import dataset, fingerprint, short
 from tsmlib.study.models import load_or_train
+from tsmlib.study.runs import Run
 
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration (A.3)
 
@@ -43,14 +46,14 @@ def learn(
     nets = {"model": net} | ({"prior": load_or_train(run, task.env, "prior")[0]} if prior == "codes" else {})
     cls, own = SegmentPolicy if prior == "codes" else OneStepPolicy, _path(run, task, model, prior)
     shipped = run.shipped / short(task.env) / own.name
-    weights = {word: store.digest(net.state_dict()) for word, net in nets.items()}
+    weights = {word: artifacts.digest(net.state_dict()) for word, net in nets.items()}
     made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
     budget = {"copies": copies, "iterations": iterations or run.pick(smoke=4, laptop=300, paper=2200)}
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            header = store.read_header(path)
+            header = artifacts.read_header(path)
             if header.get("made_from") == made_from and (path == shipped or header.get("budget") == budget):
-                return store.load_model(path, cls, expect=fingerprint(task.env)), header
+                return artifacts.load_model(path, cls, expect=fingerprint(task.env)), header
     print(f"{task.env}: no policy learned in {model} through {prior} at scale {run.scale}; learning it now")
     data = dataset(run, task.env, "train")
     options: dict[str, Any] = dict(angles=data.angles, copies=copies, seed=1000 * run.seed)
@@ -73,15 +76,15 @@ def learn(
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"),
     }  # fmt: skip
-    store.save_model(own, policy.cpu(), header)
+    artifacts.save_model(own, policy.cpu(), header)
     shutil.rmtree(checkpoint)
-    return policy, store.read_header(own)
+    return policy, artifacts.read_header(own)
 
 
 def kept_budget(run: Run, task: Task, model: str, prior: str) -> dict[str, int] | None:
     """Copies and iterations of the policy that the run's folder holds, for ``learn`` to find it again; else None."""
     path = _path(run, task, model, prior)
-    return dict(store.read_header(path)["budget"]) if path.exists() else None
+    return dict(artifacts.read_header(path)["budget"]) if path.exists() else None
 
 
 def _path(run: Run, task: Task, model: str, prior: str) -> Path:

@@ -7,16 +7,22 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from tsmlib import evaluate, scoreboard, store
-from tsmlib.runs import ROOT, Run, require
+from tsmlib.evaluation import prediction
+from tsmlib.sampling import Noise
+from tsmlib.storage import artifacts, tables
 from tsmlib.study.data import dataset, short
 from tsmlib.study.models import load_or_train
+from tsmlib.study.notebooks import require
+from tsmlib.study.results import prediction as prediction_results
+from tsmlib.study.runs import ROOT, Run
+from tsmlib.trajectory import Segment
 
 RESULTS = ROOT / "data" / "results"
 
 
-def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluate.Scores:
+def scores(run: Run, env: str, model: str, *, segments: bool = False) -> prediction.Scores:
     """``evaluate.score`` of a trained model on test episodes: open loop, or ``segments`` from the true past.
 
     Smoke 8 episodes and samples, laptop 200 episodes and 16 samples, paper 1,000 and 32. Scores are kept in the run's
@@ -30,25 +36,25 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> evaluat
     samples = run.pick(smoke=8, laptop=16, paper=32)  # of a model without samples: noisy copies
     options: dict[str, Any] = {"horizon": 90}
     if segments:
-        options = {"horizon": 10, "starts": list(scoreboard.SEGMENTS)}
+        options = {"horizon": 10, "starts": list(prediction_results.SEGMENTS)}
     path = run.folder(f"scores/{short(env)}") / f"{model}{'-segments' * segments}.safetensors"
     made_from = {
-        "version": evaluate.VERSION, "rows": evaluate.ROWS, "samples": samples, "seed": run.seed, **options,
-        "model": net.config(), "weights": store.digest(net.state_dict()),
-        **{split: store.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})
+        "version": prediction.VERSION, "rows": prediction.ROWS, "samples": samples, "seed": run.seed, **options,
+        "model": net.config(), "weights": artifacts.digest(net.state_dict()),
+        **{split: artifacts.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})
            for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
-    if not path.exists() or store.read_header(path).get("made_from") != made_from:
+    if not path.exists() or artifacts.read_header(path).get("made_from") != made_from:
         features = deepcopy(net.features)  # what is scored is on the processor
-        found = evaluate.score(
+        found = prediction.score(
             net.to(run.device), features, test, held_out, samples=samples, seed=run.seed, **options,
             progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
         )  # fmt: skip
         tensors = {f"values.{metric}": value for metric, value in found.values.items()}
         tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
         tensors |= {"pit": found.pit, "outside": found.outside}
-        store.save(path, tensors, kind="scores", header={"made_from": made_from, "device": run.device})
-    return _unpacked(store.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
+        artifacts.save(path, tensors, kind="scores", header={"made_from": made_from, "device": run.device})
+    return _unpacked(artifacts.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
 
 
 def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict[str, Any]]:
@@ -60,7 +66,7 @@ def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict
     """
     name = f"{run.notebook}{table}.csv"
     if run.scale == "laptop" and (RESULTS / name).exists():
-        published = store.load_table(RESULTS / name)
+        published = tables.load_table(RESULTS / name)
         known = {row["env"] for row in published}
         return [*published, *(row for row in rows if row["env"] not in known)]
     if run.scale != "paper":
@@ -69,7 +75,7 @@ def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict
         if run.dir not in path.parents:
             folder = path.parents[1]
             require(replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder), run.notebook)
-            rows = [*rows, *store.load_table(path)]
+            rows = [*rows, *tables.load_table(path)]
     return rows
 
 
@@ -77,12 +83,25 @@ def table(run: Run, name: str) -> list[dict[str, Any]]:
     """The rows of a run's table, else of the published one; none where neither is there."""
     for path in (run.metrics / name, RESULTS / name):
         if path.exists():
-            return store.load_table(path)
+            return tables.load_table(path)
     return []
 
 
-def _unpacked(tensors: dict[str, torch.Tensor]) -> evaluate.Scores:
+def _unpacked(tensors: dict[str, torch.Tensor]) -> prediction.Scores:
     values = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("values.")}
     fitted = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("fitted.")}
     numbers: dict[str, Any] = {name: tensor if tensor.ndim else float(tensor) for name, tensor in fitted.items()}
-    return evaluate.Scores(values, tensors["pit"], tensors["outside"], evaluate.Fitted(**numbers))
+    return prediction.Scores(values, tensors["pit"], tensors["outside"], prediction.Fitted(**numbers))
+
+
+class WithoutPastActions:
+    """A model that is shown zeros for the past actions U-: what they were worth (section 3)."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.segment_len, self.past_len, self.features = model.segment_len, model.past_len, model.features
+        self.stochastic = getattr(model, "stochastic", True)
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """As the model's, see ``DynamicsModel``."""
+        return self.model.predict_segment(Segment(past.states, 0 * past.actions), actions, generator=generator)

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 import tsmlib.envs
-from tsmlib import store
-from tsmlib.control import Task
-from tsmlib.envs import imperfections
-from tsmlib.runs import ROOT
+from tsmlib.envs.spec import imperfections
+from tsmlib.planning.tasks import Task
+from tsmlib.storage import artifacts
 from tsmlib.study.data import short
+from tsmlib.study.runs import ROOT
 
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
@@ -29,7 +29,7 @@ def task(env: str, split: str = "test") -> Task:
         return replace(task(arm, split), env=env)
     path = FROZEN / f"{short(env)}.safetensors"
     if split == "test" and path.exists():
-        tensors, header = store.load(path, kind="task")
+        tensors, header = artifacts.load(path, kind="task")
         return Task(header["task"], header["env"], tensors["start"].numpy(), tensors["target"])
     return draw_task(env, seed=TASK_SEED[split])
 
@@ -50,4 +50,4 @@ def freeze_tasks() -> None:
         path = FROZEN / f"{short(env)}.safetensors"
         path.parent.mkdir(parents=True, exist_ok=True)
         header = {"task": drawn.name, "env": env, "seed": TASK_SEED["test"]}
-        store.save(path, {"start": drawn.start, "target": drawn.target}, kind="task", header=header)
+        artifacts.save(path, {"start": drawn.start, "target": drawn.target}, kind="task", header=header)

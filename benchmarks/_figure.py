@@ -1,0 +1,84 @@
+"""How cost grows with the size of things, for docs/speed.md. Letters in shapes: R rounds, K sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from tsmlib.figures.axes import finite
+from tsmlib.figures.style import COLOURS, legend, panels, styled
+
+LOOKS: dict[str, dict[str, Any]] = {  # the model's blues and a grey; black is the true simulator
+    "train": dict(color=COLOURS["tsm"], marker="o"),
+    "imagine": dict(color=COLOURS["data"], marker="s"),
+    "plan": dict(color=COLOURS["tsm+energy+direct"], marker="^"),
+    "score": dict(color=COLOURS["tsm"], marker="D"),
+    "learn": dict(color=COLOURS["tsm"], marker="v"),
+    "simulate": dict(color=COLOURS["oracle"], marker="x"),
+}
+UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
+WORDS = {
+    "train": "training update", "imagine": "imagining", "plan": "planning iteration", "score": "scoring",
+    "learn": "policy update", "simulate": "MuJoCo",
+}  # fmt: skip
+
+Curve = tuple[np.ndarray, np.ndarray]  # sizes (K,), seconds (R, K)
+
+
+def exponents(sizes: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Of sizes (K,) and seconds (R, K), the slope of log seconds over log size, round by round: (R,)."""
+    return np.polyfit(np.log(sizes), np.log(seconds).T, 1)[0]
+
+
+@styled
+def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
+    """Cost against size, both logarithmic, one panel per size; cost is relative to that of the smallest size.
+
+    curves: panel -> what is done, one of LOOKS -> sizes and seconds. Marks are medians over rounds, bars reach from the
+    lowest to the highest; each line's exponent stands in the panel, with its spread over rounds. Grey: linear growth,
+    or for threads a cost that falls in proportion.
+    """
+    figure, axes = panels(len(curves), 4, 1.65)
+    for ax, (title, lines) in zip(axes, curves.items(), strict=True):
+        every = np.unique(np.concatenate([np.asarray(sizes, float) for sizes, _ in lines.values()]))
+        slope = -1 if title == "threads" else 1
+        lowest = np.array([min(sizes[0] for sizes, _ in lines.values()), every[-1]])
+        ax.plot(lowest, (lowest / lowest[0]) ** slope, color=COLOURS["zero"], ls="--", lw=0.8, zorder=1)
+        notes = []
+        for word, (sizes, seconds) in lines.items():
+            sizes = finite(f"sizes of {title}, {word}", sizes, "K")
+            seconds = finite(f"seconds of {title}, {word}", seconds, f"R {len(sizes)}")
+            relative = seconds / seconds[:, :1]
+            middle = np.median(relative, axis=0)
+            bars = np.stack([middle - relative.min(0), relative.max(0) - middle])
+            ax.errorbar(sizes, middle, bars, **LOOKS[word], ms=3, lw=1, elinewidth=0.7, zorder=3)
+            found = exponents(sizes, seconds)
+            notes.append(
+                (f"exponent {np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})", LOOKS[word]["color"])
+            )
+        unit = f" ({UNITS[title]})" if title in UNITS else ""
+        ax.set(xscale="log", yscale="log", title=title.capitalize() + unit)
+        ax.set_xticks(every, [f"{size:g}" for size in every])
+        ax.yaxis.set_major_locator(FixedLocator([a * 10.0**b for b in range(-2, 4) for a in (1, 2, 5)]))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_minor_locator(NullLocator())
+        low, high = ax.get_ylim()
+        room = (high / low) ** (0.13 * len(notes))  # for the notes: below lines that rise, above those that should fall
+        ax.set_ylim((low / room, high) if slope > 0 else (low, high * room))
+        for i, (note, shade) in enumerate(reversed(notes) if slope > 0 else notes):
+            y, anchor = (0.02 + 0.09 * i, "bottom") if slope > 0 else (0.98 - 0.09 * i, "top")
+            ax.text(1.0, y, note.replace("-", "\u2212"), transform=ax.transAxes, ha="right", va=anchor, color=shade,
+                    fontsize=6 if slope > 0 else 5.2)  # fmt: skip
+    for ax in axes[::4]:
+        ax.set_ylabel("cost (of the smallest)")
+    used = [word for word in LOOKS if any(word in lines for lines in curves.values())]
+    entries = [Line2D([], [], **LOOKS[word], ms=3, label=WORDS[word]) for word in used]
+    entries.append(Line2D([], [], color=COLOURS["zero"], ls="--", lw=0.8, label="in proportion"))
+    legend(figure, entries, 7)
+    return figure

@@ -1,0 +1,59 @@
+"""Which learning rate each model is trained with: half, once and twice that of its schedule, on validation data.
+
+Every model gets the same three tries at the same share of its budget (`study.BUDGET`); what counts is the best
+validation loss of its last stage. Losses of different models are not to be compared.
+
+    python benchmarks/settings/learning_rates.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from tsmlib import study
+from tsmlib.envs.spec import ENV_IDS, sim_of
+from tsmlib.storage import tables
+from tsmlib.study import parameters, runs
+from tsmlib.training.fit import fit
+
+FACTORS = (0.5, 1.0, 2.0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
+    parser.add_argument("--models", nargs="+", choices=study.DYNAMICS, metavar="MODEL", default=[
+        "onestep", "multistep", "lstm", "ensemble+mse", "tsm", "tsm+energy+direct"])  # fmt: skip
+    parser.add_argument("--share", type=float, default=0.2, help="of the budget (default 0.2)")
+    parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
+    parser.add_argument("--out", type=Path, help="table to write (default: metrics/02_learning_rates.csv of the run)")
+    arguments = parser.parse_args()
+    run = runs.resolve("02_train", scale=arguments.scale)
+    data, held_out = (study.dataset(run, arguments.env, split) for split in ("train", "validation"))
+    path = arguments.out or run.metrics / "02_learning_rates.csv"
+    common = dict(
+        env=arguments.env, sim=sim_of(arguments.env), planner="none", condition="learning rate",
+        metric="validation_loss", n=len(held_out), seed=run.seed, scale=run.scale,
+    )  # fmt: skip
+    rows = []
+    for model in arguments.models:
+        for factor in FACTORS:
+            net = study.fresh(run, model, data)
+            for stage in study.schedule(run, arguments.env, model):
+                steps = max(1, round(stage.steps * arguments.share))
+                curve = fit(
+                    net, getattr(net, stage.loss), data, held_out,
+                    past_len=net.past_len, future_len=stage.future_len, steps=steps,
+                    lr=factor * stage.lr, batch_size=stage.batch, validate_every=50, seed=run.seed, bf16=True,
+                    progress=f"{model}, {factor:g} times the rate: {stage.loss}",
+                )  # fmt: skip
+            best = min(curve.validation)
+            print(f"{model:20} last stage at {factor * stage.lr:.0e}: best validation loss {best:.4f}", flush=True)
+            rows.append(dict(common, model=model, value=best, rate=factor * stage.lr))
+            tables.save_table(path, rows, extra=["rate"])
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""What both simulators share: state layout, geometry, resets, rewards, and the Gymnasium interface.
+
+State (float64, all in one horizontal plane):
+
+    joint angles (2, rad, not wrapped), joint velocities (2, rad/s), fingertip (2, m)
+    and with a block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
+
+Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A simulator subclasses `ArmVectorEnv` with
+four methods: ``_start``, ``_simulate``, ``get_state`` and ``set_state``. One arm, `ArmEnv`, is N = 1 of the same code.
+"""
+
+from __future__ import annotations
+
+import secrets
+from abc import ABC, abstractmethod
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from tsmlib.envs.geometry import (
+    BLOCK_CLEARANCE,
+    BLOCK_RING,
+    DT,
+    MAX_OVERLAP,
+    START_ANGLE,
+    START_VELOCITY,
+    STATE_NAMES,
+    STATE_UNITS,
+    TARGET_RADIUS,
+    closest_gap,
+    fingertip,
+)
+from tsmlib.envs.spec import task_of
+
+
+class SimulationUnstable(RuntimeError):
+    """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` since reset (from 0), ``reason``."""
+
+    def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
+        super().__init__(
+            f"the simulation of {env} became unstable in episode {episode} at step {step}: {reason}. "
+            "Check the state this episode started from; the other episodes of this call were not returned."
+        )
+        self.env, self.episode, self.step, self.reason = env, episode, step, reason
+
+
+class ArmVectorEnv(VectorEnv, ABC):
+    """N independent arms. Episodes are not reset on their own: ``truncated`` turns true after the last step.
+
+    ``reset(seed, options)``: ``options["states"]`` (N, dx) starts the episodes there, ``options["target"]`` (2,) or
+    (N, 2) sets the target. Without them, episode i is drawn from (seed, i) alone, so it does not depend on N.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1 / DT),
+        "autoreset_mode": AutoresetMode.DISABLED,
+    }
+    angles = (0, 1)
+    dt = DT
+
+    def __init__(
+        self, num_envs: int, env_id: str, *, max_episode_steps: int = 100, render_mode: str | None = None
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; expected at least 1")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
+        self.num_envs, self.env_id, self.task = num_envs, env_id, task_of(env_id)
+        self.max_episode_steps, self.render_mode = max_episode_steps, render_mode
+        dx = 6 if self.task == "reacher" else 10
+        self.names, self.units = STATE_NAMES[:dx], STATE_UNITS[:dx]
+        self.single_observation_space = Box(-np.inf, np.inf, (dx,), np.float64)
+        self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seed_root: int | None = None  # of the last reset with a seed
+        self._resets = 0
+        self._elapsed: int | None = None  # steps since reset; None before the first
+        self._states = np.zeros((num_envs, dx))
+        self.target = np.zeros((num_envs, 2))
+
+    # What a simulator provides
+
+    @abstractmethod
+    def _start(self, states: np.ndarray) -> None:
+        """Put the N episodes into ``states`` (N, dx); the fingertip in them already fits the angles."""
+
+    @abstractmethod
+    def _simulate(self, actions: np.ndarray) -> np.ndarray:
+        """Advance by float64 ``actions`` (N, T, 2), finite and in [-1, 1], to states (N, T, dx).
+
+        Raises SimulationUnstable, ``step`` counted from the beginning of ``actions``; `rollout` adds those before.
+        """
+
+    @abstractmethod
+    def get_state(self) -> Any:
+        """Everything the simulator's future depends on; `set_state` brings it back bit for bit."""
+
+    @abstractmethod
+    def set_state(self, snapshot: Any) -> None:
+        """Continue from what `get_state` returned."""
+
+    # Gymnasium's interface
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start N episodes; gives states (N, dx) and ``{"target": (N, 2)}``."""
+        options = options or {}
+        if unknown := set(options) - {"states", "target"}:
+            raise ValueError(f"unknown reset options {sorted(unknown)}; expected 'states' and 'target'")
+        super().reset(seed=seed)
+        if seed is not None or self._seed_root is None:
+            self._seed_root, self._resets = (secrets.randbits(64) if seed is None else seed), 0
+        root = (self._seed_root, self._resets)
+        rngs = (np.random.default_rng((*root, i)) for i in range(self.num_envs))
+        self._resets += 1
+        if "states" in options:
+            states = self._checked(options["states"], self._states.shape, "states")
+            states[:, 4:6] = fingertip(states[:, :2])
+            self._require_apart(states)
+            target = np.stack([_in_ring(rng, 0.0, TARGET_RADIUS) for rng in rngs])
+        else:
+            states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
+        if "target" in options:
+            given = np.asarray(options["target"], np.float64)
+            target = self._checked(np.broadcast_to(given, target.shape) if given.ndim == 1 else given, target.shape,
+                                   "target")  # fmt: skip
+        self._states, self.target, self._elapsed = states, target, 0
+        self._start(states)
+        return states.copy(), {"target": target.copy()}
+
+    def rollout(self, actions: np.ndarray) -> np.ndarray:
+        """Advance by ``actions`` (N, T, 2), clipped to [-1, 1], and give the states (N, T, dx) after each.
+
+        Raises ValueError (nothing simulated) where an action is not finite, SimulationUnstable as its name says.
+        """
+        if self._elapsed is None:
+            raise gymnasium.error.ResetNeeded(f"{self.env_id}: call reset() before step() or rollout()")
+        actions = self.checked(actions)
+        if actions.shape[1] == 0:
+            return np.zeros((self.num_envs, 0, len(self.names)))
+        try:
+            states = self._simulate(np.clip(actions, -1.0, 1.0))
+        except SimulationUnstable as fault:
+            step = self._elapsed + fault.step
+            raise SimulationUnstable(fault.env, fault.episode, step, fault.reason) from None
+        self._states = states[:, -1].copy()
+        self._elapsed += actions.shape[1]
+        return states
+
+    def checked(self, actions: np.ndarray) -> np.ndarray:
+        """``actions`` as floats; ValueError where they are not of this shape, or not finite."""
+        actions = np.asarray(actions, np.float64)
+        if actions.ndim != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != 2:
+            raise ValueError(f"actions are {actions.shape}; {self.env_id} expected (N={self.num_envs}, T, 2)")
+        bad = np.argwhere(~np.isfinite(actions))
+        if len(bad):
+            episode, step, joint = bad[0]
+            raise ValueError(
+                f"{len(bad)} action(s) for {self.env_id} are not finite, the first in episode {episode}, step {step}, "
+                f"joint {joint}: {actions[episode, step, joint]}. Nothing was simulated."
+            )
+        return actions
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and the targets."""
+        states = self.rollout(np.asarray(actions)[:, None])[:, 0]
+        moved = states[:, 6:8] if self.task == "push" else states[:, 4:6]
+        torque = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        reward = -np.linalg.norm(moved - self.target, axis=-1) - np.sum(torque**2, axis=-1)
+        truncated = np.full(self.num_envs, (self._elapsed or 0) >= self.max_episode_steps)
+        return states, reward, np.zeros(self.num_envs, bool), truncated, {"target": self.target.copy()}
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One uint8 image (height, width, 3) per episode, or None without ``render_mode="rgb_array"``."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.image(state, target) for state, target in zip(self._states, self.target, strict=True))
+
+    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Draw one state (dx,) and target (2,); a simulator with a renderer of its own replaces this."""
+        from tsmlib.envs.render import render_array
+
+        return render_array(state, self.env_id, target=target)
+
+    def _draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """A state (dx,) and a target (2,) from the reset distribution."""
+        q = rng.uniform(-START_ANGLE, START_ANGLE, 2)
+        state = np.concatenate([q, rng.uniform(-START_VELOCITY, START_VELOCITY, 2), fingertip(q)])
+        target = _in_ring(rng, 0.0, TARGET_RADIUS)
+        if self.task == "reacher":
+            return state, target
+        while True:  # the block must not touch the arm
+            with_block = np.concatenate([state, _in_ring(rng, *BLOCK_RING), np.zeros(2)])
+            if closest_gap(with_block, self.env_id) > BLOCK_CLEARANCE:
+                return with_block, target
+
+    def _require_apart(self, states: np.ndarray) -> None:
+        """Raise where a start puts the block into the arm, from where a simulator would throw it out."""
+        if self.task == "reacher":
+            return
+        gap = closest_gap(states, self.env_id)
+        if (gap < -MAX_OVERLAP).any():
+            episode = int(np.argmax(gap < -MAX_OVERLAP))
+            reason = f"block and arm overlap by {-1000 * gap[episode]:.1f} mm, at most {1000 * MAX_OVERLAP:g} mm may"
+            raise SimulationUnstable(self.env_id, episode, 0, reason)
+
+    def _checked(self, given: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+        array = np.array(given, np.float64)
+        if array.shape != shape:
+            raise ValueError(f"reset option {name!r} of {self.env_id} is {array.shape}; expected {shape}")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            raise ValueError(
+                f"reset option {name!r} of {self.env_id} is not finite in episode {bad[0][0]}: {array[bad[0][0]]}"
+            )
+        return array
+
+
+def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray:
+    """A point (2,) uniform over the area between two radii."""
+    radius, angle = np.sqrt(rng.uniform(inner**2, outer**2)), rng.uniform(-np.pi, np.pi)
+    return radius * np.array([np.cos(angle), np.sin(angle)])
+
+
+class ArmEnv(gymnasium.Env):
+    """One arm: the vector environment of the same id with N = 1, so single and bulk simulation agree bit for bit."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
+    angles = (0, 1)
+    dt = DT
+
+    def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
+        vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode, **kwargs).unwrapped
+        assert isinstance(vector, ArmVectorEnv)
+        self.vector = vector
+        self.env_id, self.render_mode = env_id, render_mode
+        self.names, self.units, self.task = self.vector.names, self.vector.units, self.vector.task
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+
+    @property
+    def target(self) -> np.ndarray:
+        """The task's target (2,)."""
+        return self.vector.target[0]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """As `ArmVectorEnv.reset`, with ``options["states"]`` (dx,) and ``options["target"]`` (2,)."""
+        super().reset(seed=seed)
+        options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
+        states, info = self.vector.reset(seed=seed, options=options)
+        return states[0], {"target": info["target"][0]}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One step by an action (2,). Never terminates; the registered time limit truncates."""
+        states, reward, _, _, info = self.vector.step(np.asarray(action)[None])
+        return states[0], float(reward[0]), False, False, {"target": info["target"][0]}
+
+    def rollout(self, actions: np.ndarray) -> np.ndarray:
+        """States (T, dx) after actions (T, 2)."""
+        return self.vector.rollout(np.asarray(actions)[None])[0]
+
+    def get_state(self) -> Any:
+        """See `ArmVectorEnv.get_state`."""
+        return self.vector.get_state()
+
+    def set_state(self, snapshot: Any) -> None:
+        """See `ArmVectorEnv.set_state`."""
+        self.vector.set_state(snapshot)
+
+    def render(self) -> np.ndarray | None:
+        """A uint8 image (height, width, 3), or None without ``render_mode="rgb_array"``."""
+        frames = self.vector.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Release the simulator."""
+        self.vector.close()

@@ -1,0 +1,78 @@
+"""Constants, state layout and kinematics that both simulators share.
+
+State (float64, all in one horizontal plane):
+
+    joint angles (2, rad, not wrapped), joint velocities (2, rad/s), fingertip (2, m)
+    and with a block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tsmlib.envs.spec import task_of
+
+# The arm is Gymnasium's Reacher; a test compares these lengths with its model (m).
+LINK_LENGTHS = (0.1, 0.11)  # shoulder to elbow, elbow to centre of the fingertip
+LINK1_CAPSULE = 0.1  # the second link's capsule ends before the fingertip's sphere begins
+ARM_RADIUS = 0.01  # links and fingertip alike
+ELBOW_LIMIT = 3.0  # rad; the shoulder turns freely
+GEAR = 200.0  # N m per unit of action
+DT = 0.02  # s per step
+
+# The block: the object to push, or the obstacle (a disc seen from above).
+BLOCK_RADIUS = 0.03
+WALL = 0.28  # the walls' faces, at the inner edge of Reacher's frame; the block's centre stays within 0.25 m
+BLOCK_MASS = 1.0  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
+BLOCK_DECAY = 0.2  # s; a free object slows down by a factor e in this time
+RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
+FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
+BLOCK_RING = (0.08, 0.17)  # m; distance of the block's centre from the shoulder at reset: within reach all around
+BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
+MAX_OVERLAP = 0.005  # m of block and arm in a given start; impacts reach 1.5 mm
+
+START_ANGLE = 0.1  # rad, rad/s and m: the reset distribution of Gymnasium's Reacher
+START_VELOCITY = 0.005
+TARGET_RADIUS = 0.2
+
+STATE_NAMES = (
+    "joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y", "block_x", "block_y", "block_vx", "block_vy",
+)  # fmt: skip
+STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
+HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.25, 0.25, 3.5, 3.0)  # in random data; angles: of cosine, sine
+
+
+def arm_points(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Forward kinematics: angles (..., 2) to elbow, end of the second capsule, and fingertip (each (..., 2), m)."""
+    shoulder, reach = angles[..., 0], angles[..., 0] + angles[..., 1]
+    elbow = LINK_LENGTHS[0] * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=-1)
+    direction = np.stack([np.cos(reach), np.sin(reach)], axis=-1)
+    return elbow, elbow + LINK1_CAPSULE * direction, elbow + LINK_LENGTHS[1] * direction
+
+
+def fingertip(angles: np.ndarray) -> np.ndarray:
+    """Fingertip position (..., 2) of joint angles (..., 2)."""
+    return arm_points(angles)[2]
+
+
+def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
+    """Signed distance (...) between the arm's surface and the block's, in metres, of states (..., 10).
+
+    Negative where they penetrate. The same geometry for both simulators. ValueError where there is no block.
+    """
+    if task_of(env_id) == "reacher":
+        raise ValueError(f"{env_id} has no block; closest_gap needs an obstacle or push environment")
+    states = np.asarray(states, np.float64)
+    block = states[..., 6:8]
+    elbow, capsule_end, tip = arm_points(states[..., :2])
+    distance = np.minimum(
+        np.minimum(_to_segment(block, np.zeros_like(elbow), elbow), _to_segment(block, elbow, capsule_end)),
+        np.linalg.norm(block - tip, axis=-1),
+    )
+    return distance - (ARM_RADIUS + BLOCK_RADIUS)
+
+
+def _to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    along = end - start
+    share = np.sum((point - start) * along, axis=-1) / np.sum(along * along, axis=-1)
+    return np.linalg.norm(point - start - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1)

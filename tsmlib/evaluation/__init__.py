@@ -1,0 +1,1 @@
+"""Scores and measures: arrays and models in, numbers out."""

@@ -1,0 +1,110 @@
+"""How alike planned and training torques are, and what it costs to keep them alike (section 5.3.5, figure 10).
+
+The paper shows one example each; here is what can be counted: roughness, spectrum, and whether a classifier that never
+saw them tells planned torques from training ones. 0.5 of its AUC means that it cannot, 1 that it never errs.
+
+Letters in shapes: B plans or episodes, T steps, F frequencies, q traits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tsmlib.envs.geometry import DT
+from tsmlib.models.action_prior import ActionPrior
+
+TRAITS = ("change", "centroid", "autocorrelation")  # of claim C51
+
+
+def traits(actions: Tensor, *, shape: bool = False) -> Tensor:
+    """TRAITS of torques (B, T, du), (B, 3). shape: of each plan divided by its own root mean square."""
+    if shape:
+        actions = actions / actions.square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-9)
+    found = roughness(actions)
+    return torch.stack([found[name] for name in TRAITS], dim=1).double()
+
+
+def spectrum(actions: Tensor, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (F,) in Hz and the mean power density (F,) of torques (B, T, du), per Hz; it integrates to the mean
+    square torque (without the constant part, which is left out)."""
+    steps = actions.shape[1]
+    power = torch.fft.rfft(actions.double(), dim=1).abs().square().mean((0, 2)) * (2 * dt / steps)
+    if steps % 2 == 0:
+        power[-1] /= 2  # the highest frequency has no mirror image
+    return torch.fft.rfftfreq(steps, dt).numpy()[1:], power.numpy()[1:]
+
+
+# The prior on its own ------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def drawn(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
+    """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0)."""
+    z = torch.randn(n, -(-horizon // prior.segment_len), prior.latent_dim, generator=generator)
+    return prior.plan(_rest(prior, n), z)[:, :horizon]
+
+
+@torch.no_grad()
+def told_again(prior: ActionPrior, actions: Tensor) -> Tensor:
+    """Torques (B, T, du) encoded segment by segment and decoded from the mean codes, T a multiple of H."""
+    segments = actions.unflatten(1, (-1, prior.segment_len))  # (B, K, H, du)
+    codes, _ = prior.encode(segments.flatten(0, 1))
+    return prior.plan(_rest(prior, len(actions)), codes.unflatten(0, segments.shape[:2]))
+
+
+def _rest(prior: ActionPrior, n: int) -> Tensor:
+    return prior.std.new_zeros(n, prior.past_len, len(prior.std))
+
+
+# Actions -------------------------------------------------------------------------------------------------------------
+
+
+def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
+    """How abrupt torques (B, T, du) are (claims C12, C51, C52), one number per plan: (B,) each.
+
+    ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power. ``fast``: share of power
+    above 5 Hz. ``autocorrelation``: of successive torques. Without any torque all are zero.
+    """
+    tiny = 1e-12
+    power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)  # (B, F)
+    frequency = torch.fft.rfftfreq(actions.shape[1], dt).double()
+    total = power.sum(1) + tiny
+    successive = (actions[:, 1:] * actions[:, :-1]).sum((1, 2))
+    return {
+        "change": actions.diff(dim=1).abs().mean((1, 2)),
+        "centroid": ((power @ frequency) / total).float(),
+        "fast": (power[:, frequency > 5].sum(1) / total).float(),
+        "autocorrelation": successive / (actions.square().sum((1, 2)) + tiny),
+    }
+
+
+def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
+    """Distance (B,) of plans (B, T, du) from the training torques (N, T', du): how far off the data a plan ventures.
+
+    The root mean square difference between each segment of a plan and the nearest of all segments of the data, in
+    standard deviations of the data's torques, averaged over the plan. Held-out torques give the value to compare with.
+    """
+    if min(actions.shape[1], data.shape[1]) < segment_len:
+        raise ValueError(
+            f"plans of {actions.shape[1]} and data of {data.shape[1]} steps hold no segment of {segment_len} steps"
+        )
+    std = data.flatten(0, 1).std(0)
+    segments = (actions / std).unfold(1, segment_len, segment_len).flatten(2)  # (B, K, du H)
+    nearest = segments.new_full(segments.shape[:2], torch.inf).flatten()
+    for episodes in (data / std).split(200):
+        known = episodes.unfold(1, segment_len, 1).flatten(0, 1).flatten(1)
+        nearest = torch.minimum(nearest, torch.cdist(segments.flatten(0, 1), known).amin(1))
+    return nearest.reshape(segments.shape[:2]).mean(1) / segments.shape[2] ** 0.5
+
+
+def within(actions: Tensor, data: Tensor, *, share: float = 0.95) -> Tensor:
+    """Share of the steps of plans (B, T, du) whose torques are no larger than the training data's: (B,) (claim C16).
+
+    No larger means inside the box around zero that holds ``share`` of all steps of the data (N, T', du); its sides are
+    as the standard deviations of the data's torques.
+    """
+    std = data.flatten(0, 1).std(0)
+    size, known = ((torques / std).abs().amax(-1) for torques in (actions, data))
+    return (size <= known.flatten().quantile(share)).float().mean(1)

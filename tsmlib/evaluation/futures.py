@@ -1,0 +1,46 @@
+"""Windows of test episodes, and futures that a segment model samples for them.
+
+Letters in shapes: S samples, N windows, L past length, T steps, dx state size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tsmlib.evaluation.prediction import sample_states
+from tsmlib.models.tsm import TSM
+from tsmlib.trajectory import Segment, Trajectories, Window, windows
+
+STARTS = (10, 40, 70)  # steps at which the windows begin; with HORIZON they hold every step of an episode once
+HORIZON = 30
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Windows of test episodes, and what a model predicts for them with codes from N(0, I).
+
+    window: past (N, L, .) and future (N, T, .); samples (S, N, T, dx), physical units.
+    """
+
+    env: str
+    window: Window
+    samples: Tensor
+
+    def first(self, steps: int) -> Seen:
+        """The same windows, cut after ``steps``."""
+        past, future = self.window
+        future = Segment(*(part[:, :steps] for part in future))
+        return replace(self, window=Window(past, future), samples=self.samples[:, :, :steps])
+
+
+def look(
+    model: TSM, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
+) -> Seen:
+    """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
+    drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)
+    episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
+    begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len
+    return Seen(test.env, windows(test.padded(0), episodes, begin, model.past_len, horizon), drawn)

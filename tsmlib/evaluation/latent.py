@@ -1,0 +1,161 @@
+"""What the codes of a segment model do: whether they are used, where, and what one of them means (section 5.3.4).
+
+    is the code used?        KL(Q(Z | X+) || N(0, I)) per segment, active units; what each dimension moves
+    what does it express?    spread of sampled futures: how large, when, and whether it tells the error
+    what happens?            when the arm touches the object, when that hits a wall, where it goes then (figure 9)
+    what is one code?        one future; codes in between are futures in between
+
+At test time codes are drawn from N(0, I), and from the encoder where the future is known. Deviations and errors are in
+units of the training data's deviation (the feature space of ``evaluation.prediction``). The paper gives no number for
+any of it.
+
+Letters in shapes: S samples, N windows of test episodes, T steps, H segment length, dz code size.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tsmlib.evaluation import prediction
+from tsmlib.evaluation.futures import Seen
+from tsmlib.models.base import rollout
+from tsmlib.models.features import Features
+from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
+from tsmlib.models.tsm import TSM
+from tsmlib.sampling import standard_normal
+from tsmlib.trajectory import Segment, Window
+
+ACTIVE = 0.01  # variance of a unit's posterior mean above which it counts as active (Burda et al., 2016)
+
+
+# Is the code used? ---------------------------------------------------------------------------------------------------
+
+
+def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(Q(Z_i | X+) || N(0, 1)) in nats, (N, dz) for the encoder's mean and log variance (N, dz)."""
+    return kl_from_standard_normal(mean[..., None], log_variance[..., None])
+
+
+def active_units(mean: Tensor) -> Tensor:
+    """(dz,) bool: dimensions whose posterior mean (N, dz) varies over segments with more than ACTIVE."""
+    return mean.var(0) > ACTIVE
+
+
+@torch.no_grad()
+def importance(model: TSM, window: Window, generator: torch.Generator) -> Tensor:
+    """How far each dimension of the code moves the next segment, (dz,), in deviations of the data.
+
+    The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, the total effect of z_i, mean over features, steps and
+    windows. Says what the decoder does with a code however it was trained; the encoder has no part in it.
+    """
+    past, actions = window.past, window.future.actions[:, : model.segment_len]
+    z, again = (standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2))
+    states = model.decode(past, actions, z)
+    moved = []
+    for i in range(model.latent_dim):
+        other = torch.where(torch.arange(model.latent_dim) == i, again, z)
+        difference = model.features.difference(model.decode(past, actions, other), states)
+        moved.append((difference.square().mean() / 2).sqrt())
+    return torch.stack(moved)
+
+
+@torch.no_grad()
+def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> dict[str, Tensor]:
+    """Error (N,) of the next segment, root mean square over features and steps, by where its code comes from.
+
+    ``posterior``: drawn from Q(Z | X+), which has seen the segment; ``prior``: drawn from N(0, I); ``zero``: z = 0.
+    """
+    future = Segment(*(part[:, : model.segment_len] for part in window.future))
+    mean, log_variance = model.encode(future.states)
+    codes = {
+        "posterior": sample_posterior(mean, log_variance, generator),
+        "prior": standard_normal(mean.shape, generator, mean),
+        "zero": torch.zeros_like(mean),
+    }
+    errors = {}
+    for word, z in codes.items():
+        difference = model.features.difference(model.decode(window.past, future.actions, z), future.states)
+        errors[word] = difference.square().mean((1, 2)).sqrt()
+    return errors
+
+
+# What does it express? -----------------------------------------------------------------------------------------------
+
+
+def deviations(seen: Seen, features: Features) -> tuple[Tensor, Tensor]:
+    """Variance of the samples, and squared error of their mean: (N, T) each, mean over the features that change."""
+    samples = prediction.scored(features, seen.samples)
+    error = samples.mean(0) - prediction.scored(features, seen.window.future.states)
+    return prediction.spread(samples).mean(-1), error.square().mean(-1)
+
+
+def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
+    """The root of the mean of squares (N, T): over windows (at the places ``where``) first, then over steps.
+
+    Every step counts alike, so that places which lie later than others do not look worse for it. NaN without a place.
+    """
+    where = torch.ones_like(squares, dtype=torch.bool) if where is None else where
+    some = where.any(0)
+    by_step = (squares * where).sum(0)[some] / where.sum(0)[some]
+    return math.sqrt(by_step.mean()) if some.any() else math.nan
+
+
+def by_spread(variance: Tensor, squared: Tensor, *, groups: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Spread and error (groups,) of windows sorted by their spread and cut into equal groups, smallest first."""
+    spread, error = variance.mean(1), squared.mean(1)
+    parts = [part for part in spread.argsort().tensor_split(groups) if len(part)]
+    return tuple(np.array([math.sqrt(x[part].mean()) for part in parts]) for x in (spread, error))  # type: ignore
+
+
+# What is one code? ---------------------------------------------------------------------------------------------------
+
+
+def between(first: Tensor, second: Tensor, n: int) -> Tensor:
+    """n codes from ``first`` to ``second`` (..., dz) along cos(a) first + sin(a) second: (n, ..., dz).
+
+    If both are drawn from N(0, I), so is every code in between, which is not true of a straight line.
+    """
+    if n < 2:
+        raise ValueError(f"n is {n}; a walk from one code to another has at least 2 codes")
+    angle = torch.linspace(0, math.pi / 2, n).reshape(n, *[1] * first.ndim)
+    codes = angle.cos() * first + angle.sin() * second
+    codes[0], codes[-1] = first, second  # exactly
+    return codes
+
+
+@torch.no_grad()
+def futures(model: TSM, window: Window, codes: Tensor, steps: int) -> Tensor:
+    """What each code (n, dz) makes of one window: states (n, T, dx). One code, then the mode (z = 0) in later segments.
+
+    window: N = 1. steps: T, at most as long as its future.
+    """
+    n, actions = len(codes), window.future.actions[:, :steps]
+    past = Segment(*(part.expand(n, -1, -1) for part in window.past))
+    actions, first = actions.expand(n, -1, -1), min(steps, model.segment_len)
+    states = model.decode(past, actions[:, :first], codes)
+    if steps <= first:
+        return states
+    past = past.then(Segment(states, actions[:, :first])).last(model.past_len)
+    return torch.cat([states, rollout(model, past, actions[:, first:])], dim=1)
+
+
+def principal(codes: Tensor) -> tuple[Tensor, Tensor]:
+    """The two directions of largest variance of codes (N, dz): coordinates (N, 2), and the share of variance (2,)."""
+    centred = codes - codes.mean(0)
+    _, sizes, axes = torch.linalg.svd(centred, full_matrices=False)
+    return centred @ axes[:2].T, sizes[:2].square() / sizes.square().sum().clamp_min(1e-30)
+
+
+def directions(codes: Tensor, outcome: Tensor) -> tuple[Tensor, float]:
+    """The directions (2, dz) of codes (N, dz) along which an outcome (N, 2) changes most, orthonormal, most first.
+
+    By least squares; also the share of the outcome's variance that a linear function of the code explains.
+    """
+    x, y = codes - codes.mean(0), outcome - outcome.mean(0)
+    slope = torch.linalg.lstsq(x, y).solution  # (dz, 2)
+    explained = 1 - float((y - x @ slope).square().sum() / y.square().sum().clamp_min(1e-30))
+    return torch.linalg.svd(slope, full_matrices=False).U.T, explained

@@ -1,0 +1,76 @@
+"""Films of an arm: two of them side by side, an mp4 file, and that file inside a notebook."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from tsmlib.storage.files import write_bytes
+
+if TYPE_CHECKING:
+    from IPython.display import Video
+
+
+def _frames(field: str, frames: np.ndarray) -> np.ndarray:
+    frames = np.asarray(frames)
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
+        raise ValueError(
+            f"{field} is {frames.dtype} {frames.shape}, expected uint8 (T, H, W, 3) with at least one frame"
+        )
+    return frames
+
+
+def side_by_side(left: np.ndarray, right: np.ndarray, labels: tuple[str, str]) -> np.ndarray:
+    """Two films as one, (T, H + strip, W1 + W2, 3), a label above each; the shorter one waits on its last frame."""
+    left, right = _frames("left", left), _frames("right", right)
+    if left.shape[1] != right.shape[1]:
+        raise ValueError(f"left is {left.shape[1]} pixels high and right {right.shape[1]}; render both at one height")
+    length, height = max(len(left), len(right)), max(20, left.shape[1] // 14)
+    halves = []
+    for film, label in zip((left, right), labels, strict=True):
+        held = film[np.minimum(np.arange(length), len(film) - 1)]
+        banner = Figure(figsize=(film.shape[2] / 100, height / 100), dpi=100, facecolor="white")
+        banner.text(0.5, 0.45, label, ha="center", va="center", fontsize=0.5 * height, family="DejaVu Sans")
+        canvas = FigureCanvasAgg(banner)
+        canvas.draw()
+        strip = np.asarray(canvas.buffer_rgba())[..., :3]
+        halves.append(np.concatenate([np.broadcast_to(strip, (length, *strip.shape)), held], axis=1))
+    return np.concatenate(halves, axis=2)
+
+
+def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
+    """Write ``frames`` (T, H, W, 3) uint8 as an mp4 that browsers play; odd sizes get one repeated row or column."""
+    import imageio.v2 as imageio  # an mp4 is no figure: only who writes one needs it
+    from imageio_ffmpeg import count_frames_and_secs
+
+    frames, path = _frames("frames", frames), Path(path)
+    if path.suffix != ".mp4":
+        raise ValueError(f"video file {path} must end in .mp4")
+    even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")
+    options = ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart"]  # one thread: the same bytes again
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "film.mp4"
+        try:
+            imageio.mimwrite(made, list(even), fps=fps, codec="libx264", quality=7, macro_block_size=1,
+                             pixelformat="yuv420p", output_params=options)  # fmt: skip
+            if count_frames_and_secs(str(made))[0] != len(even):  # ffmpeg says nothing of a full disk
+                raise OSError("frames are missing")
+        except (OSError, RuntimeError) as error:
+            reason = str(error).partition("\n")[0]
+            raise OSError(f"ffmpeg could not make {path}: {reason}. Make room in {tempfile.gettempdir()}.") from error
+        write_bytes(path, made.read_bytes())
+    return path
+
+
+def embed(path: str | Path) -> Video:
+    """The film at ``path`` for the end of a notebook cell, its data inside the notebook."""
+    from IPython.display import Video
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no film at {path}; write it with figures.save_video(frames, path) first")
+    return Video(str(path), embed=True, html_attributes="controls loop muted playsinline")

@@ -1,0 +1,1 @@
+"""Dynamics models and the action prior. No physics, no plots."""

@@ -1,0 +1,63 @@
+"""Features: angles as cosine and sine, everything standardised by training statistics."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class Features(nn.Module):
+    """Physical states as networks and scores see them: angles as cosine and sine, everything standardised.
+
+    The statistics come from training data by ``fit`` and travel with the model. A state dimension that never changes
+    within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out.
+    """
+
+    mean: Tensor
+    std: Tensor
+    step_std: Tensor
+
+    def __init__(self, state_dim: int, angles: tuple[int, ...]) -> None:
+        super().__init__()
+        self.angles = list(angles)
+        self.others = [d for d in range(state_dim) if d not in angles]
+        self.dim = state_dim + len(angles)
+        self.register_buffer("mean", torch.zeros(self.dim))
+        self.register_buffer("std", torch.ones(self.dim))
+        self.register_buffer("step_std", torch.ones(state_dim))  # of x_{t+1} - x_t, physical units
+
+    def fit(self, states: Tensor) -> Features:
+        """Take the statistics of training states (N, T + 1, dx)."""
+        raw = self._raw(states).flatten(0, 1)
+        self.mean.copy_(raw.mean(0))
+        std = raw.std(0)
+        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+        self.step_std.copy_(states.diff(dim=1).flatten(0, 1).std(0))
+        return self
+
+    @property
+    def moving(self) -> Tensor:
+        """(dx,) bool: state dimensions that change within an episode."""
+        return self.step_std > 1e-9
+
+    @property
+    def scored(self) -> Tensor:
+        """(dim,) bool: features that change within an episode."""
+        moving = self.moving
+        return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
+
+    def forward(self, states: Tensor) -> Tensor:
+        """(..., dx) -> (..., dim): cosines, sines, the rest; zero mean and unit variance on the training data."""
+        return (self._raw(states) - self.mean) / self.std
+
+    def difference(self, predicted: Tensor, true: Tensor) -> Tensor:
+        """(..., dx) twice -> the difference of their features that change within an episode, standardised."""
+        return (self(predicted) - self(true))[..., self.scored]
+
+    def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
+        """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
+        return (predicted - true)[..., self.moving] / self.step_std[self.moving]
+
+    def _raw(self, states: Tensor) -> Tensor:
+        angles = states[..., self.angles]
+        return torch.cat([angles.cos(), angles.sin(), states[..., self.others]], dim=-1)

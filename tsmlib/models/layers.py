@@ -1,0 +1,192 @@
+"""Building blocks of the segment models: gated causal layers (Eq. 1), a convolutional encoder, features. No physics.
+
+Letters in shapes: B batch, P positions in time, C channels, dz latent size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tsmlib.sampling import Noise, standard_normal
+
+BLOCK = 1024  # rows that are decoded at once on a processor
+
+
+def beside(model: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """``tensors`` on the device of the model's weights; as they are where it has none."""
+    weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
+    return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
+
+
+def in_blocks(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+    """``compute`` of so few rows at a time that what lies between its steps stays in a processor's cache."""
+    if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
+        return compute(*rows)
+    return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
+
+
+class GatedLayer(nn.Module):
+    """One dilated causal layer with the gated activation of Eq. 1, a residual and a skip connection.
+
+        h = tanh(W_f * s + V_f z) . sigmoid(W_g * s + V_g z)
+
+    The convolution has two taps, s_{t-d} and s_t. Written as one matrix product over both, the same function serves
+    all positions at once (B, P, C) and a single position (B, C), which is what keeps the two decoding paths equal.
+    """
+
+    def __init__(self, channels: int, *, residual: bool = True, skip: bool = True) -> None:
+        super().__init__()
+        self.residual, self.skip = residual, skip  # without them only for an ablation (section 3.1)
+        self.taps = nn.Linear(2 * channels, 2 * channels)  # W_f and W_g
+        self.out = nn.Linear(channels, 2 * channels)  # 1x1: residual and skip
+
+    def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
+        filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
+        residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
+        return now + residual if self.residual else residual, skip if self.skip else torch.zeros_like(skip)
+
+
+Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (B, C), oldest first
+
+
+class CausalDecoder(nn.Module):
+    """P(output | inputs up to now, z): a stack of gated layers whose output at a position sees no later position.
+
+    ``forward`` decodes all positions at once; ``begin`` and ``step`` decode one by one with cached activations, for
+    inputs that depend on earlier outputs. Both compute the same numbers. Receptive field: 1 + sum(dilations).
+    """
+
+    def __init__(
+        self,
+        input_dim: int,
+        output_dim: int,
+        latent_dim: int,
+        *,
+        channels: int = 32,
+        head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
+        direct_channels: int = 0,  # two 1x1 layers that see the inputs beside the stack's output, in its place; 0: none
+        dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
+        plain: bool = False,  # neither residual nor skip connections: the last layer's output alone
+    ) -> None:
+        super().__init__()
+        self.inlet = nn.Linear(input_dim, channels)
+        self.dilations = dilations
+        self.layers = nn.ModuleList(
+            GatedLayer(channels, residual=not plain, skip=not plain or last)
+            for last in [*[False] * (len(dilations) - 1), True]
+        )
+        self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
+        self.direct = bool(direct_channels)
+        if direct_channels:
+            widths = [channels + input_dim, direct_channels, direct_channels]
+            inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
+            self.head = nn.Sequential(*inner, nn.Linear(direct_channels, output_dim))
+        else:
+            head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
+            self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
+
+    def forward(self, inputs: Tensor, z: Tensor, n: int | None = None) -> Tensor:
+        """(B, P, input_dim), (B, dz) -> (B, n, output_dim): at the last ``n`` positions, or at all."""
+        first = 0 if n is None else inputs.shape[1] - n
+        _, skips = self._parallel(inputs, z, inputs.shape[1] - first)
+        return self._out(reduce(torch.add, skips), inputs[:, first:])
+
+    def last(self, inputs: Tensor, z: Tensor) -> Tensor:
+        """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, output_dim).
+
+        Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed.
+        """
+        n_positions, owed = inputs.shape[1], [[0]]
+        for dilation in reversed(self.dilations[1:]):
+            seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
+            owed.insert(0, sorted(seen))
+        s, held = self.inlet(inputs), list(reversed(range(n_positions)))
+        skips = []
+        codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
+        for layer, dilation, code, positions in zip(self.layers, self.dilations, codes, owed, strict=True):
+            at = {p: i for i, p in enumerate(held)}
+            s = F.pad(s, (0, 0, 0, 1))  # zeros stand for what lies before the first position
+            taken = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
+            earlier, now = s.index_select(1, torch.tensor(taken).to(s.device)).chunk(2, dim=1)
+            s, skip = layer(earlier, now, code)
+            skips.append(skip[:, 0])
+            held = positions
+        return self._out(reduce(torch.add, skips), inputs[:, -1])
+
+    def begin(self, inputs: Tensor, z: Tensor) -> Cache:
+        """The cache after the known inputs (B, P, input_dim), P >= 0."""
+        layer_inputs, _ = self._parallel(inputs, z, 0)
+        return [
+            list(F.pad(s, (0, 0, dilation, 0))[:, -dilation:].unbind(1))
+            for dilation, s in zip(self.dilations, layer_inputs, strict=True)
+        ]
+
+    def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
+        """One position: (B, input_dim) and ``self.codes(z)`` -> (B, output_dim). Moves ``cache`` one position on."""
+        s = self.inlet(inputs)  # (B, C)
+        total: Any = None
+        for layer, code, window in zip(self.layers, codes.chunk(len(self.layers), dim=-1), cache, strict=True):
+            window.append(s)
+            s, skip = layer(window.pop(0), s, code)
+            total = skip if total is None else total + skip
+        return self._out(total, inputs)
+
+    def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
+        return self.head(torch.cat([total, inputs], dim=-1) if self.direct else total)
+
+    def _parallel(self, inputs: Tensor, z: Tensor, n: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Each layer's inputs, as far as the outputs at the last ``n`` positions see them, and its skips there.
+
+        Going down from the last layer, ``owed`` is how many last positions of a layer's inputs are needed.
+        """
+        owed = [n]
+        for dilation in reversed(self.dilations):
+            owed.insert(0, min(inputs.shape[1], owed[0] + dilation))
+        s = self.inlet(inputs[:, inputs.shape[1] - owed[0] :])  # (B, P, C)
+        layer_inputs, skips = [s], []
+        codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
+        for layer, dilation, code, now in zip(self.layers, self.dilations, codes, owed[1:], strict=True):
+            if layer is self.layers[-1] and not n:
+                break
+            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[:, :now]  # zeros before the first position
+            s, skip = layer(earlier, s[:, s.shape[1] - now :], code)
+            layer_inputs.append(s)
+            skips.append(skip[:, now - n :])
+        return layer_inputs, skips
+
+
+class Encoder(nn.Module):
+    """Q(Z | segment): 1-D convolutions over time with ReLU, flattened and projected to mean and log variance."""
+
+    def __init__(self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32) -> None:
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv1d(input_dim, channels, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv1d(channels, channels, 3, padding=1),
+            nn.ReLU(),
+        )
+        self.project = nn.Linear(channels * segment_len, 2 * latent_dim)
+
+    def forward(self, segment: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, H, input_dim) -> mean and log variance of Z, (B, dz) each."""
+        mean, log_variance = self.project(self.convolutions(segment.transpose(1, 2)).flatten(1)).chunk(2, dim=-1)
+        return mean, log_variance
+
+
+def sample_posterior(mean: Tensor, log_variance: Tensor, generator: Noise) -> Tensor:
+    """z ~ N(mean, variance) by the reparametrisation trick."""
+    return mean + (0.5 * log_variance).exp() * standard_normal(mean.shape, generator, mean)
+
+
+def kl_from_standard_normal(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(N(mean, variance) || N(0, I)) in nats, summed over the last dimension."""
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)

@@ -1,0 +1,1 @@
+"""Trajectory optimisation: search spaces, predictors, planners, tasks, execution (section 4)."""

@@ -1,0 +1,59 @@
+"""Plans, and the protocols of predictors, search spaces and planners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from tsmlib.rewards import Reward
+
+Predict = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
+
+
+class Space(Protocol):
+    """What a planner searches: parameters that decode to bounded actions."""
+
+    shape: tuple[int, ...]  # of one target's parameters
+    scale: float  # standard deviation of parameters whose actions are like the training data's
+
+    def decode(self, parameters: Tensor) -> Tensor:
+        """(C, B, *shape) -> actions (C, B, T, du) in [-1, 1]."""
+        ...
+
+    def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
+        """Perturbations (n, n_targets, *shape) of unit variance."""
+        ...
+
+    def after(self, parameters: Tensor, steps: int) -> tuple[Space, Tensor]:
+        """What is left when ``steps`` actions of a plan (B, *shape) are done: the space, and the plan in it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The best actions found for each of B targets.
+
+    actions (B, T, du); parameters (B, *shape) they decode from; states (S, B, T, dx) predicted for them;
+    predicted (B,): expected undiscounted return; curve (iterations + 1, B): predicted return of the best so far, from
+    the start on; seconds; trace (iterations + 1, B, *shape): the parameters of the best so far, see ``stopped``.
+    """
+
+    actions: Tensor
+    parameters: Tensor
+    states: Tensor
+    predicted: Tensor
+    curve: Tensor
+    seconds: float
+    trace: Tensor | None = None
+
+
+class Planner(Protocol):
+    """``adam``, ``cem`` or ``mppi``, with its settings bound by ``functools.partial``."""
+
+    def __call__(self, predict: Predict, reward: Reward, space: Space, start: Tensor | int, /) -> Plan:
+        """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero. Never worse than it."""
+        ...

@@ -1,0 +1,304 @@
+"""Trajectory optimisation through a model or the true simulator, over actions (Eq. 2) or latent codes (Eq. 3).
+
+    max over p of E[ sum_t r(x_t, u_t) ],   u = space.decode(p),   x ~ predict(u)
+
+What is optimised over is a ``Space``: DirectActions (Eq. 2) or LatentActions (Eq. 3). What predicts is a function
+from actions to states: ``through_model`` or ``through_simulator``. A ``Planner`` is ``adam``, as the paper plans,
+which needs a differentiable prediction, or ``cem`` or ``mppi``, which sample and take any prediction, so that the
+oracle is the same planner with the true simulator as its model. All three have one signature.
+
+Letters in shapes: B targets planned at once, C candidates for each, S model samples, T horizon, K segments.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from tsmlib.planning.base import Plan, Predict, Space
+from tsmlib.rewards import Reward, rewarded
+
+
+@torch.enable_grad()  # see train.fit
+def adam(
+    predict: Predict,
+    reward: Reward,
+    space: Space,
+    start: Tensor | int,
+    *,
+    iterations: int = 100,  # section 4.2
+    lr: float = 0.01,  # section 4.2
+    progress: str = "",
+) -> Plan:
+    """Gradient ascent on the expected return, as the paper plans, from ``start`` (C, B, *shape) or zero.
+
+    C restarts run side by side; each target keeps the parameters with the best predicted return it ever had.
+    ValueError where the return has no gradient with respect to the states or the actions.
+    """
+    if iterations < 0:
+        raise ValueError(f"iterations is {iterations}, expected 0 or more")
+    began = time.perf_counter()
+    start = _parameters(start, space)
+    parameters = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([parameters], lr=lr)
+    best = _Best(start)
+    for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
+        actions = space.decode(parameters)
+        states = predict(actions)
+        returns = expected_return(states, actions, reward)
+        if not iteration:
+            _check_gradient(states, returns)
+        best.update(parameters.detach(), returns.detach())
+        optimizer.zero_grad()
+        (-returns.sum()).backward()
+        assert parameters.grad is not None
+        sound = torch.isfinite(parameters.grad)
+        if not iteration and not sound.all():
+            raise FloatingPointError(
+                "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
+                "reward, and add a tiny constant under it"
+            )
+        parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
+        optimizer.step()
+    with torch.no_grad():
+        best.update(parameters.detach(), evaluate(predict, reward, space, parameters))
+    return best.plan(predict, reward, space, time.perf_counter() - began)
+
+
+def _check_gradient(states: Tensor, returns: Tensor) -> None:
+    instead = "plan with cem or mppi instead, which need no gradient"
+    if not states.requires_grad:
+        raise ValueError(f"what predicts the states is not differentiable, as the true simulator is not; {instead}")
+    slope = None
+    if returns.requires_grad:
+        (slope,) = torch.autograd.grad(returns.sum(), states, retain_graph=True, allow_unused=True)
+    if slope is None:
+        raise ValueError(
+            "the reward is not a differentiable function of the states: a comparison, a rounding, NumPy or detach() "
+            f"cuts the gradient off. Write it with smooth torch functions, or {instead}"
+        )
+
+
+def cem(
+    predict: Predict,
+    reward: Reward,
+    space: Space,
+    start: Tensor | int,
+    *,
+    candidates: int = 256,
+    elites: int = 24,
+    iterations: int = 10,
+    keep: float = 0.1,  # of the old mean and deviation, against collapse
+    seed: int = 0,
+    progress: str = "",
+) -> Plan:
+    """Cross-entropy method: sample around a mean, refit mean and deviation to the elites, keep the best ever seen.
+
+    The mean begins at the best of ``start`` (C, B, *shape), or at zero for as many targets.
+    """
+    if not 2 <= elites <= candidates or iterations < 1:
+        raise ValueError(
+            f"candidates is {candidates}, elites {elites}, iterations {iterations}; expected 2 <= elites <= candidates "
+            "and at least one iteration"
+        )
+
+    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        chosen = returns.topk(elites, dim=0).indices  # (elites, B)
+        elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
+        return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
+
+    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+
+
+def mppi(
+    predict: Predict,
+    reward: Reward,
+    space: Space,
+    start: Tensor | int,
+    *,
+    candidates: int = 256,
+    iterations: int = 10,
+    temperature: float = 0.3,  # in standard deviations of the candidates' returns
+    shrink: float = 0.8,  # of the noise, from one iteration to the next
+    seed: int = 0,
+    progress: str = "",
+) -> Plan:
+    """Model predictive path integral control (Williams et al., 2017): the mean moves to a weighted mean of candidates.
+
+        w_c ~ exp(R_c / (temperature * std(R)))        mean <- sum_c w_c parameters_c
+
+    Beyond the original, the noise shrinks from one iteration to the next, so that many iterations converge.
+    """
+    if candidates < 2 or iterations < 1 or not temperature > 0 or not 0 < shrink <= 1:
+        raise ValueError(
+            f"candidates is {candidates}, iterations {iterations}, temperature {temperature}, shrink {shrink}; "
+            "expected 2 or more, 1 or more, above 0, and above 0 to 1"
+        )
+
+    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+        spread = returns.std(0).clamp(min=1e-9)
+        weights = ((returns - returns.max(0).values) / (temperature * spread)).softmax(0)
+        return (_like(weights, parameters) * parameters).sum(0), shrink * deviation
+
+    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+
+
+Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@torch.no_grad()
+def _sample(
+    predict: Predict, reward: Reward, space: Space, start: Tensor | int, refit: Refit,
+    candidates: int, iterations: int, seed: int, progress: str,
+) -> Plan:  # fmt: skip
+    """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
+    began = time.perf_counter()
+    generator = torch.Generator().manual_seed(seed)
+    start = _parameters(start, space)
+    best = _Best(start)
+    best.update(start, evaluate(predict, reward, space, start))
+    mean = best.parameters
+    deviation = torch.full_like(mean, space.scale)
+    for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
+        parameters = mean + deviation * space.noise(candidates, len(mean), generator)
+        if iteration:
+            parameters[0] = best.parameters
+        returns = evaluate(predict, reward, space, parameters)
+        finite = torch.isfinite(returns)  # a candidate on which the model diverges is as bad as the worst
+        worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
+        returns = returns.where(finite, worst)
+        mean, deviation = refit(parameters, returns, mean, deviation)
+        both = torch.cat([returns, evaluate(predict, reward, space, mean[None])])
+        best.update(torch.cat([parameters, mean[None]]), both)
+    return best.plan(predict, reward, space, time.perf_counter() - began)
+
+
+def _parameters(start: Tensor | int, space: Space) -> Tensor:
+    """``start`` as parameters (C, B, *shape)."""
+    if isinstance(start, int):
+        return torch.zeros(1, start, *space.shape)
+    if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
+        raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
+    return start
+
+
+def _like(values: Tensor, parameters: Tensor) -> Tensor:
+    """(C, B) with as many dimensions as ``parameters``."""
+    return values.reshape(*values.shape, *[1] * (parameters.ndim - 2))
+
+
+@torch.no_grad()
+def reassess(plan: Plan, predict: Predict, reward: Reward) -> Plan:
+    """The same plan with ``predicted`` and ``states`` from fresh samples.
+
+    A planner picks what does best under the few samples that it plans with; what the model promises is the
+    expectation, and needs samples that had no part in the choice.
+    """
+    states = predict(plan.actions[None])
+    return replace(plan, states=states[:, 0], predicted=expected_return(states, plan.actions[None], reward)[0])
+
+
+@torch.no_grad()
+def stopped(plan: Plan, iteration: int, predict: Predict, reward: Reward, space: Space) -> Plan:
+    """The plan as it was after ``iteration`` steps of its planner (0: its start), to see what more of them earned.
+
+    ``predicted`` and ``states`` come from ``predict``: as in ``reassess``, give it samples of its own.
+    """
+    if plan.trace is None or not 0 <= iteration < len(plan.trace):
+        steps = "kept no trace" if plan.trace is None else f"took {len(plan.trace) - 1} iterations"
+        raise ValueError(f"the planner {steps}; there is no plan as of iteration {iteration}")
+    parameters = plan.trace[iteration]
+    found = replace(
+        plan, parameters=parameters, actions=space.decode(parameters[None])[0],
+        curve=plan.curve[: iteration + 1], trace=plan.trace[: iteration + 1],
+    )  # fmt: skip
+    return reassess(found, predict, reward)
+
+
+def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
+    """After how many iterations a plan's ``curve`` (iterations + 1, B) has ``share`` of all that it gains: (B,).
+
+    A curve that gains nothing is there from the start (claim C15).
+    """
+    return (curve >= curve[0] + share * (curve[-1] - curve[0])).int().argmax(0)
+
+
+@torch.no_grad()
+def sampled_starts(
+    predict: Predict,
+    reward: Reward,
+    space: Space,
+    n_targets: int,
+    *,
+    candidates: int = 256,
+    keep: int = 4,
+    seed: int = 0,
+) -> Tensor:
+    """The ``keep`` best of random candidates for each target, as starts (keep, B, *shape) for ``adam``.
+
+    Where nothing is pushed before contact there is no gradient either, so a start must already touch the object.
+    """
+    if not 1 <= keep <= candidates:
+        raise ValueError(f"keep is {keep} of {candidates} candidates, expected 1 to {candidates}")
+    parameters = space.scale * space.noise(candidates, n_targets, torch.Generator().manual_seed(seed))
+    chosen = evaluate(predict, reward, space, parameters).topk(keep, dim=0).indices
+    return parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
+
+
+def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
+    """Undiscounted return (C, B), mean over the S samples of states (S, C, B, T, dx). Checks what the reward gives."""
+    return rewarded(reward, states, actions).sum(-1).mean(0)
+
+
+@torch.no_grad()
+def evaluate(predict: Predict, reward: Reward, space: Space, parameters: Tensor, *, rows: int = 1600) -> Tensor:
+    """Expected return (C, B) of parameters (C, B, *shape), about ``rows`` at a time, which fit in a cache."""
+    returns = []
+    for chunk in parameters.split(max(1, rows // parameters.shape[1])):
+        actions = space.decode(chunk)
+        returns.append(expected_return(predict(actions), actions, reward))
+    return torch.cat(returns)
+
+
+class _Best:
+    """Per target, the parameters with the highest predicted return so far."""
+
+    def __init__(self, start: Tensor) -> None:
+        self.parameters = start[0].clone()
+        self.returns = start.new_full((start.shape[1],), -torch.inf)
+        self.curve: list[Tensor] = []
+        self.trace: list[Tensor] = []
+
+    def update(self, parameters: Tensor, returns: Tensor) -> None:
+        value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)
+        hopeless = torch.isinf(torch.maximum(value, self.returns))
+        if hopeless.any():
+            raise FloatingPointError(
+                f"no candidate for target {int(hopeless.nonzero()[0])} has a predicted return that is finite; the "
+                "model diverges on all of them, or the reward is infinite"
+            )
+        better = value > self.returns
+        chosen = parameters[index, torch.arange(len(index))]
+        self.parameters = torch.where(better.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, self.parameters)
+        self.returns = torch.where(better, value, self.returns)
+        self.curve.append(self.returns)
+        self.trace.append(self.parameters)
+
+    @torch.no_grad()
+    def plan(self, predict: Predict, reward: Reward, space: Space, seconds: float) -> Plan:
+        actions = space.decode(self.parameters[None])
+        states = predict(actions)
+        return Plan(
+            actions=actions[0],
+            parameters=self.parameters,
+            states=states[:, 0],
+            predicted=expected_return(states, actions, reward)[0],
+            curve=torch.stack(self.curve),
+            seconds=seconds,
+            trace=torch.stack(self.trace),
+        )

@@ -1,0 +1,1 @@
+"""Policies learned inside a model (section 4.3)."""

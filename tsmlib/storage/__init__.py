@@ -1,0 +1,1 @@
+"""Files: artefacts, tables, manifests, provenance."""

@@ -1,0 +1,217 @@
+"""Execution of notebooks, and the status of what they made."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tsmlib.storage.files import alive, only_writer
+from tsmlib.study import parameters
+from tsmlib.study.runs import NOTEBOOKS, Run, RunError, resolve
+
+# Execution -----------------------------------------------------------------------------------------------------------
+
+
+def execute(
+    notebook: Path,
+    *,
+    scale: str = "",
+    seed: int = 0,
+    device: str = "",
+    given: Mapping[str, str] | None = None,
+    progress: bool = True,
+) -> Path:
+    """Execute a notebook into its run's folder and return the executed copy.
+
+    given: parameter name -> text, as typed on the command line. Everything is checked before any file exists.
+    Raises ParameterError for bad parameters, RunError if another process writes to the same run or the notebook does
+    not reach its end.
+    """
+    defaults = parameters.declared(notebook)
+    values = {"scale": scale, "seed": seed, **parameters.typed(notebook, given or {})}
+    values = {name: values[name] for name in defaults if name in values}
+    own = {name: values[name] for name in ("scale", "seed", "run_dir") if name in values}
+    run = resolve(notebook.stem, device=device, **own)
+    if "scale" in values:
+        values["scale"] = run.scale
+    from tsmlib.storage import (
+        files,
+        manifest,  # heavy, and not needed to refuse a parameter
+    )
+    from tsmlib.storage.provenance import provenance
+
+    try:
+        hold = contextlib.ExitStack()
+        hold.enter_context(only_writer(run.dir, run.notebook))
+    except files.StoreError as error:
+        raise RunError(str(error)) from None
+    with hold, _terminable(), _environment("TSM_DEVICE", run.device):
+        began = time.monotonic()
+        before = _stamps(run)
+        status: dict[str, Any] = {"pid": os.getpid(), "started": _now(), "parameters": values}
+        status |= {"scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance()}
+        _note(run, {**status, "state": "running"})
+        ended: dict[str, Any] = {"state": "interrupted", "error": "stopped before its end"}
+        try:
+            executed = _papermill(notebook, run, values, progress)
+            made = [path for path, stamp in _stamps(run).items() if before.get(path) != stamp]
+            ended = {"state": "complete", "files": manifest.listing(run.dir, sorted(made))}
+        except RunError as error:
+            ended = {"state": "failed", "error": str(error)}
+            raise
+        finally:
+            seconds = round(time.monotonic() - began, 1)
+            _note(run, {**status, **ended, "finished": _now(), "seconds": seconds})
+    return executed
+
+
+def require(run: Run, notebook: str) -> dict[str, Any]:
+    """The status entry of a notebook of ``run`` that is complete and whose results are as it left them.
+
+    Raises RunError naming the state and the command that makes what is missing.
+    """
+    from tsmlib.storage import files, manifest
+
+    command = f"python -m tsmlib run {notebook[3:]} --scale {run.scale} --seed {run.seed}"
+    path = run.dir / files.STATUS
+    entry: Any = (
+        manifest.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
+    )
+    state = entry.get("state") if isinstance(entry, dict) else "damaged"
+    if state == "running" and not alive(entry.get("pid")):
+        state = "interrupted: its process is gone"
+    if (
+        state == "complete" and {"files", "sha256"} & set(entry) and not manifest.intact(entry)
+    ):  # older ones have neither
+        state = "damaged"
+    if state != "complete":
+        what = "Wait for it, or run it again" if state == "running" else "Run it"
+        raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. {what}: {command}")
+    try:
+        changed = [
+            name
+            for name, file in entry.get("files", {}).items()
+            if not (run.dir / name).is_file() or manifest.sha256(run.dir / name) != file["sha256"]
+        ]
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        changed = [f"{files.STATUS} ({error!r:.80})"]
+    if changed:
+        raise RunError(f"{run.dir / changed[0]} is not what {notebook} made, or is gone. Run it again: {command}")
+    return entry
+
+
+def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
+    """Tables and pictures of a run, and when each was written."""
+    found = [path for folder in ("metrics", "figures") for path in (run.dir / folder).glob("[!.]*") if path.is_file()]
+    return {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in found}
+
+
+def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool) -> Path:
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+    from traitlets.config import Config
+
+    output = run.dir / notebook.name
+    unfinished = output.with_name(f".{notebook.stem}.running.ipynb")
+    failure, seen = None, ""
+    try:
+        executed = papermill.execute_notebook(
+            _literally(notebook),
+            _literally(unfinished),
+            values,
+            kernel_name="python3",
+            language="python",
+            cwd=str(NOTEBOOKS),
+            progress_bar={"desc": notebook.stem} if progress else False,
+            config=Config({"KernelManager": {"transport_encryption": "auto"}}),  # keeps ipykernel >= 7.3 from warning
+        )
+        code = [cell for cell in executed.cells if cell.cell_type == "code" and cell.source.strip()]
+        if any(cell.execution_count is None for cell in code):  # sys.exit(0) in a cell, for one
+            failure = "it stopped before its last cell"
+    except papermill.PapermillExecutionError as error:
+        failure = f"cell {error.exec_count}: {error.ename}: {error.evalue}"
+    except DeadKernelError:
+        failure = "its kernel died, perhaps for want of memory. Run it again: trainings go on where they were"
+    except Exception as error:  # no kernel, a full disk, ...
+        failure = f"{type(error).__name__}: {error}"
+    finally:
+        if unfinished.exists() and _is_whole(unfinished):
+            os.replace(unfinished, output)
+            seen = f"\nSee {output}"
+        unfinished.unlink(missing_ok=True)
+    if failure:
+        raise RunError(f"{notebook.stem} failed: {failure}{seen}")
+    return output
+
+
+def _is_whole(notebook: Path) -> bool:
+    """Whether papermill came to the end of writing it, which a full disk prevents."""
+    try:
+        return bool(json.loads(notebook.read_text())["cells"])
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _literally(path: Path) -> str:
+    """papermill formats paths; this keeps braces in them as they are."""
+    return str(path).replace("{", "{{").replace("}", "}}")
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _note(run: Run, entry: Mapping[str, Any]) -> None:
+    """Write this notebook's entry of status.json. A file that it made again is no longer another's."""
+    from tsmlib.storage import files, manifest
+
+    path = run.dir / files.STATUS
+    entries: dict[str, Any] = manifest.read_own_json(path) if path.exists() else {}
+    entries[run.notebook] = manifest.sealed(entry)
+    for name, other in entries.items():
+        if (
+            name != run.notebook
+            and manifest.intact(other)
+            and set(other.get("files", {})) & set(entry.get("files", {}))
+        ):
+            rest = {file: stated for file, stated in other["files"].items() if file not in entry["files"]}
+            entries[name] = manifest.sealed({**other, "files": rest})
+    manifest.write_json(path, entries)
+
+
+@contextlib.contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    """Processes that start meanwhile, a kernel for one, have ``value`` in their environment."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        os.environ.pop(name)
+        if before is not None:
+            os.environ[name] = before
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends a run as Ctrl-C does, so that its status is written and its kernel shut down."""
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

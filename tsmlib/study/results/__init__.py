@@ -1,0 +1,1 @@
+"""Rows of each notebook, and tables and panels made of them."""

@@ -1,0 +1,137 @@
+"""Where the results of a notebook live, how it is executed, and what is known of a run afterwards.
+
+Everything that a run makes is in one folder, ``runs/<scale>/seed<k>/``: ``data``, ``models``, ``metrics``, ``figures``,
+the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (an executed notebook
+whose kernel was killed looks complete): running, complete, failed or interrupted, with what made it and the SHA-256 of
+each table and picture. `require` refuses what is not complete.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tsmlib.study import parameters
+from tsmlib.study.parameters import ParameterError
+
+ROOT = Path(__file__).resolve().parents[2]
+NOTEBOOKS = ROOT / "notebooks"
+
+T = TypeVar("T")
+
+
+class RunError(RuntimeError):
+    """A notebook that did not run to its end, or whose results are asked for all the same."""
+
+
+# Where things live ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Run:
+    """One notebook at one scale with one seed, and the folders it reads and writes (made when first asked for)."""
+
+    notebook: str
+    scale: str
+    seed: int
+    dir: Path
+    device: str = "cpu"  # where ``study`` trains, learns, plans and imagines
+
+    @property
+    def data(self) -> Path:
+        """Collected trajectories."""
+        return self.folder("data")
+
+    @property
+    def models(self) -> Path:
+        """Trained models."""
+        return self.folder("models")
+
+    @property
+    def metrics(self) -> Path:
+        """Tables: ``<notebook>.csv`` and ``<notebook>_rows.csv``."""
+        return self.folder("metrics")
+
+    @property
+    def figures(self) -> Path:
+        """Pictures and videos."""
+        return self.folder("figures")
+
+    @property
+    def shipped(self) -> Path:
+        """The pretrained models that come with the repository. Read only."""
+        return ROOT / "data" / "pretrained"
+
+    def pick(self, *, smoke: T, laptop: T, paper: T) -> T:
+        """The value for this run's scale."""
+        return {"smoke": smoke, "laptop": laptop, "paper": paper}[self.scale]
+
+    def folder(self, name: str = ".") -> Path:
+        """A folder of this run, made if need be."""
+        folder = self.dir / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ParameterError(
+                f"cannot make the folder {folder}: {error.strerror}. Name another place with TSM_RUN_DIR."
+            ) from error
+        return folder
+
+
+def resolve(
+    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Any
+) -> Run:
+    """The run that a notebook belongs to. Touches no file.
+
+    scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
+    run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
+    device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu.
+    others: the notebook's other parameters, checked against the same schema.
+    Raises ParameterError naming the value and what is allowed.
+    """
+    parameters.check("seed", seed)
+    scale = _setting("scale", scale, "TSM_SCALE", "laptop")
+    device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
+    base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
+    defaults = parameters.declared(notebooks()[notebook[3:]]) if others and notebook[3:] in notebooks() else {}
+    for name, value in others.items():
+        parameters.check(name, value, default=defaults.get(name, value))
+    try:
+        if base.exists() and not base.is_dir():
+            raise ParameterError(f"run_dir is {base}, which is a file; expected a folder. Name another.")
+    except (OSError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(f"run_dir is {str(base)[:80]!a}, expected the name of a folder: {error}.") from None
+    return Run(notebook, scale, seed, base / scale / f"seed{seed}", device)
+
+
+def _setting(name: str, value: str, variable: str, default: str) -> str:
+    """A parameter, else its environment variable, else ``default``."""
+    parameters.check(name, value)
+    return value or parameters.check(name, os.environ.get(variable, ""), origin=variable) or default
+
+
+def _present(device: str) -> str:
+    """``device``, if this machine has it."""
+    if device == "cpu":
+        return device
+    import torch  # heavy, and not needed otherwise
+
+    found, asked = torch.cuda.device_count() if torch.cuda.is_available() else 0, torch.device(device).index or 0
+    if asked >= found:
+        raise ParameterError(
+            f"device is {device}, but torch {torch.__version__} finds {found} such devices here. Leave --device (or "
+            "TSM_DEVICE) out, or install a torch that is built for this machine's: https://pytorch.org/get-started"
+        )
+    return device
+
+
+# Notebooks ------------------------------------------------------------------------------------------------------------
+
+
+def notebooks() -> dict[str, Path]:
+    """Word -> file, in order: 'control' is notebooks/05_control.ipynb."""
+    return {path.stem[3:]: path for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
