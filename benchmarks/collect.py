@@ -21,7 +21,7 @@ from _rounds import Row, interleaved, parsed, parser, peak_bytes, save
 from _simulator import ENV, raw
 
 import tsmlib.envs  # noqa: F401 - registers the environments
-from tsmlib.collection import collect, once, smooth_torques
+from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs.mujoco_arm import load_model
 
 STEPS = 100
@@ -30,7 +30,7 @@ STEPS = 100
 def bulk(starts: np.ndarray, torques: torch.Tensor) -> np.ndarray:
     """States (N, T, dx) from one call for all episodes."""
     env = gymnasium.make_vec(ENV, num_envs=len(starts))
-    states = collect(env, once(torques), horizon=STEPS, states=starts).states[:, 1:]
+    states = collect(env, open_loop(torques), horizon=STEPS, states=starts).states[:, 1:]
     env.close()
     return states
 

@@ -27,9 +27,9 @@ from tsmlib.figures.style import save as save_figure
 from tsmlib.models.base import rollout
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions
-from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.learning import episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.storage import tables
 from tsmlib.study import runs
@@ -112,14 +112,14 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
 
     def plan(n_targets: int, horizon: int) -> Call:
         some = task.take(n_targets)
-        predict = through_model(model, some.past(model.past_len))
+        predict = model_predictor(model, some.past(model.past_len))
         return partial(adam, predict, some.reward, DirectActions(horizon), n_targets, iterations=1)
 
     def learn(copies: int) -> float:
         policy: Any = OneStepPolicy(reach.start.shape[1], DU, copies=copies)
         policy.features.load_state_dict(small.features.state_dict())
         draw = episodes_from(torch.from_numpy(reach.start))
-        return improve(policy, small, getattr(rewards, reach.name), draw, iterations=2, record_every=2).seconds[-1]
+        return learn_policy(policy, small, getattr(rewards, reach.name), draw, iterations=2, record_every=2).seconds[-1]
 
     few = data.take(slice(2))
     cores = os.cpu_count() or 1

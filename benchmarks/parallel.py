@@ -1,7 +1,7 @@
 """Trainings side by side, in processes of one thread each, against one after another with as many threads.
 
-The same few updates of the paper's model on pushing, once for each of ``--trainings``: by ``study.ahead``, starting its
-processes included, and in this process with as many threads as the other way has processes.
+The same few updates of the paper's model on pushing, once for each of ``--trainings``: by ``study.precompute``, with
+the start of its processes, and in this process with as many threads as the other way has processes.
 
     python benchmarks/parallel.py        or        python -m tsmlib bench parallel
 """
@@ -24,7 +24,7 @@ def little(run: Run, seed: int, updates: int) -> None:
     """``updates`` of the free-running stage."""
     data, held_out = (study.random_data(ENV, n, seed=seed) for n in (100, 1))
     stage = study.schedule(run, ENV, "tsm")[-1]
-    net = study.fresh(run, "tsm", data)
+    net = study.initialise(run, "tsm", data)
     training(net, stage, (data, held_out), updates=updates, bf16=study.bf16_pays("tsm", stage))()
 
 
@@ -43,7 +43,7 @@ def main() -> None:
         torch.set_num_threads(arguments.threads)
 
     def side_by_side() -> None:
-        study.ahead(run, calls)
+        study.precompute(run, calls)
 
     seconds = interleaved({"ahead": side_by_side, "in turn": in_turn}, arguments.rounds, warm=False)
     n = arguments.trainings

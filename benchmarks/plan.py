@@ -26,11 +26,11 @@ from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_byte
 from torch import Tensor
 
 from tsmlib import study
-from tsmlib.collection import collect, once
+from tsmlib.collection import collect, open_loop
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam, cem
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.storage import artifacts
 from tsmlib.study import runs
@@ -45,7 +45,7 @@ def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
         tsm = artifacts.load_model(folder / "tsm.safetensors", TSM)
         return tsm, artifacts.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
     data = study.random_data(env, 50, seed=0)
-    return study.fresh(run, "tsm", data), study.fresh(run, "prior", data), "untrained"
+    return study.initialise(run, "tsm", data), study.initialise(run, "prior", data), "untrained"
 
 
 def timed(call: Callable[[Tensor], Tensor], name: str, seconds: dict[str, float]) -> Callable[[Tensor], Tensor]:
@@ -82,7 +82,7 @@ def main() -> None:
         return LatentActions(prior, horizon)
 
     def through(model: Any) -> Callable[[Tensor], Tensor]:
-        return through_model(model, task.past(model.past_len), samples=samples)
+        return model_predictor(model, task.past(model.past_len), samples=samples)
 
     def in_parts() -> None:
         """The plan over codes, telling its parts apart."""
@@ -161,7 +161,7 @@ def simulate(start: np.ndarray, actions: Tensor, n_rollouts: int) -> None:
     """Execute ``n_rollouts`` episodes in bulk, the actions over and over."""
     copies = -(-n_rollouts // len(start))
     env = gymnasium.make_vec(ENV, num_envs=copies * len(start))
-    collect(env, once(actions.repeat(copies, 1, 1)), horizon=actions.shape[1], states=np.tile(start, (copies, 1)))
+    collect(env, open_loop(actions.repeat(copies, 1, 1)), horizon=actions.shape[1], states=np.tile(start, (copies, 1)))
     env.close()
 
 

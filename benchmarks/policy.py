@@ -19,13 +19,13 @@ from plan import models
 
 from tsmlib import rewards, study
 from tsmlib.models.base import rollout
-from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.learning import episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
 from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
 
 SCHEDULE = 2200  # updates until the rate has decayed to its end, A25
-EPISODES = 20  # of each update and copy, ``improve``'s default
+EPISODES = 20  # of each update and copy, ``learn_policy``'s default
 
 
 def main() -> None:
@@ -51,7 +51,7 @@ def main() -> None:
             else OneStepPolicy(state_dim, 2, copies=copies)
         )
         learner.features.load_state_dict(model.features.state_dict())
-        return improve(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon).seconds[-1]
+        return learn_policy(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon).seconds[-1]
 
     @torch.no_grad()
     def imagine() -> None:

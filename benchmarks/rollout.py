@@ -36,7 +36,7 @@ def main() -> None:
     simulator = raw(data.states[:few, 0], data.actions[:few], threads=1)
     rows = []
     for model in arguments.models.split(","):
-        net = study.fresh(run, model, data)
+        net = study.initialise(run, model, data)
         ways: dict[str, Callable[[], object]] = {"simulator": simulator}
         for size in sizes:
             ways |= {f"{word} {size}": imagine(net, data, size, word == "bfloat16") for word in ("float32", "bfloat16")}

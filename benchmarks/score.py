@@ -38,7 +38,7 @@ def main() -> None:
     pairs = [data.take(slice(2)) for data in splits]
     ways: dict[str, Callable[[], object]] = {"memory": bandwidth(BYTES)}
     for model in arguments.models.split(","):
-        net = study.fresh(run, model, splits[0])
+        net = study.initialise(run, model, splits[0])
         for samples, data in ((arguments.samples, splits), (arguments.many, pairs)):
             options_of = dict(samples=samples, horizon=horizon)
             ways[f"{model} {samples}"] = partial(prediction.score, net, net.features, *data, **options_of)

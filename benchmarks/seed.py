@@ -32,11 +32,11 @@ from tsmlib import rewards, study
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, MUJOCO_IDS, NOISE
 from tsmlib.evaluation import prediction
-from tsmlib.planning.planners import cem, reassess
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.planners import cem, reevaluate
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.learning import episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
 from tsmlib.study import runs
 from tsmlib.study.results import planning as planning_results
@@ -111,7 +111,7 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
     data = {env: study.random_data(env, 200, seed=0) for env in (*envs, *(IMPERFECT if REACH in envs else ()))}
     few = {env: study.random_data(env, arguments.little, seed=1) for env in data}
     robust = [word for word in models if word in ("tsm", BEST, "onestep", "multistep", "lstm")]
-    nets = {(env, word): study.fresh(run, word, data[env]) for env in data for word in (*models, "prior")}
+    nets = {(env, word): study.initialise(run, word, data[env]) for env in data for word in (*models, "prior")}
     for env in data:
         own = robust if env in IMPERFECT else [*models, *(["tsm+teacher"] if env == PUSH else [])]
         for word in own:
@@ -130,7 +130,7 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
 
 def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) -> Iterator[Part]:
     """The stages of one model; an update costs the same at any time."""
-    net, held_out = study.fresh(run, word, data), data.take(slice(1))
+    net, held_out = study.initialise(run, word, data), data.take(slice(1))
     for stage in study.schedule(run, env, word):
         bf16 = study.bf16_pays(word, stage)
         few = training(net, stage, (data, held_out), updates=n, bf16=bf16)
@@ -149,15 +149,15 @@ def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
     few, horizon = task.take(n), task.horizon
     past, samples = few.past(net.past_len), 2 if getattr(net, "stochastic", True) else 1
     for space in (LatentActions(prior, horizon), DirectActions(horizon)):
-        predict = through_model(net, past, samples=samples)
-        judge = through_model(net, past, samples=16 * samples, seed=1)
+        predict = model_predictor(net, past, samples=samples)
+        judge = model_predictor(net, past, samples=16 * samples, seed=1)
 
         def call(space: Any = space, predict: Any = predict) -> None:
             cem(predict, few.reward, space, len(few), candidates=96, elites=9, iterations=2)
 
         found = cem(predict, few.reward, space, len(few), candidates=2, elites=2, iterations=1)
         yield Part("plan", call, 10 / 2 * len(task) / len(few))
-        yield Part("plan", partial(reassess, found, judge, few.reward), len(task) / len(few))
+        yield Part("plan", partial(reevaluate, found, judge, few.reward), len(task) / len(few))
 
 
 def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
@@ -170,7 +170,7 @@ def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
         learner.features.load_state_dict(net.features.state_dict())
 
         def updates(learner: Any = learner) -> float:
-            return improve(learner, net, reward, draw, iterations=n, record_every=n).seconds[-1]
+            return learn_policy(learner, net, reward, draw, iterations=n, record_every=n).seconds[-1]
 
         yield Part("policy", updates, 2200 / n)
 

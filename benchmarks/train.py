@@ -47,14 +47,14 @@ def main() -> None:
     for model in arguments.models.split(","):
         for stage in study.schedule(run, ENV, model):
             stage = replace(stage, batch=arguments.batch or stage.batch)
-            net = study.fresh(run, model, data[0])
+            net = study.initialise(run, model, data[0])
             kind = (type(net), str(net.config()), stage.loss, stage.batch, stage.future_len)
             if kind not in seen:  # tsm and tsm+energy begin alike
                 rows.append(stage_row(net, model, stage, data, arguments))
             seen.add(kind)
     if arguments.batches:
         sizes = [int(word) for word in arguments.batches.split(",")]
-        rows += batch_rows(study.fresh(run, "tsm", data[0]), sizes, data, arguments.updates, 2)
+        rows += batch_rows(study.initialise(run, "tsm", data[0]), sizes, data, arguments.updates, 2)
     print(f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads")
     save("train", rows)
 

@@ -30,7 +30,7 @@ from tsmlib import study
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts
 from tsmlib.study import runs
-from tsmlib.training.checkpoint import Progress
+from tsmlib.training.checkpoint import TrainingState
 from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories, Window
 
@@ -83,21 +83,21 @@ def round_of(
     seconds: dict[str, list[float]],
 ) -> float:  # fmt: skip
     """One training with checkpoints: how many times as long it would take as one without."""
-    net, asked, saves = study.fresh(run, "tsm", data), [], []
+    net, asked, saves = study.initialise(run, "tsm", data), [], []
 
     def loss(window: Window, generator: torch.Generator) -> torch.Tensor:
         if torch.is_grad_enabled():
             asked.append(time.process_time())
         return net.loss(window, generator)
 
-    def save(state: Progress, folder: Path, identity: dict[str, Any]) -> None:
+    def save(state: TrainingState, folder: Path, identity: dict[str, Any]) -> None:
         with timed(saves):
-            Progress.save(state, folder, identity)
+            TrainingState.save(state, folder, identity)
 
     every = max(1, arguments.steps // 2)
     with (
         tempfile.TemporaryDirectory() as name,
-        mock.patch("tsmlib.training.fit.Progress", type("Timed", (Progress,), {"save": save})),
+        mock.patch("tsmlib.training.fit.TrainingState", type("Timed", (TrainingState,), {"save": save})),
     ):
         fit(net, loss, data, held_out, past_len=10, future_len=20, steps=arguments.steps, validate_every=every,
             checkpoint=Path(name) / "run", bf16=True)  # fmt: skip

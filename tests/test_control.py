@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tsmlib import rewards, study
-from tsmlib.collection import collect, once, smooth_torques
+from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, imperfections
 from tsmlib.models.action_prior import ActionPrior
@@ -24,7 +24,7 @@ from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
 from tsmlib.planning import predictors
 from tsmlib.planning.base import Plan
-from tsmlib.planning.execution import execute, replan
+from tsmlib.planning.execution import execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
@@ -48,7 +48,7 @@ def torques(n: int, steps: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("env_id", [REACHER, PUSH, "tsm/PymunkPush-v0"])
 def test_collected_episodes_are_the_simulators_rollouts(env_id: str) -> None:
     env, actions = arms(env_id, 3), torques(3, 12)
-    data = collect(env, once(actions), horizon=12, seed=5)
+    data = collect(env, open_loop(actions), horizon=12, seed=5)
     start, _ = env.reset(seed=5)
     np.testing.assert_array_equal(data.states[:, 0], start.astype(np.float32))
     np.testing.assert_array_equal(data.states[:, 1:], env.unwrapped.rollout(actions.numpy()).astype(np.float32))
@@ -61,7 +61,7 @@ def test_collected_episodes_are_the_simulators_rollouts(env_id: str) -> None:
 def test_episodes_start_from_given_states() -> None:
     env = arms(PUSH, 4)
     start, _ = env.reset(seed=1)
-    data = collect(env, once(torques(4, 6)), horizon=6, states=start[::-1])
+    data = collect(env, open_loop(torques(4, 6)), horizon=6, states=start[::-1])
     np.testing.assert_array_equal(data.states[:, 0], start[::-1].astype(np.float32))
 
 
@@ -81,20 +81,20 @@ def test_a_controller_that_is_asked_again_gets_the_past() -> None:
     for k, past in enumerate(asked):
         assert torch.equal(past.states, whole.states[:, 3 * k : 3 * k + 5])
         assert torch.equal(past.actions, whole.actions[:, 3 * k : 3 * k + 5])
-    at_once = collect(arms(REACHER, 2), once(plan), horizon=10, seed=0)
+    at_once = collect(arms(REACHER, 2), open_loop(plan), horizon=10, seed=0)
     np.testing.assert_array_equal(data.states, at_once.states)
 
 
 def test_what_is_recorded_is_what_the_arm_received() -> None:
     strong = torch.full((1, 4, 2), 3.0, requires_grad=True)
-    data = collect(arms(REACHER, 1), once(strong), horizon=4, seed=0)
+    data = collect(arms(REACHER, 1), open_loop(strong), horizon=4, seed=0)
     assert (data.actions == 1).all()
 
 
 @pytest.mark.parametrize("horizon", [0, -5])
 def test_a_horizon_without_steps_is_refused(horizon: int) -> None:
     with pytest.raises(ValueError, match=f"horizon is {horizon}, expected a positive number of steps"):
-        collect(arms(REACHER, 1), once(torques(1, 5)), horizon=horizon)
+        collect(arms(REACHER, 1), open_loop(torques(1, 5)), horizon=horizon)
 
 
 def test_a_controller_without_an_answer_is_refused() -> None:
@@ -141,7 +141,9 @@ def test_without_torque_the_return_is_that_of_staying_put(env: str) -> None:
     trial = execute(task, zero_torques(task))
     distance = np.linalg.norm(task.start[:, task.position] - task.target.numpy(), axis=1)
     assert trial.states.shape == (4, 21, task.start.shape[1])
-    np.testing.assert_allclose(trial.true, -20 * distance, atol=20 * 1e-3)  # it drifts by less than a millimetre
+    np.testing.assert_allclose(
+        trial.executed_return, -20 * distance, atol=20 * 1e-3
+    )  # it drifts by less than a millimetre
     np.testing.assert_allclose(trial.final_distance, distance, atol=2e-3)
     np.testing.assert_allclose(trial.states[:, 0], task.start)
 
@@ -156,7 +158,7 @@ def test_the_environments_reward_is_the_tasks(env: str) -> None:
     for u in actions.unbind(1):
         last, reward, _, _, _ = arm.step(u.numpy())
         total += reward
-    np.testing.assert_allclose(trial.true, total, rtol=1e-5)
+    np.testing.assert_allclose(trial.executed_return, total, rtol=1e-5)
     np.testing.assert_allclose(trial.states[:, -1], last, rtol=1e-5, atol=1e-6)
 
 
@@ -184,12 +186,12 @@ def test_the_gap_is_predicted_minus_true() -> None:
     actions = random_torques(task)
     promised = torch.tensor([-1.0, -2.0, 0.0, 5.0])
     plan = Plan(
-        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted=promised,
+        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted_return=promised,
         curve=promised[None], seconds=1.0,
     )  # fmt: skip
     trial, plain = execute(task, plan), execute(task, actions)
-    torch.testing.assert_close(trial.true, plain.true)
-    torch.testing.assert_close(trial.gap, promised - plain.true)
+    torch.testing.assert_close(trial.executed_return, plain.executed_return)
+    torch.testing.assert_close(trial.gap, promised - plain.executed_return)
     with pytest.raises(ValueError, match="not planned"):
         _ = plain.gap
 
@@ -207,7 +209,7 @@ def test_behind_noisy_sensors_a_trial_earns_what_the_true_states_earn(env: str) 
     noisy, clear, actions = imperfect_task(env, noise=NOISE), some_task(env), torques(4, 20)
     trial, plain = execute(noisy, actions), execute(clear, actions)
     assert torch.equal(trial.states, plain.states)
-    assert torch.equal(trial.true, plain.true)
+    assert torch.equal(trial.executed_return, plain.executed_return)
     assert torch.equal(trial.final_distance, plain.final_distance)
     assert trial.observed is not None
     assert trial.observed.shape == trial.states.shape
@@ -262,13 +264,13 @@ def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> 
 
 def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_earns_what_is_true() -> None:
     task, model = imperfect_task(noise=NOISE), Wrong()
-    trial = replan(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
+    trial = mpc(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
     assert trial.observed is not None
     told = {past.states[:4, -1].contiguous().numpy().tobytes() for past in model.asked}
     for now in (0, 10):
         assert trial.observed[:, now].contiguous().numpy().tobytes() in told
     expected = task.reward(trial.states[:, 1:], trial.actions).sum(-1)
-    torch.testing.assert_close(trial.true, expected)
+    torch.testing.assert_close(trial.executed_return, expected)
 
 
 # Closed loop ---------------------------------------------------------------------------------------------------------
@@ -279,12 +281,12 @@ as_it_is = partial(adam, iterations=0)  # the planner that leaves a plan as it i
 def test_a_plan_that_is_never_made_again_is_executed_open_loop() -> None:
     task, space = some_task(PUSH), DirectActions(20, rms=0.3)
     planner = partial(cem, candidates=12, elites=3, iterations=2)
-    trial = replan(task, None, space, planner, every=20)
+    trial = mpc(task, None, space, planner, every=20)
     assert trial.plan is not None
     open_loop = execute(task, trial.actions)
     assert torch.equal(trial.states, open_loop.states)
-    torch.testing.assert_close(trial.true, open_loop.true)
-    torch.testing.assert_close(trial.plan.predicted, trial.true)  # the simulator keeps its word
+    torch.testing.assert_close(trial.executed_return, open_loop.executed_return)
+    torch.testing.assert_close(trial.plan.predicted_return, trial.executed_return)  # the simulator keeps its word
     torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:])
 
 
@@ -293,13 +295,15 @@ def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int)
     torch.manual_seed(0)
     task, prior = some_task(horizon=30), ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
     space = LatentActions(prior.requires_grad_(False), 30) if over == "codes" else DirectActions(30, rms=0.3)
-    plan = cem(predictors.through_simulator(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
+    plan = cem(predictors.simulator_predictor(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
                iterations=2)  # fmt: skip
-    trial = replan(task, None, space, as_it_is, every=every, plan=plan)
+    trial = mpc(task, None, space, as_it_is, every=every, plan=plan)
     assert trial.plan is not None
     torch.testing.assert_close(trial.actions, plan.actions, rtol=1e-4, atol=1e-6)
     assert trial.plan.curve.shape == (math.ceil(30 / every), 4)
-    torch.testing.assert_close(trial.plan.curve, trial.true.expand_as(trial.plan.curve), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(
+        trial.plan.curve, trial.executed_return.expand_as(trial.plan.curve), rtol=1e-3, atol=1e-4
+    )
     torch.testing.assert_close(trial.gap, torch.zeros(4), rtol=0, atol=1e-3)
     torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:], rtol=1e-3, atol=1e-3)
 
@@ -307,11 +311,11 @@ def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int)
 def test_planning_again_through_the_true_simulator_never_makes_a_plan_worse() -> None:
     task = some_task()
     planner = partial(mppi, candidates=12, iterations=2)
-    trial = replan(task, None, DirectActions(20, rms=0.3), planner, every=5)
+    trial = mpc(task, None, DirectActions(20, rms=0.3), planner, every=5)
     assert trial.plan is not None
     assert (trial.plan.curve.diff(dim=0) > -1e-4).all()
     assert (trial.plan.curve[-1] > trial.plan.curve[0]).any()
-    torch.testing.assert_close(trial.plan.curve[-1], trial.true, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(trial.plan.curve[-1], trial.executed_return, rtol=1e-4, atol=1e-4)
 
 
 @dataclasses.dataclass
@@ -332,7 +336,7 @@ def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
         return adam(predict, reward, space, torch.full((1, 4, *space.shape), 0.2), iterations=0)
 
     task, model = some_task(horizon=20), Wrong()
-    trial = replan(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
+    trial = mpc(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
     whole = Trajectories(
         trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
     ).padded(3)  # fmt: skip
@@ -349,10 +353,10 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
         return -(states[..., 5] - height).abs()  # fails on any other horizon
 
     task = some_task().with_reward("rise", rise)
-    trial = replan(task, None, DirectActions(20, rms=0.3), partial(cem, candidates=24, elites=4, iterations=3), every=6)
+    trial = mpc(task, None, DirectActions(20, rms=0.3), partial(cem, candidates=24, elites=4, iterations=3), every=6)
     assert trial.plan is not None
-    torch.testing.assert_close(trial.plan.curve[-1], trial.true, rtol=1e-3, atol=1e-4)
-    assert (trial.true > 0.7 * execute(task, zero_torques(task)).true).all()
+    torch.testing.assert_close(trial.plan.curve[-1], trial.executed_return, rtol=1e-3, atol=1e-4)
+    assert (trial.executed_return > 0.7 * execute(task, zero_torques(task)).executed_return).all()
 
 
 @pytest.mark.parametrize("over", ["actions", "codes"])
@@ -369,7 +373,7 @@ def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
     prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
     planner = partial(adam, iterations=1, lr=0.1) if over == "codes" else partial(mppi, iterations=1, candidates=4)
-    trial = replan(task, model, space, planner, every=7)  # no multiple of the prior's segment
+    trial = mpc(task, model, space, planner, every=7)  # no multiple of the prior's segment
     assert trial.plan is not None
     assert trial.actions.shape == (2, 20, 2)
     assert trial.actions.abs().max() <= 1
@@ -380,7 +384,7 @@ def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
 
 def test_a_closed_loop_without_steps_is_refused() -> None:
     with pytest.raises(ValueError, match="every is 0, expected a positive number of steps"):
-        replan(some_task(), None, DirectActions(20), as_it_is, every=0)
+        mpc(some_task(), None, DirectActions(20), as_it_is, every=0)
 
 
 # Tasks ---------------------------------------------------------------------------------------------------------------

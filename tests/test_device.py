@@ -20,11 +20,11 @@ from tsmlib import study
 from tsmlib.__main__ import main
 from tsmlib.evaluation import prediction
 from tsmlib.models.base import rollout
-from tsmlib.planning.base import Planner, Space
+from tsmlib.planning.base import Planner, SearchSpace
 from tsmlib.planning.planners import adam, cem
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.policies.learning import improve
+from tsmlib.policies.learning import learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
 from tsmlib.study import runs
@@ -177,11 +177,11 @@ def test_it_finds_the_same_plan(planner: Planner, over: str, device: str) -> Non
 
     def found(place: str) -> tuple[Tensor, ...]:
         model, prior = new_model().to(place), new_prior().float().to(place)
-        space: Space = LatentActions(prior, HORIZON) if over == "codes" else DirectActions(HORIZON)
-        predict = through_model(model, initial_past(start, model.past_len, DU), samples=2)
+        space: SearchSpace = LatentActions(prior, HORIZON) if over == "codes" else DirectActions(HORIZON)
+        predict = model_predictor(model, initial_past(start, model.past_len, DU), samples=2)
         plan = planner(predict, to_the_origin, space, TARGETS)
         left, parameters = space.after(plan.parameters, 7)  # what a closed loop goes on from
-        return plan.actions, plan.predicted, left.decode(parameters[None])
+        return plan.actions, plan.predicted_return, left.decode(parameters[None])
 
     assert all(agree(there, here, device) for there, here in zip(on(device, found), on(PROCESSOR, found), strict=True))
 
@@ -204,7 +204,7 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
             return starts[torch.randint(8, (n,), generator=generator)], torch.randn(n, 2, generator=generator)
 
         model = new_model()
-        improve(policy.to(place), model.to(place), reward, draw, horizon=12, iterations=2, episodes=3)
+        learn_policy(policy.to(place), model.to(place), reward, draw, horizon=12, iterations=2, episodes=3)
         past = Segment(*(part[:4, :10].float() for part in seen))
         return policy, controller(policy, torch.zeros(4, 2))(past)
 
@@ -237,7 +237,7 @@ def test_what_study_makes_there_is_what_it_makes_here(
         assert header["device"] == place
         earned = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
         return (
-            *(plan.actions for plan in plans), *(plan.predicted for plan in (*plans, later)),
+            *(plan.actions for plan in plans), *(plan.predicted_return for plan in (*plans, later)),
             *study.scores(run, REACHER, "onestep").values.values(), *earned.values(),
         )  # fmt: skip
 

@@ -14,7 +14,7 @@ from tsmlib import statistics, study
 from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
 from tsmlib.evaluation import contacts, exploitation, futures, latent, prediction
 from tsmlib.evaluation.contacts import Deflections
-from tsmlib.evaluation.futures import Seen
+from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.tsm import TSM
@@ -61,7 +61,7 @@ def still_window(n: int, steps: int = 10) -> Window:
     )
 
 
-def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> Seen:
+def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> SampledFutures:
     """An arm at rest along x and an object at rest, for the truth and for two samples."""
     state = torch.zeros(10)
     state[4:6], state[6:8] = torch.from_numpy(fingertip(np.zeros(2))).float(), torch.tensor(block)
@@ -69,7 +69,7 @@ def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> 
     window = Window(
         Segment(state.expand(n, 10, -1).clone(), torch.zeros(n, 10, 2)), Segment(states, torch.zeros(n, steps, 2))
     )
-    return Seen(PUSH, window, states.expand(2, -1, -1, -1).clone())
+    return SampledFutures(PUSH, window, states.expand(2, -1, -1, -1).clone())
 
 
 def test_the_divergence_of_a_gaussian_is_the_textbook_s_and_adds_up_over_dimensions() -> None:
@@ -93,7 +93,7 @@ def test_each_dimension_of_a_linear_decoder_matters_by_its_own_weight() -> None:
 def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder_listens(
     model: TSM, test_data: Trajectories
 ) -> None:
-    seen = futures.look(model, test_data, samples=2, horizon=10)
+    seen = futures.sample_futures(model, test_data, samples=2, horizon=10)
     with torch.no_grad():
         for weight in model.decoder.codes.parameters():
             kept = weight.clone()
@@ -105,7 +105,7 @@ def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder
 
 
 def test_windows_hold_the_states_that_scores_are_taken_from(model: TSM, test_data: Trajectories) -> None:
-    seen = futures.look(model, test_data, samples=2, horizon=30)
+    seen = futures.sample_futures(model, test_data, samples=2, horizon=30)
     whole = test_data.padded(0)
     assert torch.equal(seen.window.future.states, prediction.cut(whole.states, futures.STARTS, 30))
     assert torch.equal(seen.window.past.states[1], whole.states[0, 30:40])  # the second window of the first episode
@@ -116,13 +116,13 @@ def test_windows_hold_the_states_that_scores_are_taken_from(model: TSM, test_dat
 
 
 def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(model: TSM, test_data: Trajectories) -> None:
-    seen, episodes = contacts.about_to_touch(model, test_data, samples=2, horizon=20)
+    seen, episodes = contacts.windows_before_contact(model, test_data, samples=2, horizon=20)
     assert 3 <= len(episodes) < len(test_data)
     near = closest_gap(seen.window.future.states.numpy(), PUSH) < exploitation.NEAR
     assert near[:, contacts.LEAD - 1].all()
     assert not near[:, : contacts.LEAD - 1].any()
     with pytest.raises(ValueError, match="none of the 40 episodes"):
-        contacts.about_to_touch(model, test_data, samples=1, horizon=90)
+        contacts.windows_before_contact(model, test_data, samples=1, horizon=90)
 
 
 def test_every_step_counts_alike_however_often_it_occurs() -> None:
@@ -153,7 +153,7 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     noise = torch.randn(64, 50, 10, 10, generator=rng())
     size = torch.full((50, 10), 0.02)
     size[:25, 6:] = 0.1
-    seen = Seen(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
+    seen = SampledFutures(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
     net: Any = SimpleNamespace(
         segment_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
     )
@@ -246,7 +246,7 @@ def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -
 
 
 def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(model: TSM, test_data: Trajectories) -> None:
-    seen = futures.look(model, test_data.take(slice(1)), samples=1, horizon=30)
+    seen = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=30)
     window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
     z = torch.randn(1, 3, generator=rng())
     once = latent.futures(model, window, z, 30)

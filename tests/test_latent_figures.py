@@ -148,7 +148,7 @@ def test_a_turned_knob_draws_the_picture_anew() -> None:
         figure.text(0.1, 0.5, f"{a} {b}")
         return figure
 
-    first, second, picture = figures.knobs(draw, a=(-3.0, 3.0, 0.25), b=(1.0, 2.0, 0.5)).children
+    first, second, picture = figures.slider_panel(draw, a=(-3.0, 3.0, 0.25), b=(1.0, 2.0, 0.5)).children
     before = picture.value
     first.value = 1.25
     second.value = 2.0

@@ -96,7 +96,7 @@ def test_what_codes_cost_is_counted_per_target() -> None:
     assert value["lost_with_distance"] == pytest.approx(1)
     assert value["further"] == pytest.approx(0.02)
     assert value["outside"] <= 0.3
-    wild = Trial(torch.ones(20, 50, 2), over_actions.states, over_actions.true, over_actions.final_distance)
+    wild = Trial(torch.ones(20, 50, 2), over_actions.states, over_actions.executed_return, over_actions.final_distance)
     rows, _ = action_prior_results.cost_of_prior(task, over_codes, wild, smooth(100, 1), smooth(200, 2), seed=0)
     assert {row["metric"]: row["value"] for row in rows}["outside"] == 1
 

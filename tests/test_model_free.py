@@ -66,7 +66,7 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
     np.testing.assert_allclose(seen.reshape(len(flat), -1), flat, rtol=1e-6, atol=1e-6)
     per_step = (push if task.name == "push" else reach)(task.target)(trial.states[:, 1:], actions)
     np.testing.assert_allclose(rewards, per_step, atol=1e-6)
-    np.testing.assert_allclose(rewards.sum(1), trial.true, atol=1e-5)
+    np.testing.assert_allclose(rewards.sum(1), trial.executed_return, atol=1e-5)
 
 
 def test_a_policy_sees_what_ours_see_and_the_target() -> None:
@@ -91,7 +91,7 @@ def test_doing_nothing_earns_what_zero_torque_earns() -> None:
     task = study.task("tsm/Reacher-v0").take(10)
     found = model_free.measured(task, lambda seen: np.zeros((len(seen), 2)))
     trial = execute(task, torch.zeros(10, task.horizon, 2))
-    assert found["return_true"] == pytest.approx(float(trial.true.mean()), abs=1e-5)
+    assert found["return_true"] == pytest.approx(float(trial.executed_return.mean()), abs=1e-5)
     assert found["final_distance"] == pytest.approx(float(trial.final_distance.mean()), abs=1e-6)
 
 

@@ -14,7 +14,7 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import adam, cem, mppi
-from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.rewards import Reward
@@ -36,13 +36,13 @@ def posed(reward: Reward = arc, env: str = REACHER) -> Task:
 def test_an_own_task_is_planned_for_and_executed() -> None:
     task = posed()
     plan = cem(
-        through_simulator(REACHER, task.start), task.reward, DirectActions(T, rms=0.3), N,
+        simulator_predictor(REACHER, task.start), task.reward, DirectActions(T, rms=0.3), N,
         candidates=48, elites=6, iterations=5,
     )  # fmt: skip
     trial, nothing = execute(task, plan), execute(task, zero_torques(task))
-    torch.testing.assert_close(trial.true, arc(trial.states[:, 1:], trial.actions).sum(-1))
-    torch.testing.assert_close(trial.true, plan.predicted)
-    assert (trial.true > 0.7 * nothing.true).all()  # both are costs below zero
+    torch.testing.assert_close(trial.executed_return, arc(trial.states[:, 1:], trial.actions).sum(-1))
+    torch.testing.assert_close(trial.executed_return, plan.predicted_return)
+    assert (trial.executed_return > 0.7 * nothing.executed_return).all()  # both are costs below zero
     torch.testing.assert_close(trial.final_distance, (trial.states[:, -1, 4:6] - ARC[-1]).norm(dim=1))
 
 
@@ -58,7 +58,7 @@ def test_a_zone_to_keep_away_from_changes_the_plan() -> None:
     for reward in (rewards.reach(target.expand(N, 2)), around):
         task = plain.with_reward("around", reward, target=target, horizon=T)
         plan = cem(
-            through_simulator(REACHER, task.start), task.reward, DirectActions(T, rms=0.3), N,
+            simulator_predictor(REACHER, task.start), task.reward, DirectActions(T, rms=0.3), N,
             candidates=64, elites=8, iterations=8,
         )  # fmt: skip
         depth.append((0.05 - (plan.states[0, ..., rewards.TIP] - zone).norm(dim=-1)).clamp(min=0).sum())
@@ -101,7 +101,7 @@ def test_a_reward_that_fails_says_what_it_was_given() -> None:
 
 
 def test_a_planner_refuses_a_reward_of_the_wrong_shape() -> None:
-    predict = through_simulator(REACHER, posed().start)
+    predict = simulator_predictor(REACHER, posed().start)
     with pytest.raises(ValueError, match="one number per step"):
         cem(predict, lambda s, a: arc(s, a)[..., 0], DirectActions(T), N, candidates=4, elites=2)
 
@@ -120,7 +120,7 @@ def test_a_reward_that_is_no_number_somewhere_stops_every_planner() -> None:
     task = posed(lambda states, actions: arc(states, actions) + 0 * (0.1 - states[..., 0].abs()).log())
     torch.manual_seed(0)
     model = TSM(6, 2, channels=8)
-    through = through_model(model, task.past(10), samples=1)
+    through = model_predictor(model, task.past(10), samples=1)
     for plan in (adam, cem, mppi):
         with pytest.raises(FloatingPointError, match=r"the reward is nan .* although the state there is finite"):
             plan(through, task.reward, DirectActions(T), torch.ones(1, N, T, 2))  # type: ignore[operator]
@@ -129,7 +129,7 @@ def test_a_reward_that_is_no_number_somewhere_stops_every_planner() -> None:
 def test_a_slope_that_is_no_number_stops_adam() -> None:
     task = posed(lambda states, actions: arc(states, actions) - (0 * states).sum(-1).abs().sqrt())
     with pytest.raises(FloatingPointError, match="the gradient of the return is not finite at the start"):
-        adam(through_model(TSM(6, 2, channels=8), task.past(10)), task.reward, DirectActions(T), N, iterations=2)
+        adam(model_predictor(TSM(6, 2, channels=8), task.past(10)), task.reward, DirectActions(T), N, iterations=2)
 
 
 # Rewards without a gradient ------------------------------------------------------------------------------------------
@@ -145,7 +145,7 @@ def test_a_slope_that_is_no_number_stops_adam() -> None:
 )
 def test_adam_refuses_a_reward_without_a_gradient_and_the_others_do_not(flat: Reward) -> None:
     task = posed(flat)
-    predict, space = through_model(TSM(6, 2, channels=8), task.past(10)), DirectActions(T)
+    predict, space = model_predictor(TSM(6, 2, channels=8), task.past(10)), DirectActions(T)
     with pytest.raises(ValueError, match=r"not a differentiable function of the states.*plan with cem or mppi"):
         adam(predict, task.reward, space, N, iterations=2)
     mppi(predict, task.reward, space, N, iterations=1, candidates=4)
@@ -154,7 +154,7 @@ def test_adam_refuses_a_reward_without_a_gradient_and_the_others_do_not(flat: Re
 def test_adam_refuses_the_true_simulator() -> None:
     task = posed()
     with pytest.raises(ValueError, match="what predicts the states is not differentiable"):
-        adam(through_simulator(REACHER, task.start), task.reward, DirectActions(T), N, iterations=2)
+        adam(simulator_predictor(REACHER, task.start), task.reward, DirectActions(T), N, iterations=2)
 
 
 # Targets and horizons ------------------------------------------------------------------------------------------------

@@ -289,7 +289,7 @@ def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
     assert first.seconds.tolist() == [3.0, 3.0]  # a target, however many are in a share
     assert second.trial.actions.shape == (5, 4, 2)
     assert len(second.seconds) == 2
-    assert (first.trial.true - first.promised).abs().max() < 0.1  # nothing was pushed
+    assert (first.trial.executed_return - first.promised).abs().max() < 0.1  # nothing was pushed
 
 
 def outcome(way: Any, seconds: float, true: list[float]) -> Any:
@@ -337,7 +337,7 @@ def test_the_trained_network_is_found_again_until_its_training_changes(
         return made[-1], {"epochs": 1.0}
 
     monkeypatch.setattr(pets, "train", train)
-    monkeypatch.setattr(pets, "fresh", lambda *_, **options: (torch.nn.Linear(2, 2), None))
+    monkeypatch.setattr(pets, "initialise", lambda *_, **options: (torch.nn.Linear(2, 2), None))
     run = runs.Run("peers", "laptop", 0, tmp_path)
     first, again = (speed.trained(run, "mse", features, data, data, seconds=3.0) for _ in range(2))
     assert torch.equal(first.weight, again.weight)

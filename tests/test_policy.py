@@ -21,11 +21,12 @@ from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.tsm import TSM
-from tsmlib.policies.learning import LearningCurve, discounted, episodes_from, imagine, improve, learning_rate
+from tsmlib.policies.learning import LearningCurve, discounted, episodes_from, imagine, learn_policy, learning_rate
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts, files
+from tsmlib.study import policies as study_policies
 from tsmlib.study import runs
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
@@ -110,7 +111,7 @@ def around(scale: float = 0.5) -> Callable[[int, torch.Generator], tuple[Tensor,
 
 def learn(learner: Any, world: Any = None, reward: Any = arrive, **settings: Any) -> LearningCurve:
     settings = dict(horizon=5, episodes=4, iterations=4, record_every=2, lr=1e-2) | settings
-    return improve(learner, world or Sled(), reward, around(), **settings)
+    return learn_policy(learner, world or Sled(), reward, around(), **settings)
 
 
 def weights(learner: Any) -> dict[str, Tensor]:
@@ -291,7 +292,7 @@ def test_copies_learn_as_they_would_alone(kind: str, name: str) -> None:
 
     def learned(copies: int, seed: int) -> tuple[Any, LearningCurve]:
         actor = policy(kind, DX, copies=copies, seed=seed)
-        curve = improve(actor, world, arrive, starts, horizon=5, episodes=4, **{**settings, "seed": 7 + seed})
+        curve = learn_policy(actor, world, arrive, starts, horizon=5, episodes=4, **{**settings, "seed": 7 + seed})
         return actor, curve
 
     together, curve = learned(3, 0)
@@ -311,7 +312,7 @@ def test_what_is_learned_is_the_policy_alone_and_not_the_model_or_the_prior() ->
     before, decoder, state = weights(world), weights(actor.prior), torch.get_rng_state()
     untouched = weights(actor)
     starts = episodes_from(torch.zeros(1, DX, dtype=torch.float64))
-    improve(actor, world, arrive, starts, horizon=5, episodes=2, iterations=2)
+    learn_policy(actor, world, arrive, starts, horizon=5, episodes=2, iterations=2)
     assert same(weights(world), before)
     assert same(weights(actor.prior), decoder)
     assert all(p.requires_grad and p.grad is None for p in world.parameters())
@@ -382,15 +383,15 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    net = study.fresh(run, "tsm", study.dataset(run, "tsm/Reacher-v0", "train"))
-    codes = study.fresh(run, "prior", study.dataset(run, "tsm/Reacher-v0", "train"))
+    net = study.initialise(run, "tsm", study.dataset(run, "tsm/Reacher-v0", "train"))
+    codes = study.initialise(run, "prior", study.dataset(run, "tsm/Reacher-v0", "train"))
     monkeypatch.setattr(
-        study.policies, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {})
+        study_policies, "load_or_train", lambda run, env, model: (codes if model == "prior" else net, {})
     )
     task = study.task("tsm/Reacher-v0", "validation").take(3)
-    assert study.kept_budget(run, task, "tsm", prior) is None
+    assert study.stored_budget(run, task, "tsm", prior) is None
     actor, header = study.learn(run, task, "tsm", prior, copies=2)
-    assert study.kept_budget(run, task, "tsm", prior) == {"copies": 2, "iterations": 4}
+    assert study.stored_budget(run, task, "tsm", prior) == {"copies": 2, "iterations": 4}
     near = study.within_data(run, task, actor)
     assert near.shape == (2,)
     assert ((near >= 0) & (near <= 1)).all()
@@ -402,7 +403,7 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     for metric, values in found.items():
         torch.testing.assert_close(values, last[metric])
     with monkeypatch.context() as patch:
-        patch.setattr(study.policies, "improve", None)
+        patch.setattr(study_policies, "learn_policy", None)
         again, _ = study.learn(run, task, "tsm", prior, copies=2)
         assert same(weights(again), weights(actor))
         with pytest.raises(TypeError):

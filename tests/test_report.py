@@ -31,7 +31,7 @@ def dreamt(task: Task, torques: Any, promised: float = 0.0) -> Trial:
     """A trial of torques whose model saw the truth coming, and promised so much more."""
     seen = execute(task, torques)
     states = seen.states[None, :, 1:].clone()
-    plan = Plan(torques, torques, states, seen.true + promised, seen.true[None], seconds=1.0)
+    plan = Plan(torques, torques, states, seen.executed_return + promised, seen.executed_return[None], seconds=1.0)
     return dataclasses.replace(seen, plan=plan)
 
 
@@ -47,17 +47,19 @@ def test_a_table_holds_what_the_trials_measured() -> None:
     task = some_task(REACHER, 4)
     trial = execute(task, zero_torques(task))
     summary, per_target = planning_results.tables([task], {REACHER: {"zero": trial}}, RUN)
-    assert value(summary, "return_true") == pytest.approx(float(trial.true.mean()))
+    assert value(summary, "return_true") == pytest.approx(float(trial.executed_return.mean()))
     near = trial.final_distance <= tasks.TOLERANCE
     assert value(summary, "success") == pytest.approx(float(near.float().mean()))
     assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
-    np.testing.assert_allclose(planning_results.by_target(per_target, "return_true")["zero"], trial.true, rtol=1e-6)
+    np.testing.assert_allclose(
+        planning_results.by_target(per_target, "return_true")["zero"], trial.executed_return, rtol=1e-6
+    )
 
 
 def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> None:
     task = some_task(REACHER, 4)
     nothing, random = (execute(task, torques(task)) for torques in (zero_torques, random_torques))
-    oracle = dataclasses.replace(nothing, true=nothing.true / 2)
+    oracle = dataclasses.replace(nothing, executed_return=nothing.executed_return / 2)
     trials = {REACHER: {"zero": nothing, "oracle codes cem": oracle, "random": random}}
     rows, _ = planning_results.tables([task], trials, RUN)
     assert value(rows, "cost_over_oracle", model="oracle") == pytest.approx(1)
@@ -74,7 +76,7 @@ def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_no
     jump = torch.zeros(10)
     jump[3] = 0.05
     careless.plan.states[0, :, 10:, 6] += jump[:, None]  # one object of ten, for half the time
-    careless.plan.predicted[3] += 1.0
+    careless.plan.predicted_return[3] += 1.0
     rows, per_target = planning_results.tables(
         [task], {PUSH: {"tsm codes cem": sound, "lstm codes cem": careless}}, RUN
     )

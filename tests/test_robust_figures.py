@@ -39,11 +39,11 @@ TITLES = ("joint1 (rad)", "joint0 vel (rad/s)", "tip x (m)")
 PARTS = ("whole state", "angles", "velocities", "fingertip")
 
 
-def ahead(level: float, k: int = 3) -> np.ndarray:
+def precompute(level: float, k: int = 3) -> np.ndarray:
     return level * (1 + 0.1 * np.arange(10)) + 0.002 * draw.normal(size=(k, 10))
 
 
-AHEAD = {part: {"tsm": ahead(0.1 + 0.02 * i), "lstm": ahead(0.15), "filter": ahead(0.08, k=1)}
+AHEAD = {part: {"tsm": precompute(0.1 + 0.02 * i), "lstm": precompute(0.15), "filter": precompute(0.08, k=1)}
          for i, part in enumerate(PARTS)}  # fmt: skip
 NOW = {part: {"filter": 0.07, "exponential": 0.15} for part in PARTS}
 RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
@@ -76,7 +76,7 @@ EVERY: dict[str, Callable[[], Figure]] = {
     "an episode": episode,
     "filtering": lambda: filtering(AHEAD, NOW, RAW),
     "filtering, one part and one seed": lambda: filtering(
-        {"angles": {"tsm": ahead(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
+        {"angles": {"tsm": precompute(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
     ),
     "a map": grid,
     "a map of nothing": lambda: grid({"plain arm: minus LSTM": np.full((2, 2), np.nan)}),
@@ -181,7 +181,7 @@ def test_all_parts_share_a_scale_in_which_the_raw_observation_is_seen() -> None:
 
 def test_a_model_that_is_far_off_is_told_in_words() -> None:
     rows = {part: dict(own) for part, own in AHEAD.items()}
-    rows["velocities"]["onestep"] = ahead(2.0)
+    rows["velocities"]["onestep"] = precompute(2.0)
     figure = filtering(rows, NOW, RAW)
     assert figure.axes[0].get_ylim()[1] < 1
     told = [ax.get_xlabel().replace("\n", " ") for ax in figure.axes]

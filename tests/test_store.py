@@ -46,7 +46,7 @@ class Line(torch.nn.Module):
         return {"inputs": self.inputs, "outputs": self.outputs}
 
 
-class Curve(Line):
+class TrainingHistory(Line):
     pass
 
 
@@ -279,8 +279,8 @@ def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: P
 def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     artifacts.save_model(path, Line(inputs=3))
-    with pytest.raises(StoreError, match="holds a 'Line', expected a Curve"):
-        artifacts.load_model(path, Curve)
+    with pytest.raises(StoreError, match="holds a 'Line', expected a TrainingHistory"):
+        artifacts.load_model(path, TrainingHistory)
     tensors, header = artifacts.load(path, kind="model")
     artifacts.save(path, tensors, kind="model", header={**header, "config": {"inputs": 4}})
     with pytest.raises(StoreError, match="does not fit the present Line"):

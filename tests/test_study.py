@@ -126,7 +126,7 @@ def test_a_model_knows_the_scale_of_its_data(made: Run) -> None:
 @pytest.mark.parametrize("env", ["tsm/ReacherPush-v0", "tsm/PymunkReacher-v0"])
 def test_models_with_contacts_are_wider(env: str) -> None:
     run = runs.resolve("02_train", scale="smoke")
-    config = study.fresh(run, "tsm", study.random_data(env, 2, seed=0, horizon=10)).config()
+    config = study.initialise(run, "tsm", study.random_data(env, 2, seed=0, horizon=10)).config()
     wide = "Push" in env
     assert (config["channels"], config["head_channels"]) == ((64, 128) if wide else (32, 0))  # appendix A.1
     assert (config["segment_len"], config["latent_dim"]) == (10, 8)  # section 5.1
@@ -179,13 +179,13 @@ def test_every_method_plans_and_executes(made: Run, planner: str, prior: str, ev
     trial = study.trial(made, some_task(), "tsm", planner, prior, every=every)
     assert trial.plan is not None
     assert trial.actions.shape == (2, 50, 2)
-    torch.testing.assert_close(trial.gap, trial.plan.predicted - trial.true)
+    torch.testing.assert_close(trial.gap, trial.plan.predicted_return - trial.executed_return)
 
 
 def test_the_oracle_earns_what_it_promises(run: Run) -> None:
     trial = study.trial(run, some_task(), "oracle", "cem", "actions")
     assert trial.plan is not None
-    torch.testing.assert_close(trial.plan.predicted, trial.true, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(trial.plan.predicted_return, trial.executed_return, rtol=1e-4, atol=1e-4)
 
 
 def test_a_plan_is_kept_for_its_task_and_models_alone(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +206,7 @@ def test_a_kept_plan_is_the_one_that_was_made(made: Run) -> None:
     first, again = (study.plan(made, some_task(), "tsm", "mppi", "actions", iterations=3) for _ in range(2))
     assert first.trace is not None
     assert again.trace is not None
-    for name in ("actions", "parameters", "states", "predicted", "curve", "trace"):
+    for name in ("actions", "parameters", "states", "predicted_return", "curve", "trace"):
         assert torch.equal(getattr(first, name), getattr(again, name)), name
 
 
@@ -216,7 +216,7 @@ def test_a_task_with_a_reward_of_its_own_is_planned_for_each_time(made: Run) -> 
     for height in (0.1, -0.1):
         own = some_task().with_reward("reach", lambda states, actions, h=height: -(states[..., 5] - h).abs())
         plan = study.plan(made, own, "tsm", "cem", "codes")
-        assert not torch.equal(plan.predicted, plain.predicted)
+        assert not torch.equal(plan.predicted_return, plain.predicted_return)
         torch.testing.assert_close(study.trial(made, own, "tsm", "cem", "codes").actions, plan.actions)
     assert {path: path.stat().st_mtime_ns for path in (made.dir / "plans").iterdir()} == before
 
@@ -264,7 +264,7 @@ def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_ve
 
 def test_what_is_promised_is_not_what_the_planner_searched_with(made: Run) -> None:
     plan = study.plan(made, some_task(), "tsm", "cem", "codes")
-    assert not torch.equal(plan.predicted, plan.curve[-1])
+    assert not torch.equal(plan.predicted_return, plan.curve[-1])
 
 
 @pytest.mark.parametrize(
@@ -407,6 +407,6 @@ def test_a_parameter_that_names_something_unknown_lists_what_there_is(text: str)
     with pytest.raises(
         ParameterError, match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v0; or all"
     ):
-        study.chosen("envs", text, [REACHER, "tsm/ReacherPush-v0"])
-    assert study.chosen("envs", f" {REACHER} ", [REACHER]) == [REACHER]
-    assert study.chosen("envs", "all", ["a", "b"]) == ["a", "b"]
+        study.parse_choice("envs", text, [REACHER, "tsm/ReacherPush-v0"])
+    assert study.parse_choice("envs", f" {REACHER} ", [REACHER]) == [REACHER]
+    assert study.parse_choice("envs", "all", ["a", "b"]) == ["a", "b"]

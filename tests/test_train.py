@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
-from tsmlib.training.checkpoint import Curve, TrainingStopped, load_generation
+from tsmlib.training.checkpoint import TrainingHistory, TrainingStopped, load_generation
 from tsmlib.training.fit import fit, fixed_windows, schedule
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window
 
@@ -50,7 +50,7 @@ def new_prior(seed: int = 0) -> ActionPrior:
     return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(torch.from_numpy(TRAIN.actions))
 
 
-def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> Curve:
+def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
     return fit(model, loss or model.loss, TRAIN, HELD_OUT, **{**SIZES, **settings})
 
 

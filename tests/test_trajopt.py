@@ -19,9 +19,9 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
-from tsmlib.planning.base import Plan, Predict
-from tsmlib.planning.planners import adam, cem, evaluate, expected_return, iterations_to, mppi, sampled_starts, stopped
-from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.base import Plan, Predictor
+from tsmlib.planning.planners import adam, cem, evaluate, expected_return, iterations_to, mppi, plan_at, sampled_starts
+from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, standard_normal
@@ -63,8 +63,8 @@ def reward(states: Tensor, actions: Tensor) -> Tensor:
     return -(states[..., 0] - TARGET[:, None]).square() - 0.3 * actions.square().sum(-1)
 
 
-def predictor(noise: float = 0.0, samples: int = 1) -> Predict:
-    return through_model(Cart(noise), initial_past(START, 1, 1), samples=samples)
+def predictor(noise: float = 0.0, samples: int = 1) -> Predictor:
+    return model_predictor(Cart(noise), initial_past(START, 1, 1), samples=samples)
 
 
 def optimum() -> tuple[Tensor, Tensor]:
@@ -90,7 +90,7 @@ class Rough(DirectActions):
         return torch.randn(n, n_targets, *self.shape, generator=generator)
 
 
-def plan_by(planner: str, predict: Predict, reward: Reward, iterations: int, **settings: Any) -> Plan:
+def plan_by(planner: str, predict: Predictor, reward: Reward, iterations: int, **settings: Any) -> Plan:
     space, start = settings.pop("space", DirectActions(T, 1, rms=0.5)), settings.pop("start", B)
     plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner]
     usual = {"adam": {"lr": 0.05}, "cem": {"candidates": 64, "elites": 8}, "mppi": {"candidates": 64}}[planner]
@@ -115,8 +115,8 @@ def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, A
     forces, value = optimum()
     plan = plan_by(planner, predictor(), reward, **settings)
     nothing = expected_return(predictor()(torch.zeros(1, B, T, 1)), torch.zeros(1, B, T, 1), reward)[0]
-    assert (plan.predicted <= value + 1e-5).all()
-    assert (value - plan.predicted < missed * (value - nothing)).all()
+    assert (plan.predicted_return <= value + 1e-5).all()
+    assert (value - plan.predicted_return < missed * (value - nothing)).all()
     if missed < 0.05:
         assert (plan.actions[..., 0] - forces).abs().max() < 0.3
 
@@ -125,9 +125,9 @@ def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, A
 def test_more_iterations_never_make_the_predicted_return_worse(planner: str) -> None:
     plans = [plan_by(planner, predictor(0.1, 3), reward, n) for n in (1, 4, 12)]
     for fewer, more in itertools.pairwise(plans):
-        assert (more.predicted >= fewer.predicted - 1e-5).all()
+        assert (more.predicted_return >= fewer.predicted_return - 1e-5).all()
     assert (plans[-1].curve.diff(dim=0) >= 0).all()
-    assert (plans[-1].predicted > plans[0].predicted).all()
+    assert (plans[-1].predicted_return > plans[0].predicted_return).all()
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -139,9 +139,9 @@ def test_a_plan_keeps_its_promises(planner: str) -> None:
     assert plan.parameters.shape == (B, T, 1)
     assert plan.seconds > 0
     torch.testing.assert_close(space.decode(plan.parameters[None])[0], plan.actions)
-    torch.testing.assert_close(evaluate(predict, reward, space, plan.parameters[None])[0], plan.predicted)
-    torch.testing.assert_close(plan.curve[-1], plan.predicted)
-    torch.testing.assert_close(reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted)
+    torch.testing.assert_close(evaluate(predict, reward, space, plan.parameters[None])[0], plan.predicted_return)
+    torch.testing.assert_close(plan.curve[-1], plan.predicted_return)
+    torch.testing.assert_close(reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted_return)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -170,7 +170,7 @@ def test_each_target_keeps_its_best_restart() -> None:
     many = adam(predictor(), reward, DirectActions(T, 1), starts, iterations=5)
     for start in starts:
         alone = adam(predictor(), reward, DirectActions(T, 1), start[None], iterations=5)
-        assert (many.predicted >= alone.predicted - 1e-5).all()
+        assert (many.predicted_return >= alone.predicted_return - 1e-5).all()
 
 
 def test_sampled_starts_are_the_best_of_the_candidates() -> None:
@@ -207,7 +207,7 @@ def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str
 
     plan = plan_by(planner, fragile, reward, 30)
     assert torch.isfinite(plan.curve).all()
-    assert (plan.predicted > plan.curve[0]).all()
+    assert (plan.predicted_return > plan.curve[0]).all()
     assert plan.actions.max() < 0.4
     assert plan.actions[0].max() > 0.2  # the first target needs force
 
@@ -217,7 +217,7 @@ def test_a_plan_is_a_function_of_its_arguments_and_seed(planner: str) -> None:
     seeds = [{}, {}, {"seed": 7}] if planner != "adam" else [{}, {}]
     plans = [plan_by(planner, predictor(0.2, 2), reward, 3, **seed) for seed in seeds]
     assert torch.equal(plans[0].actions, plans[1].actions)
-    assert torch.equal(plans[0].predicted, plans[1].predicted)
+    assert torch.equal(plans[0].predicted_return, plans[1].predicted_return)
     assert planner == "adam" or not torch.equal(plans[0].actions, plans[2].actions)
 
 
@@ -227,7 +227,7 @@ def test_a_plan_is_never_worse_than_the_best_of_its_starts(planner: str) -> None
     start = torch.zeros(2, B, T, 1)
     start[1] = torch.atanh(forces)[..., None]  # nothing is better
     plan = plan_by(planner, predictor(), reward, 2, start=start)
-    torch.testing.assert_close(plan.predicted, value)
+    torch.testing.assert_close(plan.predicted_return, value)
     assert plan.curve.shape == (3, B)
 
 
@@ -242,15 +242,15 @@ def test_a_plan_can_be_had_as_it_was_along_the_way(planner: str) -> None:
     predict, space = predictor(0.1, 2), DirectActions(T, 1, rms=0.5)
     plan = plan_by(planner, predict, reward, 6)
     nothing = torch.zeros(1, B, T, 1)
-    torch.testing.assert_close(stopped(plan, 0, predict, reward, space).actions, nothing[0])
+    torch.testing.assert_close(plan_at(plan, 0, predict, reward, space).actions, nothing[0])
     torch.testing.assert_close(plan.curve[0], expected_return(predict(nothing), nothing, reward)[0])
-    early, shorter = stopped(plan, 2, predict, reward, space), plan_by(planner, predict, reward, 2)
+    early, shorter = plan_at(plan, 2, predict, reward, space), plan_by(planner, predict, reward, 2)
     torch.testing.assert_close(early.actions, shorter.actions)
-    torch.testing.assert_close(early.predicted, shorter.predicted)
+    torch.testing.assert_close(early.predicted_return, shorter.predicted_return)
     torch.testing.assert_close(early.curve, shorter.curve)
-    torch.testing.assert_close(stopped(plan, 6, predict, reward, space).actions, plan.actions)
+    torch.testing.assert_close(plan_at(plan, 6, predict, reward, space).actions, plan.actions)
     with pytest.raises(ValueError, match="took 6 iterations; there is no plan as of iteration 7"):
-        stopped(plan, 7, predict, reward, space)
+        plan_at(plan, 7, predict, reward, space)
 
 
 def test_a_curve_is_nearly_done_when_it_has_95_of_100_of_its_gain() -> None:
@@ -295,13 +295,13 @@ def test_candidates_and_calls_meet_the_same_futures() -> None:
     torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 4, -1, -1, -1))
     torch.testing.assert_close(predict(actions)[:, 0], states[:, 0])
     assert (states[0] - states[1]).abs().min(dim=-1).values.max() > 0.01  # the samples themselves differ
-    other = through_model(Cart(0.3), initial_past(START, 1, 1), samples=4, seed=1)
+    other = model_predictor(Cart(0.3), initial_past(START, 1, 1), samples=4, seed=1)
     assert not torch.equal(other(actions), predict(actions))
 
 
 def test_no_samples_means_the_mode() -> None:
     actions = torch.full((2, B, T, 1), 0.3)
-    states = through_model(Cart(0.3), initial_past(START, 1, 1), samples=0)(actions)
+    states = model_predictor(Cart(0.3), initial_past(START, 1, 1), samples=0)(actions)
     torch.testing.assert_close(states, predictor(0.0)(actions))
 
 
@@ -310,10 +310,10 @@ def test_a_batch_of_candidates_and_samples_is_laid_out_as_stated() -> None:
     model = TSM(6, 2, channels=8)
     start = torch.randn(B, 6)
     actions = torch.randn(4, B, 15, 2).clamp(-1, 1)
-    states = through_model(model, initial_past(start, 10, 2), samples=0)(actions)
+    states = model_predictor(model, initial_past(start, 10, 2), samples=0)(actions)
     for c, b in itertools.product(range(4), range(B)):
         past = initial_past(start[b : b + 1], 10, 2)
-        alone = through_model(model, past, samples=0)(actions[c : c + 1, b : b + 1])
+        alone = model_predictor(model, past, samples=0)(actions[c : c + 1, b : b + 1])
         torch.testing.assert_close(states[0, c, b], alone[0, 0, 0], rtol=1e-4, atol=1e-5)
 
 
@@ -351,7 +351,7 @@ def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(prior: ActionP
 def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, planner: str) -> None:
     torch.manual_seed(0)
     model, space = TSM(6, 2, channels=8).requires_grad_(False), LatentActions(prior, 20)
-    predict = through_model(model, initial_past(torch.zeros(B, 6), 10, 2), samples=2)
+    predict = model_predictor(model, initial_past(torch.zeros(B, 6), 10, 2), samples=2)
     task = rewards.reach(torch.tensor([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0]]))
     start = torch.zeros(1, B, *space.shape)
     if planner == "adam":
@@ -360,7 +360,7 @@ def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, pla
         plan = cem(predict, task, space, B, candidates=16, elites=4, iterations=4)
     else:
         plan = mppi(predict, task, space, B, candidates=16, iterations=4)
-    assert (plan.predicted > evaluate(predict, task, space, start)[0]).all()
+    assert (plan.predicted_return > evaluate(predict, task, space, start)[0]).all()
     assert plan.actions.abs().max() <= 1
     torch.testing.assert_close(plan.actions, prior.plan(torch.zeros(B, 10, 2), plan.parameters))
 
@@ -403,14 +403,14 @@ def test_every_planner_plans_through_every_model(prior: ActionPrior, name: str, 
     model = MODELS[name](6, 2).requires_grad_(False)
     model.features.step_std.fill_(0.05)  # a tame world
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
-    predict = through_model(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=2)
+    predict = model_predictor(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=2)
     task = rewards.reach(torch.tensor([[5.0, 0.0], [0.0, 5.0], [-5.0, 0.0]]), torque_weight=0)
     settings = {"adam": {"iterations": 5, "lr": 0.1}, "cem": {"iterations": 3, "candidates": 12, "elites": 3},
                 "mppi": {"iterations": 3, "candidates": 12}}[planner]  # fmt: skip
     plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner](predict, task, space, B, **settings)  # type: ignore[operator]
     assert plan.states.shape == (2, B, 20, 6)
     assert plan.actions.abs().max() <= 1
-    assert (plan.predicted > plan.curve[0]).all()
+    assert (plan.predicted_return > plan.curve[0]).all()
 
 
 def test_a_rollout_keeps_one_member_of_the_ensemble_and_candidates_share_it() -> None:
@@ -418,7 +418,7 @@ def test_a_rollout_keeps_one_member_of_the_ensemble_and_candidates_share_it() ->
     model, n = Ensemble(6, 2, hidden=16, gaussian=False).requires_grad_(False), 40
     past = initial_past(torch.zeros(n, 6), 1, 2)
     actions = torch.full((3, n, 12, 2), 0.5)
-    states = through_model(model, past, samples=2)(actions)  # (2, 3, n, 12, 6)
+    states = model_predictor(model, past, samples=2)(actions)  # (2, 3, n, 12, 6)
     torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 2, -1, -1, -1))
     apart = (states[:, 0].flatten(0, 1)[:, None] - states[:, 0].flatten(0, 1)[None]).abs().amax((2, 3)) > 1e-3
     futures = {tuple(row) for row in (~apart).tolist()}
@@ -432,11 +432,11 @@ def test_cem_through_the_simulator_beats_doing_nothing() -> None:
     env_id = "tsm/Reacher-v0"
     env = gymnasium.make_vec(env_id, num_envs=2)
     start, _ = env.reset(seed=0)
-    predict = through_simulator(env_id, start)
+    predict = simulator_predictor(env_id, start)
     task = rewards.reach(torch.tensor([[0.1, 0.12], [0.15, -0.1]]))
     plan = cem(predict, task, DirectActions(20), 2, candidates=24, elites=4, iterations=4)
     nothing = torch.zeros(1, 2, 20, 2)
-    assert (plan.predicted > expected_return(predict(nothing), nothing, task)[0] + 0.1).all()
+    assert (plan.predicted_return > expected_return(predict(nothing), nothing, task)[0] + 0.1).all()
     env.reset(options={"states": start})
     by_hand = torch.from_numpy(env.unwrapped.rollout(plan.actions.numpy())).float()
     torch.testing.assert_close(plan.states[0], by_hand, rtol=0, atol=0)  # what it predicted is what happens
@@ -445,7 +445,7 @@ def test_cem_through_the_simulator_beats_doing_nothing() -> None:
 
 def test_candidates_in_the_simulator_do_not_mix() -> None:
     start = gymnasium.make_vec("tsm/ReacherPush-v0", num_envs=2).reset(seed=0)[0]
-    predict = through_simulator("tsm/ReacherPush-v0", start)
+    predict = simulator_predictor("tsm/ReacherPush-v0", start)
     actions = 0.2 * torch.randn(3, 2, 12, 2, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
     states = predict(actions)
     assert states.shape == (1, 3, 2, 12, 10)
@@ -460,7 +460,7 @@ def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float)
     actions = smooth_torques(30, 40, generator=torch.Generator().manual_seed(0))
     observed = env.rollout(actions[:, :20].numpy()).astype("float32")[:, -1]
     follows = torch.from_numpy(env.rollout(actions[:, 20:].numpy())).float()
-    states = through_simulator(env_id, observed)(actions[None, :, 20:])[0, 0]
+    states = simulator_predictor(env_id, observed)(actions[None, :, 20:])[0, 0]
     assert (states - follows)[..., 4:8].abs().max() < off  # metres
 
 

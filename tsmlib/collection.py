@@ -85,6 +85,6 @@ def smooth_torques(
     return torch.from_numpy((torques * (rms / settled)).clip(-1, 1).astype(np.float32))
 
 
-def once(actions: Tensor) -> Controller:
+def open_loop(actions: Tensor) -> Controller:
     """The open-loop controller that plays ``actions`` (N, T, du) from the start of an episode."""
     return lambda past: actions

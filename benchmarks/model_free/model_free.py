@@ -65,7 +65,7 @@ RECORDS = 25  # along the way, and one before
 UNITS = {"return_true": "m", "final_distance": "m", "success": "share", "seconds": "s", "cpu_seconds": "s"}
 EXTRA = ("configuration",)  # a column beside the usual ones
 
-Predict = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, du)
+Predictor = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, du)
 
 
 # The task ------------------------------------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ class Episodes:
         return observed(states, self.arms.target), rewards, self.taken == HORIZON
 
 
-def measured(task: Task, predict: Predict) -> dict[str, float]:
+def measured(task: Task, predict: Predictor) -> dict[str, float]:
     """What a policy truly earns on a task, as ``study.assess`` measures ours: means over the targets."""
     target = task.target.numpy()
 
@@ -108,7 +108,7 @@ def measured(task: Task, predict: Predict) -> dict[str, float]:
 
     done = execute(task, control)
     return {
-        "return_true": float(done.true.mean()), "final_distance": float(done.final_distance.mean()),
+        "return_true": float(done.executed_return.mean()), "final_distance": float(done.final_distance.mean()),
         "success": float((done.final_distance < TOLERANCE).float().mean()),
     }  # fmt: skip
 

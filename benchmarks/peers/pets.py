@@ -138,7 +138,7 @@ def batch_of(data: Trajectories, features: Features) -> Any:
     return TransitionBatch(before, actions, after, nothing, nothing.astype(bool), nothing.astype(bool))
 
 
-def fresh(form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH) -> tuple[Any, Any]:
+def initialise(form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH) -> tuple[Any, Any]:
     """mbrl-lib's model with new weights and the statistics of ``data``, and batches of a bootstrap for every member."""
     from mbrl.util.replay_buffer import BootstrapIterator
 
@@ -184,7 +184,7 @@ def train(
     from mbrl.util.replay_buffer import TransitionIterator
 
     torch.manual_seed(seed)
-    model, bootstraps = fresh(form, features, data, seed=seed)
+    model, bootstraps = initialise(form, features, data, seed=seed)
     parts = Parts(bootstraps, min(PART, len(bootstraps)))
     best: dict[str, Any] = {"score": None, "weights": None}
     bar = tqdm(total=round(seconds), desc=f"{study.short(data.env)} {MODELS[form]}", unit="s")

@@ -30,10 +30,10 @@ from tqdm.auto import tqdm
 from tsmlib import study
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.features import Features
-from tsmlib.planning.base import Space
+from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import adam, cem, expected_return
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.statistics import interval
@@ -75,7 +75,7 @@ def theirs(form: str, features: Features, data: Trajectories, *, batch: int) -> 
     """mbrl-lib's trainer: a batch holds ``batch`` transitions for each member, from that member's bootstrap."""
     from mbrl.models import ModelTrainer
 
-    model, batches = pets.fresh(form, features, data, seed=0, batch=batch)
+    model, batches = pets.initialise(form, features, data, seed=0, batch=batch)
     trainer = ModelTrainer(model, optim_lr=pets.LEARNING_RATE, weight_decay=pets.WEIGHT_DECAY)
 
     def run(updates: int) -> None:
@@ -238,7 +238,7 @@ class Models:
     known: Mapping[str, Any]
     prior: Any
 
-    def space(self, way: Way, horizon: int) -> Space:
+    def space(self, way: Way, horizon: int) -> SearchSpace:
         return LatentActions(self.prior, horizon) if way.prior == "codes" else DirectActions(horizon)
 
 
@@ -251,7 +251,7 @@ def planned(way: Way, task: Task, models: Models, *, seed: int = 0) -> Tensor:
     """Actions (B, T, du): by mbrl-lib one target after the other, by this package all at once."""
     space, model = models.space(way, task.horizon), models.known[way.model]
     if way.planner != "mbrl-cem":
-        predict = through_model(model, task.past(model.past_len), samples=way.samples, seed=seed)
+        predict = model_predictor(model, task.past(model.past_len), samples=way.samples, seed=seed)
         if way.planner == "adam":
             return adam(predict, task.reward, space, len(task), iterations=way.iterations).actions
         options: dict[str, Any] = dict(candidates=way.candidates, elites=max(2, way.candidates // 10), seed=seed)
@@ -267,7 +267,7 @@ def planned(way: Way, task: Task, models: Models, *, seed: int = 0) -> Tensor:
         if way.model == "pets":
             value = through_pets(models.theirs, model.unit, single, way.samples)
         else:
-            predict = through_model(model, single.past(model.past_len), samples=way.samples, seed=seed)
+            predict = model_predictor(model, single.past(model.past_len), samples=way.samples, seed=seed)
             value = partial(_value, predict, single)
         with torch.no_grad():
             best = search(lambda parameters, v=value: v(decode(parameters)), space.shape, way, seed=seed + i)
@@ -291,8 +291,8 @@ class Outcome:
     promised: Tensor
 
     @property
-    def true(self) -> np.ndarray:
-        return self.trial.true.numpy()
+    def executed_return(self) -> np.ndarray:
+        return self.trial.executed_return.numpy()
 
 
 def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, rounds: int) -> list[Outcome]:
@@ -315,7 +315,7 @@ def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, r
     results = []
     for way in ways:
         model = models.known[way.model]
-        predict = through_model(model, task.past(model.past_len), samples=PROMISE, seed=1)
+        predict = model_predictor(model, task.past(model.past_len), samples=PROMISE, seed=1)
         with torch.no_grad():
             promised = expected_return(predict(actions[way][None]), actions[way][None], task.reward)[0]
         results.append(Outcome(way, np.array(seconds[way]), execute(task, actions[way]), promised))
@@ -324,7 +324,7 @@ def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, r
 
 def as_good(subject: Outcome, others: Sequence[Outcome]) -> Outcome | None:
     """The fastest of ``others`` whose true return is, in the mean, at least that of ``subject``; None without any."""
-    good = [other for other in others if other.true.mean() >= subject.true.mean()]
+    good = [other for other in others if other.executed_return.mean() >= subject.executed_return.mean()]
     return min(good, key=lambda other: np.median(other.seconds), default=None)
 
 
@@ -335,7 +335,7 @@ def times_faster(fast: Outcome, slow: Outcome) -> np.ndarray:
 
 def compared(subject: Outcome, other: Outcome) -> tuple[float, float]:
     """True return of ``subject`` minus that of ``other``: the mean over targets, and half its 95 % t interval."""
-    return interval(subject.true - other.true)
+    return interval(subject.executed_return - other.executed_return)
 
 
 # Tables --------------------------------------------------------------------------------------------------------------
@@ -379,7 +379,7 @@ def training(
 def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
     """Print and return what every way takes, promises and earns, and how it stands to mbrl-lib's with its settings."""
     first, n, rows = found[0], len(task), []
-    idle = execute(task, zero_torques(task)).true.numpy()
+    idle = execute(task, zero_torques(task)).executed_return.numpy()
     print(
         f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; idle (no torques) earns "
         f"{idle.mean():.2f}"
@@ -390,10 +390,10 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
     )
     for outcome in found:
         way, (gain, half), ratio = outcome.way, compared(outcome, first), times_faster(outcome, first)
-        over_idle, idle_half = interval(outcome.true - idle)
+        over_idle, idle_half = interval(outcome.executed_return - idle)
         rollout = np.median(outcome.seconds) / (way.candidates * way.iterations * way.samples)
         values = {
-            "return_predicted": outcome.promised.mean().item(), "return_true": outcome.true.mean(),
+            "return_predicted": outcome.promised.mean().item(), "return_true": outcome.executed_return.mean(),
             "final_distance": outcome.trial.final_distance.mean().item(),
         }  # fmt: skip
         predicted, true, distance = values.values()
@@ -443,7 +443,7 @@ def trained(
     if path.exists():
         weights, header = artifacts.load(path, kind="peer")
         if header["made_from"] == made_from:
-            model, _ = pets.fresh(form, features, data, seed=0)  # the statistics of its inputs are not weights
+            model, _ = pets.initialise(form, features, data, seed=0)  # the statistics of its inputs are not weights
             model.load_state_dict(weights)
             return model.eval()
     model, took = pets.train(form, features, data, validation, seconds=seconds, seed=0)

@@ -34,7 +34,7 @@ def main() -> None:
     shipped = artifacts.read_header(run.shipped / study.short(arguments.env) / f"{model}.safetensors")["curves"]
     path, rows = arguments.out or run.metrics / "02_budget.csv", []
     for condition, (batches, updates) in TRIES.items():
-        net = study.fresh(run, model, data)
+        net = study.initialise(run, model, data)
         for stage in study.schedule(run, arguments.env, model)[: arguments.stages]:
             curve = fit(
                 net, getattr(net, stage.loss), data, held_out,

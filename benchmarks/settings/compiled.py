@@ -34,7 +34,7 @@ def main() -> None:
     stage = study.schedule(run, ENV, arguments.model)[-1]
     data = study.random_data(ENV, 100, seed=0)
     window = fixed_windows(data, 10, stage.future_len, stage.batch)
-    nets = [study.fresh(run, arguments.model, data) for _ in range(2)]
+    nets = [study.initialise(run, arguments.model, data) for _ in range(2)]
     with tempfile.TemporaryDirectory() as cold:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cold
         nets[1].decode = torch.compile(nets[1].decode, dynamic=False)

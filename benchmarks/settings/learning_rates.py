@@ -39,7 +39,7 @@ def main() -> None:
     rows = []
     for model in arguments.models:
         for factor in FACTORS:
-            net = study.fresh(run, model, data)
+            net = study.initialise(run, model, data)
             for stage in study.schedule(run, arguments.env, model):
                 steps = max(1, round(stage.steps * arguments.share))
                 curve = fit(

@@ -12,7 +12,7 @@ import argparse
 import torch
 
 from tsmlib import rewards, study
-from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.learning import episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.study import runs
 
@@ -31,7 +31,7 @@ def main() -> None:
     for name, (iterations, decay) in TRIES.items():
         policy = OneStepPolicy(starts.shape[1], 2, copies=3)
         policy.features.load_state_dict(model.features.state_dict())
-        curve = improve(
+        curve = learn_policy(
             policy, model, reward, episodes_from(starts), iterations=iterations, lr_decay=decay,
             record_every=iterations, measure=lambda p: study.assess(p, model, task, seed=1), progress=name,
         )  # fmt: skip

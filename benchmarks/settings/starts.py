@@ -17,10 +17,10 @@ import torch
 
 from tsmlib import rewards, study
 from tsmlib.envs.spec import sim_of
-from tsmlib.planning.base import Space
+from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.execution import execute
-from tsmlib.planning.planners import adam, reassess
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.planners import adam, reevaluate
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.storage import tables
 from tsmlib.study import parameters, runs
@@ -44,26 +44,26 @@ def main() -> None:
     posed = study.task(ENV, "validation").take(arguments.targets)
     model, prior = (study.load_or_train(run, ENV, word)[0] for word in (arguments.model, "prior"))
     held_out, train = (torch.from_numpy(study.dataset(run, ENV, split).actions) for split in ("test", "train"))
-    spaces: dict[str, Space] = {
+    spaces: dict[str, SearchSpace] = {
         "actions": DirectActions(posed.horizon), "codes": LatentActions(prior, posed.horizon)
     }  # fmt: skip
     rows = []
     for word, weight in product(spaces, arguments.weights):
         task = posed.with_reward(posed.name, rewards.reach(posed.target, torque_weight=weight))
         past, space = task.past(model.past_len), spaces[word]
-        predict, judge = (through_model(model, past, samples=s, seed=run.seed + i) for i, s in enumerate((2, 32)))
+        predict, judge = (model_predictor(model, past, samples=s, seed=run.seed + i) for i, s in enumerate((2, 32)))
         for start in STARTS[word]:
             noise = torch.randn(1, len(task), *space.shape, generator=torch.Generator().manual_seed(run.seed))
             plan = adam(predict, task.reward, space, start * noise, iterations=arguments.iterations,
                         progress=f"weight {weight:g}, {word} from {start:g}")  # fmt: skip
-            trial = execute(task, reassess(plan, judge, task.reward))
+            trial = execute(task, reevaluate(plan, judge, task.reward))
             common = dict(
                 env=ENV, sim=sim_of(ENV), task=task.name, model=arguments.model, planner="adam", prior=word,
                 horizon=task.horizon, condition="starts", seed=run.seed, scale=run.scale, start=start,
                 torque_weight=weight,
             )  # fmt: skip
             rows += action_prior_results.rows(trial.actions, held_out, train[:500], **common)
-            for metric, values in (("return_true", trial.true), ("exploitation_gap", trial.gap),
+            for metric, values in (("return_true", trial.executed_return), ("exploitation_gap", trial.gap),
                                    ("final_distance", trial.final_distance)):  # fmt: skip
                 value = float(values.mean())
                 rows.append(dict(common, metric=metric, value=value, unit="m", n=len(task)))

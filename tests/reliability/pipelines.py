@@ -172,7 +172,7 @@ for seed in range(int(sys.argv[4])):
     print("made", json.dumps({
         "data": data, "weights": artifacts.digest(net.state_dict()), "plan": artifacts.digest({"u": trial.actions}),
         "losses": [curve["train"], curve["validation"]], "validation": curve["validation"][-1],
-        "promised": trial.plan.predicted.mean().item(),
+        "promised": trial.plan.predicted_return.mean().item(),
     }))
 """
 

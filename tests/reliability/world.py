@@ -24,7 +24,7 @@ from torch import Tensor
 
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.tsm import TSM
-from tsmlib.policies.learning import episodes_from, improve
+from tsmlib.policies.learning import episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.rewards import Reward
 from tsmlib.storage import artifacts, files, manifest, tables
@@ -119,7 +119,7 @@ def learn(checkpoint: Path | None) -> str:
 
     policy, model = OneStepPolicy(3, 2, angles=(0,), hidden=8, copies=2), new_model(tiny)
     starts = episodes_from(torch.from_numpy(TRAIN.states[:, 0]))
-    curve = improve(
+    curve = learn_policy(
         policy, model, near, starts, horizon=6, episodes=4, iterations=24, record_every=4, checkpoint=checkpoint
     )
     return outcome_digest(policy, curve, checkpoint)

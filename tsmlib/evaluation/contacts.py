@@ -15,7 +15,7 @@ from torch import Tensor
 from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, closest_gap
 from tsmlib.envs.spec import has_block
 from tsmlib.evaluation.exploitation import NEAR
-from tsmlib.evaluation.futures import HORIZON, Seen
+from tsmlib.evaluation.futures import HORIZON, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
@@ -45,9 +45,9 @@ EVENTS = ("object", "wall")  # the arm touches the object, the object touches a 
 
 
 @torch.no_grad()
-def about_to_touch(
+def windows_before_contact(
     model: TSM, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0
-) -> tuple[Seen, np.ndarray]:
+) -> tuple[SampledFutures, np.ndarray]:
     """The windows of figure 9, which begin LEAD steps before the first touch of an episode, and whose they are.
 
     Column LEAD - 1 of the future holds the first state that touches. Episodes (N,) without a touch, or without room
@@ -65,13 +65,13 @@ def about_to_touch(
     window = windows(test.padded(0), torch.from_numpy(episodes), first, model.past_len, horizon)
     generator = torch.Generator().manual_seed(seed)
     drawn = [rollout(model, window.past, window.future.actions, generator=generator) for _ in range(samples)]
-    return Seen(test.env, window, torch.stack(drawn)), episodes
+    return SampledFutures(test.env, window, torch.stack(drawn)), episodes
 
 
 # What happens? -------------------------------------------------------------------------------------------------------
 
 
-def contacts(seen: Seen) -> dict[str, tuple[Tensor, Tensor]]:
+def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
     """Where contacts begin: event -> truth (N, T) and samples (S, N, T), bool.
 
     Arm and object touch where they are within 5 mm. Object and wall touch where they are, or where the speed with which
@@ -163,8 +163,8 @@ class Deflections:
         ).sum(0)
 
 
-def deflections(seen: Seen) -> Deflections:
-    """From windows of ``about_to_touch``: the way of the object until AHEAD steps after its first touch."""
+def deflections(seen: SampledFutures) -> Deflections:
+    """From windows of ``windows_before_contact``: the way of the object until AHEAD steps after its first touch."""
     start, step = seen.window.past.states[:, -1, BLOCK], LEAD - 1 + AHEAD
     ways = [states[..., [step, -1], BLOCK] - start[:, None] for states in (seen.window.future.states, seen.samples)]
     moves = [way[..., 0, :].norm(dim=-1) > 0.01 for way in ways]
@@ -175,7 +175,7 @@ def deflections(seen: Seen) -> Deflections:
     return Deflections(off[:, known], travel[known], travels[:, known])
 
 
-def touched(seen: Seen) -> Tensor:
+def touched(seen: SampledFutures) -> Tensor:
     """(N, T) bool: the arm touches the obstacle or object before or after the step; never where there is none."""
     future = seen.window.future.states
     if not has_block(seen.env):

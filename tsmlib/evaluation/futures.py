@@ -19,7 +19,7 @@ HORIZON = 30
 
 
 @dataclass(frozen=True)
-class Seen:
+class SampledFutures:
     """Windows of test episodes, and what a model predicts for them with codes from N(0, I).
 
     window: past (N, L, .) and future (N, T, .); samples (S, N, T, dx), physical units.
@@ -29,18 +29,18 @@ class Seen:
     window: Window
     samples: Tensor
 
-    def first(self, steps: int) -> Seen:
+    def first(self, steps: int) -> SampledFutures:
         """The same windows, cut after ``steps``."""
         past, future = self.window
         future = Segment(*(part[:, :steps] for part in future))
         return replace(self, window=Window(past, future), samples=self.samples[:, :, :steps])
 
 
-def look(
+def sample_futures(
     model: TSM, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
-) -> Seen:
+) -> SampledFutures:
     """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
     drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)
     episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
     begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len
-    return Seen(test.env, windows(test.padded(0), episodes, begin, model.past_len, horizon), drawn)
+    return SampledFutures(test.env, windows(test.padded(0), episodes, begin, model.past_len, horizon), drawn)

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
-from tsmlib.planning.base import Space
+from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.planners import expected_return
-from tsmlib.planning.predictors import through_model
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.trajectory import Segment
@@ -56,10 +56,10 @@ def of_return(task: Task, model: Any, prior: ActionPrior, *, seed: int = 0) -> d
     """
     net, prior = deepcopy(model).double().requires_grad_(), deepcopy(prior).double().requires_grad_()
     past = Segment(*(part.double() for part in task.past(net.past_len)))
-    predict = through_model(net, past, samples=2, seed=seed)
+    predict = model_predictor(net, past, samples=2, seed=seed)
     draw = torch.Generator().manual_seed(seed)
 
-    def errors(space: Space, parts: dict[str, list[Tensor]]) -> dict[str, float]:
+    def errors(space: SearchSpace, parts: dict[str, list[Tensor]]) -> dict[str, float]:
         point = (space.scale * space.noise(1, len(task), draw)).double().requires_grad_()
 
         def value() -> Tensor:
@@ -78,7 +78,7 @@ def _playing(net: Any) -> list[Tensor]:
     return [p for key, p in net.named_parameters() if not key.startswith("encoder")]
 
 
-def signal(task: Task, model: DynamicsModel, space: Space, *, samples: int = 32, seed: int = 0) -> Tensor:
+def signal(task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int = 32, seed: int = 0) -> Tensor:
     """Signal to noise of the gradient that a planner follows: |mean| / standard deviation over ``samples`` samples of
     the model, for each variable; of these the geometric mean, at one random point of ``space`` per start: (B,).
 
@@ -90,7 +90,7 @@ def signal(task: Task, model: DynamicsModel, space: Space, *, samples: int = 32,
     for i in range(samples):
         parameters = points.clone().requires_grad_()
         actions = space.decode(parameters)
-        states = through_model(model, past, samples=1, seed=seed + 1 + i)(actions)
+        states = model_predictor(model, past, samples=1, seed=seed + 1 + i)(actions)
         (slope,) = torch.autograd.grad(expected_return(states, actions, task.reward).sum(), parameters)
         gradients.append(slope[0].flatten(1).double())
     drawn = torch.stack(gradients)  # (S, B, variables)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.evaluation import prediction
-from tsmlib.evaluation.futures import Seen
+from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
@@ -86,7 +86,7 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
 # What does it express? -----------------------------------------------------------------------------------------------
 
 
-def deviations(seen: Seen, features: Features) -> tuple[Tensor, Tensor]:
+def deviations(seen: SampledFutures, features: Features) -> tuple[Tensor, Tensor]:
     """Variance of the samples, and squared error of their mean: (N, T) each, mean over the features that change."""
     samples = prediction.scored(features, seen.samples)
     error = samples.mean(0) - prediction.scored(features, seen.window.future.states)

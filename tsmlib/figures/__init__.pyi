@@ -39,7 +39,7 @@ from .robustness import filtering as filtering
 from .robustness import imperfect_episode as imperfect_episode
 from .rollouts import gallery as gallery
 from .rollouts import rollout_panels as rollout_panels
-from .sliders import knobs as knobs
+from .sliders import slider_panel as slider_panel
 from .style import COLOURS as COLOURS
 from .style import WIDTH as WIDTH
 from .style import colour as colour

@@ -1,14 +1,4 @@
-"""One function per figure: arrays in, a matplotlib figure out.
-
-Every function draws in the style of ``tsm.mplstyle`` and returns its ``Figure`` with nothing left open in pyplot: as
-the last line of a notebook cell it shows once, and ``save`` writes it. Here are the figures of data and of learning;
-those of predictions are in ``tsmlib.predict_figures``, of codes in ``tsmlib.latent_figures``, of plans and policies in
-``tsmlib.plan_figures`` and ``tsmlib.policy_figures``, of the action prior in ``tsmlib.prior_figures``, the diagrams of
-the paper's figures 1-3 in ``tsmlib.diagrams``, films in ``tsmlib.film``, sliders in ``tsmlib.knobs``, colours and
-labels in ``tsmlib.style``: all are reached from here.
-
-Letters in shapes: n episodes, T steps, S samples, dx state size, H and W pixels.
-"""
+"""Figures of the data and of learning: environments, torques, states, workspace coverage, loss curves (figure 4)."""
 
 from __future__ import annotations
 

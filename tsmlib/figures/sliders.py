@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ipywidgets import VBox
 
 
-def knobs(draw: Callable[..., Figure], **ranges: tuple[float, float, float]) -> VBox:
+def slider_panel(draw: Callable[..., Figure], **ranges: tuple[float, float, float]) -> VBox:
     """Sliders, name=(lowest, highest, step), above the picture ``draw(name=value, ...)``, which follows them.
 
     They start at zero, or as near to it as they go. The picture is an image: ``ipywidgets.interact`` captures output

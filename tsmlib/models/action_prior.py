@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tsmlib.models.layers import CausalDecoder, Encoder, in_blocks, kl_from_standard_normal, sample_posterior
+from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Window
 
@@ -64,7 +64,7 @@ class ActionPrior(nn.Module):
 
     def decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
         """P(U+ | U-, z): past actions (B, L, du) and codes (B, dz) -> actions (B, H, du) in [-1, 1]."""
-        return in_blocks(self._decode, past_actions, z)
+        return chunked(self._decode, past_actions, z)
 
     def _decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
         u, codes = past_actions[:, -1], self.decoder.codes(z)

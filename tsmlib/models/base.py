@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from tsmlib.models.layers import beside
+from tsmlib.models.layers import on_device_of
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Window
 
@@ -42,7 +42,7 @@ def rollout(model: DynamicsModel, past: Segment, actions: Tensor, *, generator: 
     is given may be on another device than the model; the states are where the actions are.
     """
     _require_past(model, past)
-    home, (*known, actions) = actions.device, beside(model, *past, actions)
+    home, (*known, actions) = actions.device, on_device_of(model, *past, actions)
     past, predicted = Segment(*known), []
     for segment_actions in actions.split(model.segment_len, dim=1):
         states = model.predict_segment(past.last(model.past_len), segment_actions, generator=generator)

@@ -19,13 +19,13 @@ from tsmlib.sampling import Noise, standard_normal
 BLOCK = 1024  # rows that are decoded at once on a processor
 
 
-def beside(model: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+def on_device_of(model: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
     """``tensors`` on the device of the model's weights; as they are where it has none."""
     weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
     return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
 
 
-def in_blocks(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     """``compute`` of so few rows at a time that what lies between its steps stays in a processor's cache."""
     if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
         return compute(*rows)

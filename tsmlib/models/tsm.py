@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.models.features import Features
-from tsmlib.models.layers import CausalDecoder, Encoder, in_blocks, kl_from_standard_normal, sample_posterior
+from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window
 
@@ -78,7 +78,7 @@ class TSM(nn.Module):
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z), free-running: each state is computed from the predicted one before it."""
-        return in_blocks(self._decode, *past, actions, z)
+        return chunked(self._decode, *past, actions, z)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         step = self._begin(Segment(states, before), z)

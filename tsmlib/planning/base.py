@@ -11,10 +11,10 @@ from torch import Tensor
 
 from tsmlib.rewards import Reward
 
-Predict = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
+Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
 
 
-class Space(Protocol):
+class SearchSpace(Protocol):
     """What a planner searches: parameters that decode to bounded actions."""
 
     shape: tuple[int, ...]  # of one target's parameters
@@ -28,7 +28,7 @@ class Space(Protocol):
         """Perturbations (n, n_targets, *shape) of unit variance."""
         ...
 
-    def after(self, parameters: Tensor, steps: int) -> tuple[Space, Tensor]:
+    def after(self, parameters: Tensor, steps: int) -> tuple[SearchSpace, Tensor]:
         """What is left when ``steps`` actions of a plan (B, *shape) are done: the space, and the plan in it."""
         ...
 
@@ -45,7 +45,7 @@ class Plan:
     actions: Tensor
     parameters: Tensor
     states: Tensor
-    predicted: Tensor
+    predicted_return: Tensor
     curve: Tensor
     seconds: float
     trace: Tensor | None = None
@@ -54,6 +54,6 @@ class Plan:
 class Planner(Protocol):
     """``adam``, ``cem`` or ``mppi``, with its settings bound by ``functools.partial``."""
 
-    def __call__(self, predict: Predict, reward: Reward, space: Space, start: Tensor | int, /) -> Plan:
+    def __call__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /) -> Plan:
         """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero. Never worse than it."""
         ...

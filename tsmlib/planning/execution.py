@@ -1,6 +1,6 @@
 """A task posed, planned for and executed: what a plan promised and what the arm then did (section 5.3.2, figure 6).
 
-Open loop as in the paper (``execute``), or planning again every few steps from what the arm really did (``replan``).
+Open loop as in the paper (``execute``), or planning again every few steps from what the arm really did (``mpc``).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from tsmlib import rewards
-from tsmlib.collection import Controller, collect, once
+from tsmlib.collection import Controller, collect, open_loop
 from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.models.base import DynamicsModel
-from tsmlib.planning.base import Plan, Planner, Space
-from tsmlib.planning.planners import reassess
-from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.base import Plan, Planner, SearchSpace
+from tsmlib.planning.planners import reevaluate
+from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment
@@ -40,7 +40,7 @@ class Trial:
 
     actions: Tensor
     states: Tensor
-    true: Tensor
+    executed_return: Tensor
     final_distance: Tensor
     plan: Plan | None = None
     observed: Tensor | None = None
@@ -50,7 +50,7 @@ class Trial:
         """Exploitation gap (B,): predicted minus true return."""
         if self.plan is None:
             raise ValueError("these actions were not planned, so nothing was predicted for them")
-        return self.plan.predicted - self.true
+        return self.plan.predicted_return - self.executed_return
 
 
 def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
@@ -61,7 +61,7 @@ def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
     actions = plan.actions if isinstance(plan, Plan) else plan
     env = gymnasium.make_vec(task.env, num_envs=len(task))
     if isinstance(actions, Tensor):
-        seen = collect(env, once(actions), horizon=actions.shape[1], seed=SENSORS, states=task.start)
+        seen = collect(env, open_loop(actions), horizon=actions.shape[1], seed=SENSORS, states=task.start)
     else:
         seen = collect(env, actions, horizon=task.horizon, seed=SENSORS, states=task.start)
         actions = torch.from_numpy(seen.actions)
@@ -69,10 +69,10 @@ def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
     return _measured(task, env, seen.states, actions, plan if isinstance(plan, Plan) else None)
 
 
-def replan(
+def mpc(
     task: Task,
     model: DynamicsModel | None,
-    space: Space,
+    space: SearchSpace,
     planner: Planner,
     *,
     every: int = 10,  # steps executed before the next plan
@@ -109,13 +109,13 @@ def replan(
         total = _whole_episode(task.reward, so_far)
         recent = past.last(past_len)
         if model is None:
-            predict = judge = through_simulator(task.env, recent.states[:, -1].numpy())
+            predict = judge = simulator_predictor(task.env, recent.states[:, -1].numpy())
         else:
-            predict = through_model(model, recent, samples=samples, seed=seed + 2 * done)
-            judge = through_model(model, recent, samples=32, seed=seed + 2 * done + 1)
+            predict = model_predictor(model, recent, samples=samples, seed=seed + 2 * done)
+            judge = model_predictor(model, recent, samples=32, seed=seed + 2 * done + 1)
         made = plan if plan is not None and not done else planner(predict, total, space, start)
-        promised = reassess(made, judge, total)
-        promises.append(promised.predicted)
+        promised = reevaluate(made, judge, total)
+        promises.append(promised.predicted_return)
         dreamt.append(promised.states[:1, :, :every])
         steps = min(every, horizon - done)
         if done + steps < horizon:
@@ -131,7 +131,7 @@ def replan(
     bar.close()
     actions = torch.from_numpy(seen.actions)
     made = Plan(
-        actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted=promises[0],
+        actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted_return=promises[0],
         curve=torch.stack(promises), seconds=time.perf_counter() - began,
     )  # fmt: skip
     return _measured(task, env, seen.states, actions, made)
@@ -162,7 +162,7 @@ def _measured(task: Task, env: VectorEnv, seen: np.ndarray, actions: Tensor, pla
     return Trial(
         actions=actions,
         states=states,
-        true=rewarded(task.reward, states[:, 1:], actions).sum(-1),
+        executed_return=rewarded(task.reward, states[:, 1:], actions).sum(-1),
         final_distance=rewards.final_distance(states, task.target, task.position),
         plan=plan,
         observed=None if states is observed else observed,

@@ -2,8 +2,8 @@
 
     max over p of E[ sum_t r(x_t, u_t) ],   u = space.decode(p),   x ~ predict(u)
 
-What is optimised over is a ``Space``: DirectActions (Eq. 2) or LatentActions (Eq. 3). What predicts is a function
-from actions to states: ``through_model`` or ``through_simulator``. A ``Planner`` is ``adam``, as the paper plans,
+What is optimised over is a ``SearchSpace``: DirectActions (Eq. 2) or LatentActions (Eq. 3). What predicts is a function
+from actions to states: ``model_predictor`` or ``simulator_predictor``. A ``Planner`` is ``adam``, as the paper plans,
 which needs a differentiable prediction, or ``cem`` or ``mppi``, which sample and take any prediction, so that the
 oracle is the same planner with the true simulator as its model. All three have one signature.
 
@@ -20,15 +20,15 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib.planning.base import Plan, Predict, Space
+from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.rewards import Reward, rewarded
 
 
 @torch.enable_grad()  # see train.fit
 def adam(
-    predict: Predict,
+    predict: Predictor,
     reward: Reward,
-    space: Space,
+    space: SearchSpace,
     start: Tensor | int,
     *,
     iterations: int = 100,  # section 4.2
@@ -85,9 +85,9 @@ def _check_gradient(states: Tensor, returns: Tensor) -> None:
 
 
 def cem(
-    predict: Predict,
+    predict: Predictor,
     reward: Reward,
-    space: Space,
+    space: SearchSpace,
     start: Tensor | int,
     *,
     candidates: int = 256,
@@ -116,9 +116,9 @@ def cem(
 
 
 def mppi(
-    predict: Predict,
+    predict: Predictor,
     reward: Reward,
-    space: Space,
+    space: SearchSpace,
     start: Tensor | int,
     *,
     candidates: int = 256,
@@ -153,7 +153,7 @@ Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 @torch.no_grad()
 def _sample(
-    predict: Predict, reward: Reward, space: Space, start: Tensor | int, refit: Refit,
+    predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, refit: Refit,
     candidates: int, iterations: int, seed: int, progress: str,
 ) -> Plan:  # fmt: skip
     """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
@@ -178,7 +178,7 @@ def _sample(
     return best.plan(predict, reward, space, time.perf_counter() - began)
 
 
-def _parameters(start: Tensor | int, space: Space) -> Tensor:
+def _parameters(start: Tensor | int, space: SearchSpace) -> Tensor:
     """``start`` as parameters (C, B, *shape)."""
     if isinstance(start, int):
         return torch.zeros(1, start, *space.shape)
@@ -193,21 +193,21 @@ def _like(values: Tensor, parameters: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def reassess(plan: Plan, predict: Predict, reward: Reward) -> Plan:
+def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
     """The same plan with ``predicted`` and ``states`` from fresh samples.
 
     A planner picks what does best under the few samples that it plans with; what the model promises is the
     expectation, and needs samples that had no part in the choice.
     """
     states = predict(plan.actions[None])
-    return replace(plan, states=states[:, 0], predicted=expected_return(states, plan.actions[None], reward)[0])
+    return replace(plan, states=states[:, 0], predicted_return=expected_return(states, plan.actions[None], reward)[0])
 
 
 @torch.no_grad()
-def stopped(plan: Plan, iteration: int, predict: Predict, reward: Reward, space: Space) -> Plan:
+def plan_at(plan: Plan, iteration: int, predict: Predictor, reward: Reward, space: SearchSpace) -> Plan:
     """The plan as it was after ``iteration`` steps of its planner (0: its start), to see what more of them earned.
 
-    ``predicted`` and ``states`` come from ``predict``: as in ``reassess``, give it samples of its own.
+    ``predicted`` and ``states`` come from ``predict``: as in ``reevaluate``, give it samples of its own.
     """
     if plan.trace is None or not 0 <= iteration < len(plan.trace):
         steps = "kept no trace" if plan.trace is None else f"took {len(plan.trace) - 1} iterations"
@@ -217,7 +217,7 @@ def stopped(plan: Plan, iteration: int, predict: Predict, reward: Reward, space:
         plan, parameters=parameters, actions=space.decode(parameters[None])[0],
         curve=plan.curve[: iteration + 1], trace=plan.trace[: iteration + 1],
     )  # fmt: skip
-    return reassess(found, predict, reward)
+    return reevaluate(found, predict, reward)
 
 
 def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
@@ -230,9 +230,9 @@ def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
 
 @torch.no_grad()
 def sampled_starts(
-    predict: Predict,
+    predict: Predictor,
     reward: Reward,
-    space: Space,
+    space: SearchSpace,
     n_targets: int,
     *,
     candidates: int = 256,
@@ -256,7 +256,7 @@ def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
 
 
 @torch.no_grad()
-def evaluate(predict: Predict, reward: Reward, space: Space, parameters: Tensor, *, rows: int = 1600) -> Tensor:
+def evaluate(predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor, *, rows: int = 1600) -> Tensor:
     """Expected return (C, B) of parameters (C, B, *shape), about ``rows`` at a time, which fit in a cache."""
     returns = []
     for chunk in parameters.split(max(1, rows // parameters.shape[1])):
@@ -290,14 +290,14 @@ class _Best:
         self.trace.append(self.parameters)
 
     @torch.no_grad()
-    def plan(self, predict: Predict, reward: Reward, space: Space, seconds: float) -> Plan:
+    def plan(self, predict: Predictor, reward: Reward, space: SearchSpace, seconds: float) -> Plan:
         actions = space.decode(self.parameters[None])
         states = predict(actions)
         return Plan(
             actions=actions[0],
             parameters=self.parameters,
             states=states[:, 0],
-            predicted=expected_return(states, actions, reward)[0],
+            predicted_return=expected_return(states, actions, reward)[0],
             curve=torch.stack(self.curve),
             seconds=seconds,
             trace=torch.stack(self.trace),

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.collection import collect, once
+from tsmlib.collection import collect, open_loop
 from tsmlib.models.base import DynamicsModel, rollout
-from tsmlib.planning.base import Predict
+from tsmlib.planning.base import Predictor
 from tsmlib.sampling import SharedNoise
 from tsmlib.trajectory import Segment
 
 
-def through_model(model: DynamicsModel, past: Segment, *, samples: int = 1, seed: int = 0) -> Predict:
+def model_predictor(model: DynamicsModel, past: Segment, *, samples: int = 1, seed: int = 0) -> Predictor:
     """Predict by rolling out ``model`` from ``past`` (B, L, .), with the same noise for every candidate and call.
 
     samples: S model samples per candidate; 0 rolls out the mode (z = 0) instead.
@@ -34,7 +34,7 @@ def through_model(model: DynamicsModel, past: Segment, *, samples: int = 1, seed
     return predict
 
 
-def through_simulator(env_id: str, start: np.ndarray) -> Predict:
+def simulator_predictor(env_id: str, start: np.ndarray) -> Predictor:
     """Predict by executing in the true simulator, in bulk, from ``start`` (B, dx): S = 1. Not differentiable.
 
     Any state can be a start, also one in the middle of an episode. In MuJoCo what follows is what would have followed,
@@ -45,7 +45,7 @@ def through_simulator(env_id: str, start: np.ndarray) -> Predict:
     def predict(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
         env = make(num_envs=n * n_targets)
-        seen = collect(env, once(actions.flatten(0, 1)), horizon=horizon, states=np.tile(start, (n, 1)))
+        seen = collect(env, open_loop(actions.flatten(0, 1)), horizon=horizon, states=np.tile(start, (n, 1)))
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
 
     return predict

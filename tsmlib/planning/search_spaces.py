@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.layers import beside
+from tsmlib.models.layers import on_device_of
 
 
 class DirectActions:
@@ -72,14 +72,14 @@ class LatentActions:
         rest = actions[:, steps : steps + space.shape[0] * prior.segment_len]
         missing = space.shape[0] * prior.segment_len - rest.shape[1]
         rest = torch.cat([rest, rest[:, -1:].expand(-1, missing, -1)], dim=1)
-        codes, _ = prior.encode(*beside(prior, rest.reshape(-1, prior.segment_len, rest.shape[2])))
+        codes, _ = prior.encode(*on_device_of(prior, rest.reshape(-1, prior.segment_len, rest.shape[2])))
         return space, codes.to(parameters.device).unflatten(0, (len(rest), -1))
 
     def _whole(self, parameters: Tensor) -> Tensor:
         """Actions (C, B, K H, du)."""
         n, n_targets = parameters.shape[:2]
         start = self._before(n_targets).repeat(n, 1, 1)
-        actions = self.prior.plan(*beside(self.prior, start, parameters.flatten(0, 1)))
+        actions = self.prior.plan(*on_device_of(self.prior, start, parameters.flatten(0, 1)))
         return actions.to(parameters.device).unflatten(0, (n, n_targets))
 
     def _before(self, n_targets: int) -> Tensor:

@@ -30,13 +30,13 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from tsmlib.models.base import DynamicsModel, stepper
-from tsmlib.models.layers import beside
+from tsmlib.models.layers import on_device_of
 from tsmlib.policies.networks import Policy
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import only_writer
-from tsmlib.training.checkpoint import Progress, TrainingStopped
+from tsmlib.training.checkpoint import TrainingState, TrainingStopped
 from tsmlib.trajectory import Segment, initial_past
 
 # The latest state x_t (R, dx), the action u_{t-1} (R, du) that led to it, noise (R, output_dim) -> u_t (R, du)
@@ -61,7 +61,7 @@ def imagine(
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
-    home, (start, target) = start.device, beside(policy, start, target)
+    home, (start, target) = start.device, on_device_of(policy, start, target)
     past = initial_past(start, max(policy.past_len, model.past_len), policy.action_dim)
     drawn: Sequence[Tensor | None] = [None] * horizon
     if generator is not None:
@@ -79,7 +79,7 @@ def imagine(
 
 @dataclass
 class LearningCurve:
-    """What ``improve`` recorded: updates done, processor seconds, and one number per copy for each of the rest.
+    """What ``learn_policy`` recorded: updates done, processor seconds, and one number per copy for each of the rest.
 
     predicted: undiscounted return that the model promises, mean over 50 episodes that are the same at every record;
     measured: whatever ``measure`` returned, such as the true return in the environment. resumed: as in a Curve.
@@ -93,7 +93,7 @@ class LearningCurve:
 
 
 @torch.enable_grad()  # see train.fit
-def improve(
+def learn_policy(
     policy: Any,
     model: DynamicsModel,
     reward: Callable[[Tensor], Reward],
@@ -131,7 +131,7 @@ def improve(
         )
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(trained, lr=lr)
-    state = Progress(policy, optimizer, LearningCurve())
+    state = TrainingState(policy, optimizer, LearningCurve())
     identity = dict(
         policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
         reward=getattr(reward, "__name__", "reward"), horizon=horizon, gamma=gamma, noise=noise,
@@ -242,7 +242,7 @@ def _checked(rewards: Tensor, seen: Segment) -> Tensor:
     return rewards
 
 
-def _stopped(state: Progress, what: str, iteration: int, iterations: int) -> TrainingStopped:
+def _stopped(state: TrainingState, what: str, iteration: int, iterations: int) -> TrainingStopped:
     """Go back to the weights of the last record; the error to raise."""
     state.restore_best()
     return TrainingStopped(

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from tsmlib.collection import Controller
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.features import Features
-from tsmlib.models.layers import beside
+from tsmlib.models.layers import on_device_of
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment
 
@@ -27,7 +27,7 @@ Act = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 class Policy(Protocol):
-    """What ``improve`` trains: M copies of pi(. | past, target), asked one step at a time."""
+    """What ``learn_policy`` trains: M copies of pi(. | past, target), asked one step at a time."""
 
     copies: int
     past_len: int
@@ -41,7 +41,7 @@ class Policy(Protocol):
     def parameters(self) -> Iterator[nn.Parameter]: ...
 
 
-class Stacked(nn.Module):
+class BatchedLinear(nn.Module):
     """M linear layers side by side: (M, B, in) -> (M, B, out). Drawn as torch draws one linear layer."""
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
@@ -90,7 +90,7 @@ class OneStepPolicy(nn.Module):
         self.action_dim = self.output_dim = action_dim
         self.features = Features(state_dim, tuple(angles))
         widths = [self.features.dim + target_dim, *[hidden] * layers, action_dim]
-        self.net = nn.ModuleList(Stacked(i, o, generators) for i, o in pairwise(widths))
+        self.net = nn.ModuleList(BatchedLinear(i, o, generators) for i, o in pairwise(widths))
         with torch.no_grad():
             for parameter in self.net[-1].parameters():
                 parameter.mul_(0.1)
@@ -152,11 +152,13 @@ class SegmentPolicy(nn.Module):
         self.dilations = tuple(dilations)
         self.past_len = max(1 + sum(dilations), self.prior.past_len)
         self.features = Features(state_dim, tuple(angles))
-        self.inlet = Stacked(self.features.dim + self.action_dim, channels, generators)
-        self.taps = nn.ModuleList(Stacked(2 * channels, 2 * channels, generators) for _ in dilations)  # W_f, W_g
-        self.outs = nn.ModuleList(Stacked(channels, 2 * channels, generators) for _ in dilations)  # residual, skip
-        self.goals = Stacked(target_dim, 2 * channels * len(dilations), generators)  # V_f, V_g of every layer
-        self.head = Stacked(channels, self.output_dim, generators)
+        self.inlet = BatchedLinear(self.features.dim + self.action_dim, channels, generators)
+        self.taps = nn.ModuleList(BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations)  # W_f, W_g
+        self.outs = nn.ModuleList(
+            BatchedLinear(channels, 2 * channels, generators) for _ in dilations
+        )  # residual, skip
+        self.goals = BatchedLinear(target_dim, 2 * channels * len(dilations), generators)  # V_f, V_g of every layer
+        self.head = BatchedLinear(channels, self.output_dim, generators)
 
     def config(self) -> dict[str, Any]:
         """The constructor's arguments, as they travel with the weights."""
@@ -200,7 +202,7 @@ def controller(policy: Policy, target: Tensor, *, noise: float = 0.0, generator:
     """
 
     def control(past: Segment) -> Tensor:
-        states, actions, goal = beside(policy, *past, target)
+        states, actions, goal = on_device_of(policy, *past, target)
         shape = (len(goal), policy.output_dim)
         drawn = None if generator is None else noise * standard_normal(shape, generator, goal)
         with torch.no_grad():

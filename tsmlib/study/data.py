@@ -9,7 +9,7 @@ import gymnasium
 import torch
 
 import tsmlib.envs
-from tsmlib.collection import collect, once, smooth_torques
+from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs.spec import has_block
 from tsmlib.storage import artifacts
 from tsmlib.study.parameters import ParameterError
@@ -25,7 +25,7 @@ def short(env: str) -> str:
     return env.partition("/")[2].removesuffix("-v0")
 
 
-def chosen(parameter: str, text: str, known: Sequence[str]) -> list[str]:
+def parse_choice(parameter: str, text: str, known: Sequence[str]) -> list[str]:
     """The value of a notebook parameter that names one of ``known``, several with commas between, or all."""
     names = list(known) if text == "all" else [word.strip() for word in text.split(",")]
     if unknown := [word for word in names if word not in known]:
@@ -59,7 +59,7 @@ def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajector
     """``n`` episodes of smooth random torques, a function of (env, n, seed) alone."""
     copies = gymnasium.make_vec(env, num_envs=n)
     torques = smooth_torques(n, horizon, generator=torch.Generator().manual_seed(seed))
-    data = collect(copies, once(torques), horizon=horizon, seed=seed)
+    data = collect(copies, open_loop(torques), horizon=horizon, seed=seed)
     copies.close()
     return data
 

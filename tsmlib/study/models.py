@@ -20,7 +20,7 @@ from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage import files as files_storage
 from tsmlib.study.data import dataset, fingerprint, short
-from tsmlib.study.parallel import ahead
+from tsmlib.study.parallel import precompute
 from tsmlib.study.runs import Run
 from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
@@ -116,11 +116,11 @@ def load_or_train(run: Run, env: str, model: str) -> tuple[Any, dict[str, Any]]:
     return train(run, env, model, own)
 
 
-def train_ahead(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
-    """``ahead`` for models: each (env, model) that is wanted, once, the longest trainings first."""
+def precompute_models(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
+    """``precompute`` for models: each (env, model) that is wanted, once, the longest trainings first."""
     pairs = list(dict.fromkeys((_trained_on(env, model), model) for env, model in wanted))
     pairs.sort(key=lambda pair: -BUDGET[short(imperfections(pair[0])[0])])
-    ahead(run, [(load_or_train, *pair) for pair in pairs], progress="models")
+    precompute(run, [(load_or_train, *pair) for pair in pairs], progress="models")
 
 
 def _trained_on(env: str, model: str) -> str:
@@ -134,7 +134,7 @@ def train(run: Run, env: str, model: str, path: Path) -> tuple[Any, dict[str, An
     """Train ``model`` by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
     print(f"{env}: no trained {model} at scale {run.scale}; training it now")
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
-    net = fresh(run, model, data)
+    net = initialise(run, model, data)
     curves = {}
     for stage in schedule(run, env, model):
         checkpoint = path.with_name(f"{model}-{stage.loss}.checkpoint")
@@ -176,7 +176,7 @@ def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
     return {Path(os.path.relpath(file, path.parent)).as_posix(): manifest.sha256(file) for file in files}
 
 
-def fresh(run: Run, model: str, data: Trajectories) -> Any:
+def initialise(run: Run, model: str, data: Trajectories) -> Any:
     """The model as training starts: new weights, and the statistics of the training data."""
     with torch.random.fork_rng(devices=[]):  # torch layers draw their weights from the global generator
         torch.manual_seed(run.seed)

@@ -21,11 +21,11 @@ from tqdm.auto import tqdm
 from tsmlib.study.runs import Run, RunError
 
 
-def ahead(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
+def precompute(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
     """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
 
     make: a function of ``study`` that keeps what it makes in the run's folder, such as ``plan``, where the notebook
-    then finds it. Calls must not need each other's results: models first (``train_ahead``), then what is made with
+    then finds it. Calls must not need each other's results: models first (``precompute_models``), then what uses
     them. At scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error, or an
     interrupt, ends it when the calls under way have ended; what they made is kept. Raises RunError where a worker died.
     """

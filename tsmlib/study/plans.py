@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from tsmlib.planning.base import Plan, Planner, Predict, Space
-from tsmlib.planning.execution import Trial, execute, replan
-from tsmlib.planning.planners import adam, cem, mppi, reassess, sampled_starts, stopped
-from tsmlib.planning.predictors import through_model, through_simulator
+from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
+from tsmlib.planning.execution import Trial, execute, mpc
+from tsmlib.planning.planners import adam, cem, mppi, plan_at, reevaluate, sampled_starts
+from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import artifacts
@@ -34,7 +34,7 @@ def trial(run: Run, task: Task, model: str, planner: str, prior: str, *, iterati
     model: any of DYNAMICS, or oracle (the true simulator), or none. planner: adam (from zero, as the paper),
     adam+starts (from the best of sampled candidates), cem, mppi; with model none: random or zero torques. prior: codes
     (Eq. 3) or actions (Eq. 2). iterations: of the planner; 0 means the scale's default. every: 0 executes open loop, as
-    the paper; else the arm stops after as many steps to plan again (``control.replan``), beginning with that plan.
+    the paper; else the arm stops after as many steps to plan again (``control.mpc``), beginning with that plan.
     """
     if model == "none":
         return execute(task, {"random": random_torques, "zero": zero_torques}[planner](task))
@@ -84,7 +84,7 @@ def plan(run: Run, task: Task, model: str, planner: str, prior: str, *, iteratio
     if task.own is None:
         arrays: dict[str, Any] = {
             "start": task.start, "target": task.target, "actions": found.actions, "parameters": found.parameters,
-            "states": found.states, "predicted": found.predicted, "curve": found.curve,
+            "states": found.states, "predicted": found.predicted_return, "curve": found.curve,
         } | ({} if found.trace is None else {"trace": found.trace})  # fmt: skip
         artifacts.save(
             own, arrays, kind="plan", header={"made_from": made_from, "seconds": found.seconds, "device": run.device}
@@ -99,7 +99,7 @@ def along_the_way(
     whole = plan(run, task, model, planner, prior, iterations=iterations)
     nets = {word: load_or_train(run, task.env, word)[0].to(run.device) for word in ("prior", model)}
     space, judge = _space(task, nets if prior == "codes" else {}), _judge(run, task, nets[model])
-    return {i: execute(task, stopped(whole, i, judge, task.reward, space)) for i in at}
+    return {i: execute(task, plan_at(whole, i, judge, task.reward, space)) for i in at}
 
 
 def _budget(run: Run, planner: str, iterations: int, every: int) -> tuple[int, int]:
@@ -121,7 +121,7 @@ def _planner(word: str, candidates: int, iterations: int, seed: int, bar: str = 
     return partial(adam, **options)
 
 
-def _space(task: Task, nets: dict[str, Any]) -> Space:
+def _space(task: Task, nets: dict[str, Any]) -> SearchSpace:
     return LatentActions(nets["prior"], task.horizon) if "prior" in nets else DirectActions(task.horizon)
 
 
@@ -130,8 +130,8 @@ def _samples(model: Any, n: int = 2) -> int:
     return n if getattr(model, "stochastic", True) else 1
 
 
-def _judge(run: Run, task: Task, model: Any) -> Predict:
-    return through_model(model, task.past(model.past_len), samples=_samples(model, 32), seed=run.seed + 1)
+def _judge(run: Run, task: Task, model: Any) -> Predictor:
+    return model_predictor(model, task.past(model.past_len), samples=_samples(model, 32), seed=run.seed + 1)
 
 
 def _search(
@@ -140,23 +140,23 @@ def _search(
     began = time.perf_counter()
     space, model = _space(task, nets), nets.get("model")
     if model is not None:
-        predict = through_model(model, task.past(model.past_len), samples=_samples(model), seed=run.seed)
+        predict = model_predictor(model, task.past(model.past_len), samples=_samples(model), seed=run.seed)
     else:
-        predict = through_simulator(task.env, task.start)
+        predict = simulator_predictor(task.env, task.start)
     start = torch.zeros(1, len(task), *space.shape)
     if planner == "adam+starts":
         start = sampled_starts(predict, task.reward, space, len(task), candidates=candidates, keep=2, seed=run.seed)
     found = _planner(planner, candidates, iterations, run.seed, bar)(predict, task.reward, space, start)
     found = replace(found, seconds=time.perf_counter() - began)
-    return found if model is None else reassess(found, _judge(run, task, model), task.reward)
+    return found if model is None else reevaluate(found, _judge(run, task, model), task.reward)
 
 
 def _closed_loop(
     run: Run, task: Task, planner: Planner, nets: dict[str, Any], every: int, first: Plan, bar: str
 ) -> Plan:
-    """``control.replan`` from the kept plan on; seconds of both."""
+    """``control.mpc`` from the kept plan on; seconds of both."""
     model = nets.get("model")
-    done = replan(
+    done = mpc(
         task, model, _space(task, nets), planner, every=every, plan=first,
         samples=_samples(model), seed=run.seed, progress=bar,
     ).plan  # fmt: skip
@@ -176,6 +176,6 @@ def _kept(path: Path, task: Task, wanted: dict[str, Any]) -> Plan | None:
         return None
     return Plan(
         actions=tensors["actions"][:n], parameters=tensors["parameters"][:n], states=tensors["states"][:, :n],
-        predicted=tensors["predicted"][:n], curve=tensors["curve"][:, :n], seconds=header["seconds"],
+        predicted_return=tensors["predicted"][:n], curve=tensors["curve"][:, :n], seconds=header["seconds"],
         trace=tensors["trace"][:, :n] if "trace" in tensors else None,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from tsmlib import rewards
 from tsmlib.evaluation.actions import within
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import TOLERANCE, Task
-from tsmlib.policies.learning import episodes_from, imagine, improve
+from tsmlib.policies.learning import episodes_from, imagine, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.storage import artifacts
 from tsmlib.study.data import dataset, fingerprint, short
@@ -63,7 +63,7 @@ def learn(
         policy = OneStepPolicy(data.states.shape[2], data.actions.shape[2], **options)
     policy.features.fit(torch.from_numpy(data.states))
     checkpoint = own.with_name(f"policy-{model}-{prior}.checkpoint")
-    curve = improve(
+    curve = learn_policy(
         policy.to(run.device), net.to(run.device), rewards.reach if task.name == "reach" else rewards.push,
         episodes_from(torch.from_numpy(data.states[:, 0])), horizon=task.horizon, iterations=budget["iterations"],
         episodes=EPISODES[run.scale], seed=1000 * run.seed,
@@ -81,7 +81,7 @@ def learn(
     return policy, artifacts.read_header(own)
 
 
-def kept_budget(run: Run, task: Task, model: str, prior: str) -> dict[str, int] | None:
+def stored_budget(run: Run, task: Task, model: str, prior: str) -> dict[str, int] | None:
     """Copies and iterations of the policy that the run's folder holds, for ``learn`` to find it again; else None."""
     path = _path(run, task, model, prior)
     return dict(artifacts.read_header(path)["budget"]) if path.exists() else None
@@ -109,7 +109,8 @@ def assess(policy: Any, model: Any, task: Task, *, seed: int) -> dict[str, torch
     start, draw = torch.from_numpy(many.start).float(), torch.Generator().manual_seed(seed)
     promised = many.reward(*imagine(policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw))
     found = {
-        "return_true": done.true, "return_predicted": promised.sum(-1), "final_distance": done.final_distance,
+        "return_true": done.executed_return, "return_predicted": promised.sum(-1),
+        "final_distance": done.final_distance,
         "success": (done.final_distance < TOLERANCE).float(),
     }  # fmt: skip
     return {name: values.unflatten(0, (policy.copies, -1)).mean(1) for name, values in found.items()}

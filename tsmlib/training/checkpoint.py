@@ -29,7 +29,7 @@ class TrainingStopped(RuntimeError):
 
 
 @dataclass
-class Curve:
+class TrainingHistory:
     """What a fit recorded at each validation: optimiser step, processor seconds, training and validation
     loss.
 
@@ -44,13 +44,13 @@ class Curve:
     resumed: list[str] = field(default_factory=list)
 
 
-class Progress:
+class TrainingState:
     """All that a run needs to continue: weights, Adam's moments, the step, the best weights and the curve so far."""
 
     def __init__(self, model: nn.Module, optimizer: torch.optim.Optimizer, curve: Any = None) -> None:
         self.model, self.optimizer = model, optimizer
         self.step, self.seconds = 0, 0.0
-        self.curve: Any = Curve() if curve is None else curve  # a dataclass of lists, with resumed
+        self.curve: Any = TrainingHistory() if curve is None else curve  # a dataclass of lists, with resumed
         self.best, self.best_step, self.best_loss = _copy(model.state_dict()), 0, math.inf
 
     def record(self, train: float, validation: float) -> None:

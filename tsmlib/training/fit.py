@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import only_writer
-from tsmlib.training.checkpoint import Curve, Progress
+from tsmlib.training.checkpoint import TrainingHistory, TrainingState
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
@@ -43,7 +43,7 @@ def fit(
     device: str = "cpu",  # where it is trained, such as "cuda"; the model comes back to the processor
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
-) -> Curve:
+) -> TrainingHistory:
     """Minimise ``loss`` over random windows with Adam; leave the weights with the best validation loss in ``model``.
 
     Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint``, a folder, continues
@@ -67,7 +67,7 @@ def fit(
     with contextlib.ExitStack() as stack:
         stack.callback(model.to, "cpu")
         optimizer = torch.optim.Adam(model.to(device).parameters(), lr=lr, fused=True)
-        state = Progress(model, optimizer)
+        state = TrainingState(model, optimizer)
         torch.set_autocast_enabled(kind, False)  # or this on
         stack.callback(torch.set_autocast_enabled, kind, False)
         if checkpoint is not None:

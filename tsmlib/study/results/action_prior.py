@@ -58,7 +58,7 @@ def cost_of_prior(
     """
     start = torch.from_numpy(task.start)[:, task.position].float()
     values = {
-        "lost": over_actions.true - over_codes.true,
+        "lost": over_actions.executed_return - over_codes.executed_return,
         "further": over_codes.final_distance - over_actions.final_distance,
         "peak": over_actions.actions.abs().amax((1, 2)),
         "novelty": novelty(over_actions.actions, train),
@@ -68,7 +68,7 @@ def cost_of_prior(
     common = dict(common, env=task.env, sim=sim_of(task.env), task=task.name, n=len(task))
     summary = {
         "lost": (float(values["lost"].mean()), "m"),
-        "lost_share": (float(values["lost"].mean() / over_actions.true.mean().abs()), "share"),
+        "lost_share": (float(values["lost"].mean() / over_actions.executed_return.mean().abs()), "share"),
         "further": (float(values["further"].mean()), "m"),
         "outside": (float((values["novelty"] > usual).float().mean()), "share"),
         "lost_with_distance": (spearman(values["lost"], values["distance"]), ""),

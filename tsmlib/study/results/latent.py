@@ -11,7 +11,7 @@ import torch
 
 from tsmlib.envs.spec import has_block, sim_of, task_of
 from tsmlib.evaluation.contacts import EVENTS, Deflections, contacts, recall, touched
-from tsmlib.evaluation.futures import HORIZON, STARTS, Seen
+from tsmlib.evaluation.futures import HORIZON, STARTS, SampledFutures
 from tsmlib.evaluation.latent import (
     active_units,
     deviations,
@@ -39,7 +39,7 @@ Rows = Sequence[Mapping[str, Any]]
 # Rows of metrics/04_latent.csv ---------------------------------------------------------------------------------------
 
 
-def code_rows(model: TSM, seen: Seen, generator: torch.Generator, /, **common: Any) -> list[dict[str, Any]]:
+def code_rows(model: TSM, seen: SampledFutures, generator: torch.Generator, /, **common: Any) -> list[dict[str, Any]]:
     """Use of the code and spread of the next segment. common: model, seed, scale. The encoder's part for tsm alone:
     the energy score trains a decoder without it."""
     seen = seen.first(model.segment_len)
@@ -99,7 +99,7 @@ def code_rows(model: TSM, seen: Seen, generator: torch.Generator, /, **common: A
     return rows
 
 
-def contact_rows(seen: Seen, **common: Any) -> list[dict[str, Any]]:
+def contact_rows(seen: SampledFutures, **common: Any) -> list[dict[str, Any]]:
     """Recall and precision of contacts: of all within the horizon, and by how far ahead they lie (column horizon: the
     last step of a stretch of ten)."""
     common = dict(common, env=seen.env, sim=sim_of(seen.env), planner="none")

@@ -43,9 +43,9 @@ Number = tuple[float, str]  # value and unit
 
 def numbers(task: Task, trial: Trial, condition: str = OPEN) -> dict[str, tuple[Tensor, str]]:
     """What a trial measured for each target: metric -> values (B,) and unit. For ``broken`` see ``invariants``."""
-    found = {"return_true": (trial.true, "m"), "final_distance": (trial.final_distance, "m")}
+    found = {"return_true": (trial.executed_return, "m"), "final_distance": (trial.final_distance, "m")}
     if trial.plan is not None:
-        found["return_predicted"] = (trial.plan.predicted, "m")
+        found["return_predicted"] = (trial.plan.predicted_return, "m")
         if task_of(task.env) == "push" and condition != CLOSED:  # there, every plan dreams from another start
             broken = shares(task.start, trial.plan.states.numpy(), task.env)
             found |= {name: (torch.from_numpy(share), "share") for name, share in broken.items()}
@@ -64,14 +64,16 @@ def means(task: Task, trial: Trial, among: Mapping[str, Trial], condition: str =
     found["success"] = (float((trial.final_distance <= TOLERANCE).float().mean()), "share")
     oracle, nothing = among.get(ORACLE), among.get(NOTHING)
     if oracle is not None:
-        found["cost_over_oracle"] = (float(trial.true.mean() / oracle.true.mean()), "ratio")
+        found["cost_over_oracle"] = (float(trial.executed_return.mean() / oracle.executed_return.mean()), "ratio")
     if oracle is not None and nothing is not None:
-        gain = (trial.true - nothing.true).mean() / (oracle.true - nothing.true).mean()
+        gain = (trial.executed_return - nothing.executed_return).mean() / (
+            oracle.executed_return - nothing.executed_return
+        ).mean()
         found["gain_share"] = (float(gain), "share")
     if trial.plan is not None:
         found["exploitation_gap"] = (float(trial.gap.mean()), "m")
         found["gap_absolute"] = (float(trial.gap.abs().mean()), "m")
-        found["relative_gap_median"] = (float((trial.gap.abs() / trial.true.abs()).median()), "share")
+        found["relative_gap_median"] = (float((trial.gap.abs() / trial.executed_return.abs()).median()), "share")
         found["plan_seconds"] = (trial.plan.seconds, "s")
         most = worst(trial.gap.numpy())
         found |= {f"{name}_worst": (float(each[name][0][most].mean()), "share") for name in INVARIANTS if name in each}
