@@ -6,21 +6,21 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
-.PHONY: help collect train predict latent control robustness action_prior claims test torture bench lint clean
+.PHONY: help collect train predict latent control robustness action_prior claims test reliability bench lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
 	@echo "make collect   collect data      (notebooks/01_collect.ipynb)"
 	@echo "make train     train the models  (notebooks/02_train.ipynb)"
-	@echo "make predict   who predicts best    (notebooks/03_predict.ipynb)"
-	@echo "make latent    what the codes mean  (notebooks/04_latent.ipynb)"
+	@echo "make predict   score predictions (notebooks/03_predict.ipynb)"
+	@echo "make latent    use and meaning of latent codes (notebooks/04_latent.ipynb)"
 	@echo "make robustness   noisy sensors and delayed actions (notebooks/06_robustness.ipynb)"
-	@echo "make action_prior   what the action prior does to a plan (notebooks/07_action_prior.ipynb)"
-	@echo "make claims    what the paper claims, judged from the rows that ship (notebooks/08_claims.ipynb)"
+	@echo "make action_prior   plans with and without the action prior (notebooks/07_action_prior.ipynb)"
+	@echo "make claims    verdicts on the paper's claims from the results that ship (notebooks/08_claims.ipynb)"
 	@echo "make test      all tests, then all notebooks cut down"
-	@echo "make torture   kill, damage, starve and forge everything at full length, and write docs/trust.md (an hour of one processor)"
+	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"
 	@echo "make bench     speed of everything against references, and docs/speed.md"
-	@echo "make lint      style and types"
+	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
 collect train predict latent control robustness action_prior claims: $(READY)
@@ -30,7 +30,7 @@ test: $(READY)
 	$(TEST) tests
 	$(TEST) --nbval-lax notebooks
 
-torture: $(READY)
+reliability: $(READY)
 	$(PY) tests/reliability $(PARTS)
 
 bench: $(READY)

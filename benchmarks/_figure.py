@@ -1,4 +1,4 @@
-"""How cost grows with the size of things, for docs/speed.md. Letters in shapes: R rounds, K sizes."""
+"""Figure of cost against size, for docs/speed.md. Letters in shapes: R rounds, K sizes."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from tsmlib.figures.axes import finite
-from tsmlib.figures.style import COLOURS, legend, panels, styled
+from tsmlib.figures.checks import finite
+from tsmlib.figures.style import BLUE, DARK, PALE, entry, legend, panels, styled
 
 LOOKS: dict[str, dict[str, Any]] = {  # the model's blues and a grey; black is the true simulator
-    "train": dict(color=COLOURS["tsm"], marker="o"),
-    "imagine": dict(color=COLOURS["data"], marker="s"),
-    "plan": dict(color=COLOURS["tsm+energy+direct"], marker="^"),
-    "score": dict(color=COLOURS["tsm"], marker="D"),
-    "learn": dict(color=COLOURS["tsm"], marker="v"),
-    "simulate": dict(color=COLOURS["oracle"], marker="x"),
+    "train": dict(color=BLUE, marker="o"),
+    "imagine": dict(color=DARK, marker="s"),
+    "plan": dict(color="#003C8F", marker="^"),
+    "score": dict(color=BLUE, marker="D"),
+    "learn": dict(color=BLUE, marker="v"),
+    "simulate": dict(color="#111111", marker="x"),
 }
 UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
 WORDS = {
@@ -48,7 +47,7 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         every = np.unique(np.concatenate([np.asarray(sizes, float) for sizes, _ in lines.values()]))
         slope = -1 if title == "threads" else 1
         lowest = np.array([min(sizes[0] for sizes, _ in lines.values()), every[-1]])
-        ax.plot(lowest, (lowest / lowest[0]) ** slope, color=COLOURS["zero"], ls="--", lw=0.8, zorder=1)
+        ax.plot(lowest, (lowest / lowest[0]) ** slope, color=PALE, ls="--", lw=0.8, zorder=1)
         notes = []
         for word, (sizes, seconds) in lines.items():
             sizes = finite(f"sizes of {title}, {word}", sizes, "K")
@@ -78,7 +77,7 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]
-    entries = [Line2D([], [], **LOOKS[word], ms=3, label=WORDS[word]) for word in used]
-    entries.append(Line2D([], [], color=COLOURS["zero"], ls="--", lw=0.8, label="in proportion"))
+    entries = [entry(WORDS[word], **LOOKS[word], ms=3) for word in used]
+    entries.append(entry("in proportion", color=PALE, ls="--", lw=0.8))
     legend(figure, entries, 7)
     return figure

@@ -1,4 +1,4 @@
-"""The segment model as the paper's text reads, without any trick: the reference of the benchmarks, the tests' oracle.
+"""Plain form of the segment model, as the paper's text reads: reference of the benchmarks, oracle of the tests.
 
     h = tanh(W_f * s + V_f z) . sigmoid(W_g * s + V_g z)      (Eq. 1)
 
@@ -49,7 +49,7 @@ class PlainDecoder(nn.Module):
         codes = weights["codes.weight"]  # (2 C layers, dz): V_f, V_g of every layer
         self.inlet = nn.Linear(input_dim, channels)
         self.layers = nn.ModuleList(PlainLayer(channels, codes.shape[1], d) for d in decoder.dilations)
-        self.direct = decoder.direct
+        self.direct = bool(decoder.state_skip)
         widths = [weights[name] for name in weights if name.startswith("head.") and name.endswith("weight")]
         activation = nn.SiLU if self.direct else nn.ReLU
         head: list[nn.Module] = [] if self.direct else [nn.ReLU()]

@@ -1,4 +1,4 @@
-"""What the benchmarks share: ways timed in turn, peak memory, matrix products alone, and rows of one table.
+"""Base of the benchmarks: ways timed in turn, peak memory, matrix products alone, and rows of one table.
 
 Absolute times on a machine that others use mean little: its clock and its load change within seconds. So every figure
 is a ratio of two ways that were timed in turn, round by round, and is stated as the median over rounds with the lowest
@@ -240,20 +240,18 @@ def save(name: str, rows: Sequence[Row]) -> None:
         measured = {
             "what": row.what, "reference": row.reference, "ratio_lowest": low, "ratio_median": middle,
             "ratio_highest": high, "limit": row.limit, "threads": row.threads, "value": row.value, "unit": row.unit,
-            "n": row.n,
+            "n": row.n, "share": row.share, "peak_bytes": row.peak_bytes,
         }  # fmt: skip
-        measured |= {} if row.share is None else {"share": row.share}
-        measured |= {} if row.peak_bytes is None else {"peak_bytes": row.peak_bytes}
         table.append({**row.columns, **measured, **about})
     path = folder() / f"{name}.csv"
-    tables.save_table(path, table, extra=EXTRA)
+    tables.save(path, table, extra=EXTRA)
     print(path)
 
 
 def load(path: Path) -> list[tuple[Row, dict[str, Any]]]:
     """The rows of one benchmark, each with the fields that it stands in."""
     found = []
-    for r in tables.load_table(path):
+    for r in tables.records(tables.load(path)):
         share, peak = (None if r[name] == "" else r[name] for name in ("share", "peak_bytes"))
         ratio = (r["ratio_lowest"], r["ratio_median"], r["ratio_highest"])
         row = Row(

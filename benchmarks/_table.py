@@ -1,4 +1,4 @@
-"""All that was measured as one table, and the figures that were asked for beside what was found.
+"""Table of all benchmarks, and targets beside what was measured.
 
 Without options it is printed. ``--publish`` writes docs/speed.md and figures/bench_growth from the tables in
 runs/bench: ``python -m tsmlib bench table``.
@@ -52,22 +52,22 @@ TARGETS = (
            starts("train tsm, teacher-forced: targets"), "ratio", True, 2.2),
     Target("training TSM, c = 64, free-running, targets per second over plain eager windows", "train",
            starts("train tsm, free-running: targets"), "ratio", True, 1.4),
-    Target("share of the processor's float32 matrix products in training TSM, both stages", "train",
+    Target("share of the CPU's float32 matrix products in training TSM, both stages", "train",
            starts("train tsm, teacher-forced: targets", "train tsm, free-running: targets"), "share", True, 0.55),
     Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, best of all batches", "rollout",
            starts("imagine with tsm, "), "ratio", True, 5, best=True),
     Target("100 latent plans, T = 50, over plain eager, per iteration", "plan",
-           lambda row, r: r["condition"] == "plain" and r["planner"] == "adam" and r["prior"] == "codes",
+           lambda row, r: r["configuration"] == "plain" and r["planner"] == "adam" and r["search_space"] == "latent",
            "ratio", True, 2),
     Target("collecting over a loop of env.step", "collect",
-           lambda row, r: r["condition"] == "env.step" and r["metric"] == "steps_per_second", "ratio", True, 8),
+           lambda row, r: r["configuration"] == "env.step" and r["metric"] == "steps_per_second", "ratio", True, 8),
     Target("share of raw mujoco.rollout in collecting", "collect",
            lambda row, r: r["metric"] == "steps_per_second", "share", True, 0.6),
-    Target("ten policies over one, time", "policy", lambda row, r: r["condition"] == "copies", "ratio", False, 2.5),
+    Target("ten policies over one, time", "policy", lambda row, r: r["configuration"] == "copies", "ratio", False, 2.5),
     Target("trainings, scores, CEM plans and policies of a seed, over two hours of two cores", "seed",
-           lambda row, r: r["condition"] == "a whole seed", "ratio", False, 1),
+           lambda row, r: r["configuration"] == "a whole seed", "ratio", False, 1),
     Target("exponent of cost against horizon, targets and seeds", "growth",
-           lambda row, r: r["condition"] in ("horizon", "targets", "seeds"), "ratio", False, 1.05),
+           lambda row, r: r["configuration"] in ("horizon", "targets", "seeds"), "ratio", False, 1.05),
 )  # fmt: skip
 MOST_GIB = 6
 

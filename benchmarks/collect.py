@@ -101,16 +101,16 @@ def main() -> None:
         Row.of(
             "collect in one call: steps", speeds["bulk"], f"loop over {way}", speeds[way], limit=bound,
             bound=speeds["raw"], peak=peaks["bulk"], threads=threads, env=ENV, sim="mujoco", model="none",
-            horizon=STEPS, condition=way, metric="steps_per_second",
+            horizon=STEPS, configuration=way, metric="steps_per_second",
         )
         for way in ("env.step", "mj_step")
     ]  # fmt: skip
     cores = {way: (n if way == "bulk" else few) * STEPS / np.array(taken[1:]) for way, taken in used.items()}
     rows.append(
         Row.of(
-            "collect in one call: steps per processor second", cores["bulk"], "loop over env.step", cores["env.step"],
+            "collect in one call: steps per CPU second", cores["bulk"], "loop over env.step", cores["env.step"],
             peak=peaks["bulk"], threads=threads, env=ENV, sim="mujoco", model="none", horizon=STEPS,
-            condition="env.step", metric="steps_per_core_second",  # where others load the machine, the fairer number
+            configuration="env.step", metric="steps_per_core_second",  # fairer where others load the machine
         )
     )  # fmt: skip
     print(f"{ENV}, {n} episodes of {STEPS} steps, {threads} threads, {arguments.rounds} rounds")

@@ -1,4 +1,4 @@
-"""How cost grows with segment length, horizon, batch, channels, samples, targets, seeds and threads.
+"""Growth of cost with segment length, horizon, batch, channels, samples, targets, seeds and threads.
 
 Every round runs all sizes of all curves in turn, one call each. The exponent of a curve is the slope of log seconds
 over log size by least squares, in each round by itself: 1 is linear growth; overhead makes it smaller at small sizes.
@@ -29,7 +29,7 @@ from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions
-from tsmlib.policies.learning import episodes_from, learn_policy
+from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.storage import tables
 from tsmlib.study import runs
@@ -66,7 +66,8 @@ def main() -> None:
             rows.append(
                 Row.of(
                     f"{_figure.WORDS[word]} against {axis}, {many}", found, linear, 1.0,
-                    unit="exponent", peak=peak, env=ENV, sim="mujoco", model="tsm", condition=axis, metric="exponent",
+                    unit="exponent", peak=peak, env=ENV, sim="mujoco", model="tsm", metric="exponent",
+                    configuration=axis,
                 )
             )  # fmt: skip
         points += [
@@ -76,14 +77,14 @@ def main() -> None:
         ]
     print(f"{ENV}, {arguments.rounds} rounds, {arguments.threads} threads")
     save("growth", rows)
-    tables.save_table(folder() / "growth_rows.csv", points, extra=COLUMNS)
+    tables.save(folder() / "growth_rows.csv", points, extra=COLUMNS)
     print(*save_figure(draw(folder()), folder() / "growth"), sep="\n")
 
 
 def draw(place: Path) -> Any:
     """The figure of what stands in ``growth_rows.csv`` of a folder; a size measured alone has no curve."""
     found: dict[str, dict[str, dict[int, dict[int, float]]]] = {}
-    for row in tables.load_table(place / "growth_rows.csv"):
+    for row in tables.records(tables.load(place / "growth_rows.csv")):
         by_round = found.setdefault(row["axis"], {}).setdefault(row["curve"], {})
         by_round.setdefault(row["round"], {})[row["size"]] = row["value"]
     panels: dict[str, dict[str, _figure.Curve]] = {}
@@ -119,7 +120,8 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
         policy: Any = OneStepPolicy(reach.start.shape[1], DU, copies=copies)
         policy.features.load_state_dict(small.features.state_dict())
         draw = episodes_from(torch.from_numpy(reach.start))
-        return learn_policy(policy, small, getattr(rewards, reach.name), draw, iterations=2, record_every=2).seconds[-1]
+        options = LearningOptions(iterations=2, record_every=2)
+        return learn_policy(policy, small, getattr(rewards, reach.name), draw, options).seconds[-1]
 
     few = data.take(slice(2))
     cores = os.cpu_count() or 1

@@ -25,7 +25,7 @@ def little(run: Run, seed: int, updates: int) -> None:
     data, held_out = (study.random_data(ENV, n, seed=seed) for n in (100, 1))
     stage = study.schedule(run, ENV, "tsm")[-1]
     net = study.initialise(run, "tsm", data)
-    training(net, stage, (data, held_out), updates=updates, bf16=study.bf16_pays("tsm", stage))()
+    training(net, stage, (data, held_out), updates=updates, bf16=stage.bf16)()
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def main() -> None:
     row = Row.of(
         f"{n} trainings side by side in {at_once} processes: trainings", n / seconds["ahead"],
         f"in turn, {at_once} threads", n / seconds["in turn"], threads=1, env=ENV, sim="mujoco", model="tsm",
-        condition="processes", metric="trainings_per_second",
+        configuration="processes", metric="trainings_per_second",
     )  # fmt: skip
     print(f"{ENV}, {arguments.updates} updates each, {arguments.rounds} rounds")
     save("parallel", [row])

@@ -1,10 +1,10 @@
-"""Planning pushes through the model: over codes and over torques by Adam, and over codes by the cross-entropy method.
+"""Planning pushes through the model: in the latent and the direct search space by Adam, in the latent one by CEM.
 
 The paper's planner is Adam with 100 iterations for all targets at once. A call here has a few iterations, in turn with
 the same call through the plain model and prior of ``_plain``, and with simulating some of the same steps in MuJoCo, in
 bulk and without a gradient. A planner also predicts once after its last iteration and once for the plan that it gives
 back, here as there; the time of the whole plan counts these as often as there are rounds in it, so it is a little high.
-``--whole`` also runs the whole plan over codes once, as a check of what the rounds extrapolate.
+``--whole`` also runs the whole latent plan by Adam once, as a check of what the rounds extrapolate.
 
     python benchmarks/plan.py        or        python -m tsmlib bench plan
 """
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from tsmlib import study
 from tsmlib.collection import collect, open_loop
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam, cem
@@ -40,7 +41,7 @@ ENV = "tsm/ReacherPush-v0"
 
 def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
     """The shipped models; where there are none, untrained ones, which are as fast."""
-    folder = run.shipped / study.short(env)
+    folder = run.shipped / EnvSpec.parse(env).name
     if all((folder / f"{name}.safetensors").exists() for name in ("tsm", "prior")):
         tsm = artifacts.load_model(folder / "tsm.safetensors", TSM)
         return tsm, artifacts.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
@@ -78,35 +79,35 @@ def main() -> None:
     plain_prior: Any = PlainPrior(prior)
     seconds: dict[str, float] = defaultdict(float)
 
-    def codes(prior: Any) -> LatentActions:
+    def latent(prior: Any) -> LatentActions:
         return LatentActions(prior, horizon)
 
     def through(model: Any) -> Callable[[Tensor], Tensor]:
         return model_predictor(model, task.past(model.past_len), samples=samples)
 
     def in_parts() -> None:
-        """The plan over codes, telling its parts apart."""
-        space = codes(prior)
+        """The latent plan by Adam, with the seconds of its parts."""
+        space = latent(prior)
         space.decode = timed(space.decode, "codes to torques", seconds)  # type: ignore[method-assign]
         predict = timed(through(model), "torques to states", seconds)
         seconds["plan"] += adam(predict, task.reward, space, n_targets, iterations=few).seconds
 
     fast, plain = through(model), through(PlainTSM(model))
-    few_codes = partial(adam, reward=task.reward, start=n_targets, iterations=few)
+    few_adam = partial(adam, reward=task.reward, start=n_targets, iterations=few)
     few_cem = partial(cem, reward=task.reward, start=n_targets, iterations=1, candidates=arguments.candidates,
                       elites=max(2, arguments.candidates // 4))  # fmt: skip
     simulated = max(1, samples * n_targets // 4)  # rollouts, a part of those of one iteration
     start, torques = task.start, 0.1 * torch.randn(n_targets, horizon, 2, generator=torch.Generator().manual_seed(0))
     ways: dict[str, Callable[[], object]] = {
-        "codes, Adam": lambda: few_codes(fast, space=codes(prior)),
-        "codes, Adam plain": lambda: few_codes(plain, space=codes(plain_prior)),
-        "actions, Adam": lambda: few_codes(fast, space=DirectActions(horizon)),
-        "actions, Adam plain": lambda: few_codes(plain, space=DirectActions(horizon)),
-        "codes, CEM": lambda: few_cem(fast, space=codes(prior)),
-        "codes, CEM plain": lambda: few_cem(plain, space=codes(plain_prior)),
+        "latent, Adam": lambda: few_adam(fast, space=latent(prior)),
+        "latent, Adam plain": lambda: few_adam(plain, space=latent(plain_prior)),
+        "direct, Adam": lambda: few_adam(fast, space=DirectActions(horizon)),
+        "direct, Adam plain": lambda: few_adam(plain, space=DirectActions(horizon)),
+        "latent, CEM": lambda: few_cem(fast, space=latent(prior)),
+        "latent, CEM plain": lambda: few_cem(plain, space=latent(plain_prior)),
         "simulate": lambda: simulate(start, torques, simulated),
     }
-    words = ("codes, Adam", "actions, Adam", "codes, CEM")
+    words = ("latent, Adam", "direct, Adam", "latent, CEM")
     products = {f"{word} sgemm": Products.of(ways[word]).alone() for word in words}
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     taken = interleaved(ways | products, arguments.rounds, warm=False)
@@ -115,13 +116,14 @@ def main() -> None:
     common = dict(env=ENV, sim="mujoco", task="push", model="tsm", horizon=horizon)
     rows, threads = [], min(os.cpu_count() or 1, 8)  # as the environment takes them
     for word in words:
-        prior_word, planner = word.lower().split(", ")
+        search_space, planner = word.lower().split(", ")
         done = few if planner == "adam" else 1
+        way = dict(common, planner=planner, search_space=search_space)
         rows.append(
             Row.of(
-                f"plan over {word}, {n_targets} targets: iterations", done / taken[word], "plain eager float32",
+                f"plan, {word}, {n_targets} targets: iterations", done / taken[word], "plain eager float32",
                 done / taken[f"{word} plain"], limit=SGEMM, bound=done / taken[f"{word} sgemm"], peak=peaks[word],
-                planner=planner, prior=prior_word, condition="plain", metric="iterations_per_second", **common,
+                configuration="plain", metric="iterations_per_second", **way,
             )
         )  # fmt: skip
         if planner == "cem":
@@ -129,27 +131,28 @@ def main() -> None:
         scale, n_rollouts = arguments.iterations / few, few * samples * n_targets
         rows.append(
             Row.of(
-                f"plan over {word}, {n_targets} targets, {arguments.iterations} iterations, extrapolated: seconds",
+                f"plan, {word}, {n_targets} targets, {arguments.iterations} iterations, extrapolated: seconds",
                 scale * taken[word], f"executing its steps in MuJoCo, {threads} threads",
-                scale * taken["simulate"] * n_rollouts / simulated, unit="s", peak=peaks[word], planner=planner,
-                prior=prior_word, condition="simulate", metric="plan_seconds", **common,
+                scale * taken["simulate"] * n_rollouts / simulated, unit="s", peak=peaks[word],
+                configuration="simulate", metric="plan_seconds", **way,
             )
         )  # fmt: skip
     if arguments.whole:
-        whole = partial(adam, fast, task.reward, codes(prior), n_targets, iterations=arguments.iterations)
+        whole = partial(adam, fast, task.reward, latent(prior), n_targets, iterations=arguments.iterations)
         began = time.perf_counter()
         peak = peak_bytes(whole)
-        extrapolated = np.median(taken["codes, Adam"]) * arguments.iterations / few
+        extrapolated = np.median(taken["latent, Adam"]) * arguments.iterations / few
         rows.append(
             Row.of(
-                "plan over codes, Adam, all of it once: seconds", np.array([time.perf_counter() - began]),
-                "its extrapolation from the rounds", extrapolated, unit="s", peak=peak, planner="adam", prior="codes",
-                condition="whole", metric="plan_seconds", **common,
+                "plan, latent, Adam, all of it once: seconds", np.array([time.perf_counter() - began]),
+                "its extrapolation from the rounds", extrapolated, unit="s", peak=peak, planner="adam",
+                search_space="latent",
+                configuration="whole", metric="plan_seconds", **common,
             )
         )  # fmt: skip
     seconds["gradients and the rest"] = 2 * seconds["plan"] - sum(seconds.values())
     for part in ("codes to torques", "torques to states", "gradients and the rest"):
-        print(f"{part:24} {seconds[part] / seconds['plan']:5.0%} of the plan over codes")
+        print(f"{part:24} {seconds[part] / seconds['plan']:5.0%} of the latent plan")
     print(
         f"{ENV}, {n_targets} targets, {horizon} steps, {few} iterations, {samples} samples, {origin} models, "
         f"{arguments.threads} threads, {arguments.rounds} rounds"

@@ -17,9 +17,9 @@ import torch
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from plan import models
 
-from tsmlib import rewards, study
+from tsmlib import study
 from tsmlib.models.base import rollout
-from tsmlib.policies.learning import episodes_from, learn_policy
+from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
 from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
@@ -38,20 +38,21 @@ def main() -> None:
     n, copies, horizon = arguments.iterations, arguments.copies, arguments.horizon
     model, prior, origin = models(runs.resolve("bench", scale="laptop"), arguments.env)
     task = study.task(arguments.env, "validation")
-    draw, reward = episodes_from(torch.from_numpy(task.start)), getattr(rewards, task.name)
+    draw, reward = episodes_from(torch.from_numpy(task.start)), task.reward_for
     state_dim = task.start.shape[1]
     starts = torch.from_numpy(task.start[:EPISODES])
     torques = 0.1 * torch.randn(len(starts), horizon, 2, generator=torch.Generator().manual_seed(0))
 
-    def learn(kind: str, copies: int, n: int = n) -> float:
+    def learn(space: str, copies: int, n: int = n) -> float:
         """Seconds of the updates alone, without the records before and after them."""
         learner: Any = (
             SegmentPolicy(state_dim, prior, copies=copies)
-            if kind == "codes"
+            if space == "latent"
             else OneStepPolicy(state_dim, 2, copies=copies)
         )
         learner.features.load_state_dict(model.features.state_dict())
-        return learn_policy(learner, model, reward, draw, iterations=n, record_every=n, horizon=horizon).seconds[-1]
+        options = LearningOptions(iterations=n, record_every=n, horizon=horizon)
+        return learn_policy(learner, model, reward, draw, options).seconds[-1]
 
     @torch.no_grad()
     def imagine() -> None:
@@ -60,7 +61,7 @@ def main() -> None:
             rollout(model, past, torques, generator=torch.Generator().manual_seed(i))
 
     ways: dict[str, Callable[[], object]] = {"imagine": imagine}
-    ways |= {f"{kind} {m}": partial(learn, kind, m) for kind in ("codes", "actions") for m in (1, copies)}
+    ways |= {f"{space} {m}": partial(learn, space, m) for space in ("latent", "direct") for m in (1, copies)}
     products = {  # of the updates alone
         f"sgemm {way}": (Products.of(partial(call, n=2 * n)) - Products.of(call)).alone()
         for way, call in ways.items()
@@ -75,19 +76,20 @@ def main() -> None:
     )
     rows = []
     common = dict(env=arguments.env, sim="mujoco", task=task.name, model="tsm", planner="policy", horizon=horizon)
-    for kind in ("codes", "actions"):
-        one, many = (f"{kind} {m}" for m in (1, copies))
+    for space in ("latent", "direct"):
+        one, many = (f"{space} {m}" for m in (1, copies))
         whole = SCHEDULE * np.median(seconds[one]) / n
-        print(f"one policy through {kind}, extrapolated to {SCHEDULE} updates: {whole / 60:.1f} min")
+        print(f"one policy, {space}, extrapolated to {SCHEDULE} updates: {whole / 60:.1f} min")
         for what, way, reference, other in (
-            (f"one policy through {kind}, an update: seconds", one, "imagining its steps, no gradient", "imagine"),
-            (f"{copies} policies through {kind}, an update: seconds", many, "one policy", one),
+            (f"one policy, {space}, an update: seconds", one, "imagining its steps, no gradient", "imagine"),
+            (f"{copies} policies, {space}, an update: seconds", many, "one policy", one),
         ):
             rows.append(
                 Row.of(
                     what, seconds[way] / n, reference, seconds[other] / n, unit="s", limit=SGEMM,
-                    bound=seconds[f"sgemm {way}"] / n, peak=peaks[way], prior=kind,
-                    condition="copies" if way == many else "one", metric="seconds", **common,
+                    bound=seconds[f"sgemm {way}"] / n, peak=peaks[way],
+                    search_space=space,
+                    configuration="copies" if way == many else "one", metric="seconds", **common,
                 )
             )  # fmt: skip
     save("policy", rows)

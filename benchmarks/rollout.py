@@ -1,4 +1,4 @@
-"""Imagining without a gradient, model by model, against MuJoCo on the same core.
+"""Rollouts without a gradient, model by model, against MuJoCo on the same core.
 
 A model imagines ``--horizon`` steps from so many rows at once, in float32 and with matrix products in bfloat16; the
 simulator is raw ``mujoco.rollout`` on one thread, which executes a few episodes of the same torques. The limit is the
@@ -51,7 +51,7 @@ def main() -> None:
                     Row.of(
                         f"imagine with {model}, {word}, {size} rows: steps", steps / seconds[f"{word} {size}"],
                         "mujoco.rollout, one thread", simulated, limit=SGEMM, bound=steps / seconds[f"sgemm {size}"],
-                        peak=peaks[f"{word} {size}"], env=ENV, sim="mujoco", model=model, condition=word,
+                        peak=peaks[f"{word} {size}"], env=ENV, sim="mujoco", model=model, configuration=word,
                         metric="steps_per_second", horizon=arguments.horizon,
                     )
                 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Scoring predictions with ``evaluate.score``, against imagining as many steps by bare rollouts.
+"""Scoring predictions with ``evaluation.prediction.score``, against bare rollouts of as many steps.
 
 Test and validation samples are drawn, scores fitted and taken; the reference draws the same number of samples in blocks
 of the same size and does nothing with them. The limit is reading every sample once from memory and writing it once.
@@ -55,7 +55,7 @@ def main() -> None:
                     f"score {model}, {samples} samples of {len(data[0])} + {len(data[1])} episodes: seconds",
                     seconds[way], "bare rollouts of its samples", seconds[f"{way} bare"], unit="s",
                     limit="memory bandwidth", bound=seconds["memory"] * 4 * n_values / BYTES, peak=peaks[way], env=ENV,
-                    sim="mujoco", model=model, condition=f"{samples} samples", metric="seconds", horizon=horizon,
+                    sim="mujoco", model=model, configuration=f"{samples} samples", metric="seconds", horizon=horizon,
                 )
             )  # fmt: skip
     print(f"{ENV}, {horizon} steps, {arguments.rounds} rounds, {arguments.threads} threads")
@@ -65,7 +65,7 @@ def main() -> None:
 @torch.no_grad()
 def imagine(net: Any, data: list[Trajectories], *, samples: int, horizon: int, observed: int = 10) -> None:
     """Roll out what ``evaluate.score`` does: one sample where the model is deterministic."""
-    samples = samples if getattr(net, "stochastic", True) else 1
+    samples = samples if net.stochastic else 1
     generator = torch.Generator().manual_seed(0)
     for split in data:
         states, actions = torch.from_numpy(split.states), torch.from_numpy(split.actions)

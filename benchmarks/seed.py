@@ -1,4 +1,4 @@
-"""What one seed of the whole study costs at scale paper: the sum of its parts, in processor time.
+"""Cost of one seed of the whole study at scale paper: the sum of its parts, in CPU seconds.
 
 The trainings of every model of the three MuJoCo arms and of two imperfect ones, their scores, plans by CEM on 100
 targets of two tasks, and policies: what notebooks 02, 03, 05 and 06 need for every seed. Not counted are the ablations
@@ -24,11 +24,10 @@ from typing import Any
 import numpy as np
 import torch
 from _rounds import Row, parsed, parser, peak_bytes, save
-from torch import Tensor
 from tqdm.auto import tqdm
 from train import training
 
-from tsmlib import rewards, study
+from tsmlib import study
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, MUJOCO_IDS, NOISE
 from tsmlib.evaluation import prediction
@@ -36,9 +35,9 @@ from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.learning import episodes_from, learn_policy
+from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
-from tsmlib.study import runs
+from tsmlib.study import runs, zoo
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
@@ -48,9 +47,9 @@ REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 BEST = "tsm+energy+direct"
 IMPERFECT = (imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY))
 WORDS = {
-    "train": "all trainings of a seed: processor seconds", "score": "all scores of a seed: processor seconds",
-    "plan": "all plans of a seed: processor seconds", "policy": "all policies of a seed: processor seconds",
-    "a whole seed": "these parts of a whole seed, the sum: processor seconds",
+    "train": "all trainings of a seed: CPU seconds", "score": "all scores of a seed: CPU seconds",
+    "plan": "all plans of a seed: CPU seconds", "policy": "all policies of a seed: CPU seconds",
+    "a whole seed": "these parts of a whole seed, the sum: CPU seconds",
 }  # fmt: skip
 
 
@@ -65,7 +64,7 @@ class Part:
 
 def main() -> None:
     options = parser(__doc__, rounds=2)
-    options.add_argument("--models", default=",".join(study.DYNAMICS))
+    options.add_argument("--models", default=",".join(zoo.words("dynamics")))
     options.add_argument("--envs", default=",".join(MUJOCO_IDS))
     options.add_argument("--little", type=int, default=10, help="episodes, and targets, of each part (default 10)")
     options.add_argument("--updates", type=int, default=3, help="of each training and policy (default 3)")
@@ -77,7 +76,7 @@ def main() -> None:
         spent: dict[str, float] = defaultdict(float)
         for part in tqdm(parts, desc="parts", leave=False):
             taken: list[float] = []
-            peak = peak_bytes(lambda part=part, taken=taken: taken.append(processor_seconds(part.call)))
+            peak = peak_bytes(lambda part=part, taken=taken: taken.append(cpu_seconds(part.call)))
             spent[part.kind] += part.times * taken[0]
             peaks[part.kind] = max(peaks[part.kind], peak)
         for name, value in spent.items():
@@ -88,7 +87,7 @@ def main() -> None:
     rows = [
         Row.of(
             WORDS[kind], np.array(seconds[kind]), "two hours of two cores", BUDGET, unit="s", peak=peaks[kind],
-            condition=kind, metric="seconds", sim="mujoco",
+            configuration=kind, metric="seconds", sim="mujoco",
         )
         for kind in (*kinds, "a whole seed")
     ]  # fmt: skip
@@ -97,7 +96,7 @@ def main() -> None:
     save("seed", rows)
 
 
-def processor_seconds(call: Callable[[], object]) -> float:
+def cpu_seconds(call: Callable[[], object]) -> float:
     """Of one call, or what it says itself."""
     began = time.process_time()
     own = call()
@@ -132,8 +131,7 @@ def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) ->
     """The stages of one model; an update costs the same at any time."""
     net, held_out = study.initialise(run, word, data), data.take(slice(1))
     for stage in study.schedule(run, env, word):
-        bf16 = study.bf16_pays(word, stage)
-        few = training(net, stage, (data, held_out), updates=n, bf16=bf16)
+        few = training(net, stage, (data, held_out), updates=n, bf16=stage.bf16)
         yield Part("train", few, stage.steps / n)
 
 
@@ -145,9 +143,9 @@ def scores(net: Any, few: Trajectories) -> Iterator[Part]:
 
 
 def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
-    """CEM of 96 candidates and 10 iterations over codes and over torques, and its promise from 32 samples."""
+    """CEM of 96 candidates and 10 iterations in both search spaces, and predicted returns from 32 other samples."""
     few, horizon = task.take(n), task.horizon
-    past, samples = few.past(net.past_len), 2 if getattr(net, "stochastic", True) else 1
+    past, samples = few.past(net.past_len), 2 if net.stochastic else 1
     for space in (LatentActions(prior, horizon), DirectActions(horizon)):
         predict = model_predictor(net, past, samples=samples)
         judge = model_predictor(net, past, samples=16 * samples, seed=1)
@@ -161,16 +159,17 @@ def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
 
 
 def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
-    """Three copies, 2,200 updates, acting by torques, and by codes where there is a prior."""
+    """Three copies, 2,200 updates, direct, and latent where there is a prior."""
     draw = episodes_from(torch.from_numpy(task.start))
-    reward: Callable[[Tensor], Any] = rewards.reach if task.name == "reach" else rewards.push
     learners: list[Any] = [OneStepPolicy(task.start.shape[1], 2, copies=3)]
     learners += [SegmentPolicy(task.start.shape[1], prior, copies=3)] if prior is not None else []
     for learner in learners:
         learner.features.load_state_dict(net.features.state_dict())
 
         def updates(learner: Any = learner) -> float:
-            return learn_policy(learner, net, reward, draw, iterations=n, record_every=n).seconds[-1]
+            return learn_policy(
+                learner, net, task.reward_for, draw, LearningOptions(iterations=n, record_every=n)
+            ).seconds[-1]
 
         yield Part("policy", updates, 2200 / n)
 

@@ -4,7 +4,7 @@ Every call is ``tsmlib.training.fit.fit`` for ten updates, with the loss, the ba
 ``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on so few windows that its share
 is that of the study (2,000 windows every 250 updates). The reference is the same stage in float32 through
 ``_plain.PlainTSM``; for models that have no plain form, themselves in the other precision. The limit is the time that
-the matrix products of the very same call take alone, in float32: the share says how many of the processor's float32
+the matrix products of the very same call take alone, in float32: the share says how many of the CPU's float32
 operations per second training gets.
 
     python benchmarks/train.py        or        python -m tsmlib bench train
@@ -22,9 +22,9 @@ from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_byte
 
 from tsmlib import study
 from tsmlib.models.tsm import TSM
-from tsmlib.study import runs
-from tsmlib.study.models import Stage
-from tsmlib.training.fit import fit
+from tsmlib.study import runs, zoo
+from tsmlib.study.zoo import Updates
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
 ENV = "tsm/ReacherPush-v0"
@@ -35,7 +35,7 @@ Data = tuple[Trajectories, Trajectories]
 
 def main() -> None:
     options = parser(__doc__, rounds=5)
-    options.add_argument("--models", default=",".join([*study.DYNAMICS, "prior"]))
+    options.add_argument("--models", default=",".join([*zoo.words("dynamics"), "prior"]))
     options.add_argument("--updates", type=int, default=10, help="in every call (default 10)")
     options.add_argument("--batches", default="128,256,512,1024", help="windows per update, tsm free-running")
     options.add_argument("--batch", type=int, default=0, help="windows per update; 0: as in the schedule (default)")
@@ -59,19 +59,22 @@ def main() -> None:
     save("train", rows)
 
 
-def training(net: Any, stage: Stage, data: Data, *, updates: int, bf16: bool) -> Callable[[], object]:
+def training(net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool) -> Callable[[], object]:
     """``updates`` updates of a stage, as the study has them."""
 
     def call() -> None:
-        fit(net, getattr(net, stage.loss), *data, past_len=net.past_len, future_len=stage.future_len, steps=updates,
-            batch_size=stage.batch, validate_every=updates, lr=1e-5, bf16=bf16)  # fmt: skip
+        options = TrainingOptions(
+            past_len=net.past_len, future_len=stage.future_len, steps=updates,
+            batch_size=stage.batch, validate_every=updates, lr=1e-5, bf16=bf16,
+        )  # fmt: skip
+        fit(net, getattr(net, stage.loss), *data, options)
 
     return call
 
 
-def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) -> Row:
+def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) -> Row:
     """Supervised targets per second of one stage."""
-    bf16 = study.bf16_pays(model, stage)
+    bf16 = stage.bf16
     plain = PlainTSM(net) if isinstance(net, TSM) else net
     other = "plain eager float32" if plain is not net else f"itself in {'float32' if bf16 else 'bfloat16'}"
     fast = training(net, stage, data, updates=arguments.updates, bf16=bf16)
@@ -93,7 +96,7 @@ def stage_row(net: Any, model: str, stage: Stage, data: Data, arguments: Any) ->
         f"train {model}, {name}: targets", targets / seconds["fast"],
         other, targets / seconds["plain"],
         limit=SGEMM, bound=targets / seconds["sgemm"], peak=peak, env=ENV, sim="mujoco", model=model,
-        condition=stage.loss, metric="targets_per_second", horizon=stage.future_len,
+        configuration=stage.loss, metric="targets_per_second", horizon=stage.future_len,
     )  # fmt: skip
 
 
@@ -101,7 +104,7 @@ def batch_rows(net: Any, sizes: list[int], data: Data, updates: int, rounds: int
     """tsm free-running: bfloat16 against float32, batch by batch, per window."""
     ways, products = {}, {}
     for batch in sizes:
-        stage = Stage("loss", 1, batch=batch)
+        stage = Updates("loss", 1, future_len=20, lr=4e-3, batch=batch, bf16=True)
         for word, bf16 in (("bfloat16", True), ("float32", False)):
             ways[f"{word} {batch}"] = training(net, stage, data, updates=updates, bf16=bf16)
         products[batch] = Products.of(ways[f"float32 {batch}"])
@@ -118,7 +121,7 @@ def batch_rows(net: Any, sizes: list[int], data: Data, updates: int, rounds: int
             f"{'float32, the same batch' if word == 'bfloat16' else f'float32, batch {sizes[0]}'}",
             speed("float32", batch if word == "bfloat16" else sizes[0]),
             limit=SGEMM, bound=speed("sgemm", batch), peak=peaks[f"{word} {batch}"], env=ENV,
-            sim="mujoco", model="tsm", condition="batch", metric="windows_per_second", horizon=20,
+            sim="mujoco", model="tsm", configuration="batch", metric="windows_per_second", horizon=20,
         )
         for batch in sizes
         for word in ("bfloat16", "float32")

@@ -1,7 +1,7 @@
-"""What trust costs: checkpoints within a training, and the checks when a shipped model is loaded.
+"""Cost of reliability: checkpoints within a training, and the checks when a shipped model is loaded.
 
 A checkpoint is held against the 250 updates between two of them, in one training; a load with all its checks against
-reading the bytes and copying them into a model that exists. In processor seconds, which other work disturbs less; a
+reading the bytes and copying them into a model that exists. In CPU seconds, which other work disturbs less; a
 checkpoint's flush to the disk comes on top.
 
     python benchmarks/trust.py        or        python -m tsmlib bench trust
@@ -27,11 +27,13 @@ from _rounds import Row, parsed, parser, peak_bytes, save
 from tqdm.auto import tqdm
 
 from tsmlib import study
+from tsmlib.envs import fingerprint
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts
 from tsmlib.study import runs
 from tsmlib.training.checkpoint import TrainingState
-from tsmlib.training.fit import fit
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories, Window
 
 ENV = "tsm/ReacherPush-v0"
@@ -46,8 +48,8 @@ def main() -> None:
 
     data, held_out = (study.random_data(ENV, n, seed=seed) for n, seed in ((200, 0), (2, 1)))
     run = runs.resolve("bench", scale="laptop")
-    shipped = run.shipped / study.short(ENV) / "tsm.safetensors"
-    expect = study.fingerprint(ENV)
+    shipped = run.shipped / EnvSpec.parse(ENV).name / "tsm.safetensors"
+    expect = fingerprint(ENV)
     existing = artifacts.load_model(shipped, TSM, expect=expect)
     seconds: dict[str, list[float]] = {"update": [], "save": [], "load": [], "read": []}
     ratio = np.array([round_of(arguments, run, data, held_out, seconds) for _ in tqdm(range(arguments.rounds))])
@@ -67,12 +69,12 @@ def main() -> None:
     between = EVERY * update / 1000
     rows = [
         Row.of(
-            "write a checkpoint: processor seconds", between * (ratio - 1), f"the {EVERY} updates before it", between,
-            condition="checkpoints", **common,
+            "write a checkpoint: CPU seconds", between * (ratio - 1), f"the {EVERY} updates before it", between,
+            configuration="checkpoints", **common,
         ),
         Row.of(
-            "load a shipped model, checked: processor seconds", np.array(seconds["load"]), "reading its bytes",
-            np.maximum(seconds["read"], 1e-6), peak=peak, condition="load", **common,
+            "load a shipped model, checked: CPU seconds", np.array(seconds["load"]), "reading its bytes",
+            np.maximum(seconds["read"], 1e-6), peak=peak, configuration="load", **common,
         ),
     ]  # fmt: skip
     save("trust", rows)
@@ -90,17 +92,19 @@ def round_of(
             asked.append(time.process_time())
         return net.loss(window, generator)
 
-    def save(state: TrainingState, folder: Path, identity: dict[str, Any]) -> None:
+    whole = TrainingState.save
+
+    def save(state: TrainingState[Any]) -> None:
         with timed(saves):
-            TrainingState.save(state, folder, identity)
+            whole(state)
 
     every = max(1, arguments.steps // 2)
     with (
         tempfile.TemporaryDirectory() as name,
-        mock.patch("tsmlib.training.fit.TrainingState", type("Timed", (TrainingState,), {"save": save})),
+        mock.patch.object(TrainingState, "save", save),
     ):
-        fit(net, loss, data, held_out, past_len=10, future_len=20, steps=arguments.steps, validate_every=every,
-            checkpoint=Path(name) / "run", bf16=True)  # fmt: skip
+        options = TrainingOptions(10, 20, arguments.steps, validate_every=every, bf16=True)
+        fit(net, loss, data, held_out, options, checkpoint=Path(name) / "run")
     updates = [after - before for i, (before, after) in enumerate(pairwise(asked), start=1) if i % every]
     updates = updates or list(np.diff(asked))
     seconds["update"] += updates
@@ -110,7 +114,7 @@ def round_of(
 
 @contextlib.contextmanager
 def timed(into: list[float]) -> Iterator[None]:
-    """Add the processor seconds that the block took."""
+    """Add the CPU seconds that the block took."""
     began = time.process_time()
     yield
     into.append(time.process_time() - began)

@@ -36,7 +36,7 @@ TINY = {
     "seed": ["--models", "onestep", "--envs", "tsm/Reacher-v0", "--little", "1"],
 }
 SPEEDS, SECONDS = {"steps_per_second"}, {"seconds"}
-ROWS = {  # condition -> metrics
+ROWS = {  # configuration -> metrics
     "collect": {"env.step": {"steps_per_second", "steps_per_core_second"}, "mj_step": SPEEDS},
     "train": {
         "teacher_forced_loss": {"targets_per_second"}, "loss": {"targets_per_second"}, "batch": {"windows_per_second"},
@@ -70,7 +70,7 @@ def test_a_benchmark_states_ratios_with_their_spread(name: str, place: Path, mon
     values: dict[str, set[str]] = {}
     rows = _rounds.load(place / "bench" / f"{name}.csv")
     for row, columns in rows:
-        values.setdefault(columns["condition"], set()).add(columns["metric"])
+        values.setdefault(columns["configuration"], set()).add(columns["metric"])
         assert row.ratio == tuple(sorted(row.ratio)), row.what
         assert row.n == 2
         assert row.peak_bytes is None or row.peak_bytes > 2**26
@@ -107,7 +107,7 @@ def test_of_several_rows_the_worst_is_held_against_a_target() -> None:
     def row(ratio: float) -> _rounds.Row:
         return _rounds.Row("ten", "one", 1.0, "s", (ratio, ratio, ratio), 1)
 
-    found = {"policy": [(row(ratio), {"condition": "copies"}) for ratio in (2.0, 3.0)]}
+    found = {"policy": [(row(ratio), {"configuration": "copies"}) for ratio in (2.0, 3.0)]}
     (line,) = (line for line in _table.targets(found) if line[0].startswith("ten policies"))
     assert line[2].startswith("3 ")
     assert line[3] == "**not reached**"

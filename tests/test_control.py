@@ -17,7 +17,7 @@ from torch import Tensor
 from tsmlib import rewards, study
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import imperfect
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, imperfections
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
@@ -421,7 +421,7 @@ def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
 def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
     for env in (REACHER, PUSH):
         plain, task = study.task(env, split), study.task(imperfect(env, **how), split)
-        assert (task.name, task.horizon, imperfections(task.env)[0]) == (plain.name, plain.horizon, env)
+        assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (plain.name, plain.horizon, env)
         assert task.env != env
         np.testing.assert_array_equal(task.start, plain.start)
         assert torch.equal(task.target, plain.target)
@@ -429,7 +429,7 @@ def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: st
 
 def test_pushing_without_an_object_is_refused() -> None:
     with pytest.raises(ValueError, match=f"there is nothing to push in {REACHER}"):
-        dataclasses.replace(some_task(), name="push")
+        dataclasses.replace(some_task(), name="push", reward_for=rewards.push, position=rewards.BLOCK)
 
 
 def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

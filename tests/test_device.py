@@ -24,11 +24,11 @@ from tsmlib.planning.base import Planner, SearchSpace
 from tsmlib.planning.planners import adam, cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.policies.learning import learn_policy
+from tsmlib.policies.learning import LearningOptions, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
-from tsmlib.study import runs
-from tsmlib.training.fit import fit
+from tsmlib.study import runs, zoo
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ def agree(found: Tensor, expected: Tensor, device: str) -> bool:
     return found.device == expected.device and torch.allclose(found, expected, rtol=close, atol=close)
 
 
-@pytest.fixture(params=["tsm", "tsm, direct", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"])
+@pytest.fixture(params=["tsm", "tsm, state skip", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"])
 def case(request: pytest.FixtureRequest) -> Case:
     return MODELS[request.param]
 
@@ -95,8 +95,8 @@ def test_a_model_trained_on_it_comes_back_the_same(case: Case, device: str) -> N
         def trained(place: str, loss: str = loss) -> tuple[Tensor, Tensor]:
             model = case.model(torch.float32)
             curve = fit(
-                model, getattr(model, loss), data, held_out, past_len=model.past_len, future_len=10,
-                steps=2, batch_size=4, validate_every=2, warmup=0, device=place,
+                model, getattr(model, loss), data, held_out,
+                TrainingOptions(model.past_len, 10, steps=2, batch_size=4, validate_every=2, warmup=0), device=place,
             )  # fmt: skip
             return torch.tensor([curve.train, curve.validation]), weights(model)
 
@@ -127,8 +127,9 @@ def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, t
 
             def run(place: str, model: Any = model, loss: Any = loss) -> None:
                 fit(
-                    model, loss, data, held_out, past_len=10, future_len=10, checkpoint=folder,
-                    steps=4, batch_size=8, validate_every=2, warmup=0, device=place,
+                    model, loss, data, held_out,
+                    TrainingOptions(10, 10, steps=4, batch_size=8, validate_every=2, warmup=0),
+                    checkpoint=folder, device=place,
                 )  # fmt: skip
 
             with suppress(KeyboardInterrupt):
@@ -203,8 +204,8 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
         def draw(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
             return starts[torch.randint(8, (n,), generator=generator)], torch.randn(n, 2, generator=generator)
 
-        model = new_model()
-        learn_policy(policy.to(place), model.to(place), reward, draw, horizon=12, iterations=2, episodes=3)
+        model, options = new_model(), LearningOptions(horizon=12, iterations=2, episodes=3)
+        learn_policy(policy.to(place), model.to(place), reward, draw, options)
         past = Segment(*(part[:4, :10].float() for part in seen))
         return policy, controller(policy, torch.zeros(4, 2))(past)
 
@@ -217,8 +218,9 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
 def test_what_study_makes_there_is_what_it_makes_here(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study.models, "bf16_pays", lambda *_: False)
-
+    onestep = zoo.ZOO["onestep"]
+    exact = replace(onestep, stages=tuple(replace(stage, bf16=False) for stage in onestep.stages))
+    monkeypatch.setitem(zoo.ZOO, "onestep", exact)
     first = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     study.load_or_train(first, REACHER, "prior")  # would take long on an imitation
 
@@ -228,12 +230,12 @@ def test_what_study_makes_there_is_what_it_makes_here(
         task = study.task(REACHER).take(2)
         assert study.load_or_train(run, REACHER, "onestep")[1]["device"] == place
         plans = [
-            study.plan(run, task, "onestep", "cem", "codes"),
-            study.plan(run, task, "onestep", "adam+starts", "actions", every=25),
+            study.plan(run, task, study.method("onestep", "latent", "cem")),
+            study.plan(run, task, study.method("onestep", "direct", "adam+starts"), every=25),
         ]
-        later = study.along_the_way(run, task, "onestep", "adam", "actions", iterations=1, at=[1])[1].plan
+        later = study.along_the_way(run, task, study.method("onestep", "direct", "adam"), iterations=1, at=[1])[1].plan
         assert later is not None
-        policy, header = study.learn(run, task, "onestep", "actions", copies=2, iterations=1)
+        policy, header = study.learn(run, task, study.method("onestep", "direct", "policy"), study.Budget(2, 1))
         assert header["device"] == place
         earned = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
         return (
@@ -265,7 +267,7 @@ def test_the_imitated_one_refuses_tensors_of_two_devices() -> None:
 @pytest.mark.parametrize("word", ["tpu", "cuda:x", "gpu", "cuda:01", "cuda:200", "CUDA"])
 def test_an_unknown_device_is_refused(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "collect", "--device", word]) == 2
-    assert f"--device is '{word}', expected cpu, cuda" in capsys.readouterr().err
+    assert f"device is '{word}', expected cpu, cuda" in capsys.readouterr().err
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_starts(

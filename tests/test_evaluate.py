@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.evaluation import contacts, prediction
-from tsmlib.evaluation.prediction import Fitted
+from tsmlib.evaluation import contacts, prediction, scoring
+from tsmlib.evaluation.scoring import Fitted
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Trajectories, Window
@@ -80,11 +80,17 @@ FEATURES = Features(2, ())
 
 
 def draw(model: Linear, data: Trajectories, samples: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    return prediction.predict(model, FEATURES, data, samples=samples, seed=seed, **OPEN)
+    return predicted_and_true(model, data, samples=samples, seed=seed, **OPEN)
+
+
+def predicted_and_true(model: Linear, data: Trajectories, **options: Any) -> tuple[Tensor, Tensor]:
+    states = prediction.sample_states(model, data, **options)
+    truth = prediction.cut(data.padded(0).states, options["starts"], options["horizon"])
+    return prediction.scored(FEATURES, states), prediction.scored(FEATURES, truth)
 
 
 def measured(samples: Tensor, truth: Tensor, fitted: Fitted, copies: int = 1) -> dict[str, Tensor]:
-    return prediction.measure(samples, truth, fitted, copies, torch.Generator().manual_seed(0))[0]
+    return scoring.measure(samples, truth, fitted, copies, torch.Generator().manual_seed(0))[0]
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -104,7 +110,7 @@ def predicted() -> tuple[Tensor, Tensor]:
 
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
-    return prediction.fit(*draw(Linear(), episodes(seed=1), samples=400, seed=1), copies=400)
+    return scoring.fit(*draw(Linear(), episodes(seed=1), samples=400, seed=1), copies=400)
 
 
 @pytest.fixture(scope="module")
@@ -139,14 +145,14 @@ def test_every_model_starts_from_the_same_step_however_little_past_it_needs() ->
         past_len = 1
 
     for model in (Mode(), Short(past_len=1)):
-        samples, truth = prediction.predict(model, FEATURES, episodes(5), samples=1, horizon=4, starts=(10,))
+        samples, truth = predicted_and_true(model, episodes(5), samples=1, horizon=4, starts=(10,))
         np.testing.assert_array_equal(truth, episodes(5).states[:, 11:15])
         expected = KEEP.numpy() * episodes(5).states[:, 10] + episodes(5).actions[:, 10]
         np.testing.assert_allclose(samples[0, :, 0], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_segments_start_from_the_true_past() -> None:
-    samples, truth = prediction.predict(Mode(), FEATURES, episodes(6), samples=1, horizon=5, starts=(5, 10, 20))
+    samples, truth = predicted_and_true(Mode(), episodes(6), samples=1, horizon=5, starts=(5, 10, 20))
     assert truth.shape == (18, 5, 2)
     for row, start in ((0, 5), (1, 10), (2, 20), (17, 20)):
         states, actions = episodes(6).states[row // 3], episodes(6).actions[row // 3]
@@ -165,7 +171,7 @@ def test_the_same_seed_draws_the_same_samples() -> None:
 @pytest.mark.parametrize("options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(0,))])
 def test_a_horizon_that_does_not_fit_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"at least one step is observed first, and episodes have {T}"):
-        prediction.predict(Linear(), FEATURES, episodes(3), samples=1, **options)
+        predicted_and_true(Linear(), episodes(3), samples=1, **options)
 
 
 def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_repeated() -> None:
@@ -176,7 +182,7 @@ def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_r
 
     seen: list[Segment] = []
     data = episodes(3)
-    prediction.predict(Recorder(), FEATURES, data, samples=1, horizon=5, starts=(2,))
+    predicted_and_true(Recorder(), data, samples=1, horizon=5, starts=(2,))
     states, actions = seen[0]
     assert torch.equal(states[:3, : PAST - 2], torch.from_numpy(data.states[:, :1]).expand(-1, PAST - 2, -1))
     assert torch.equal(states[:3, PAST - 2 :], torch.from_numpy(data.states[:, 1:3]))
@@ -259,19 +265,19 @@ def test_the_likelihood_with_a_variance_per_step_and_dimension_is_the_analytic_o
 
 def test_the_floor_of_a_model_without_noise_is_its_error() -> None:
     error = 0.05 * normal(4000, 3, 2)
-    floor = prediction.fit_floor(torch.zeros(5, 4000, 3, 2), error)
+    floor = scoring.fit_floor(torch.zeros(5, 4000, 3, 2), error)
     assert floor == pytest.approx(error.square().mean().item(), rel=1e-5)
     assert floor == pytest.approx(0.05**2, rel=0.05)
 
 
 def test_residual_noise_is_told_apart_from_the_spread_of_the_samples() -> None:
     samples, truth = 0.8 * normal(200, 4000, 1, 2), math.hypot(0.8, 0.6) * normal(4000, 1, 2, seed=1)
-    own = prediction.fit_own(samples, truth)
+    own = scoring.fit_own(samples, truth)
     torch.testing.assert_close(own, torch.full((1, 2), 0.36), rtol=0.3, atol=0)
     exact = gaussian(truth, torch.ones(2)).mean()
-    assert prediction.ll_own(samples, truth, own).mean() == pytest.approx(exact.item(), abs=0.02)
+    assert scoring.ll_own(samples, truth, own).mean() == pytest.approx(exact.item(), abs=0.02)
     for share in (0.7, 1.4):
-        assert prediction.ll_own(samples, truth, share * own).mean() < prediction.ll_own(samples, truth, own).mean()
+        assert scoring.ll_own(samples, truth, share * own).mean() < scoring.ll_own(samples, truth, own).mean()
 
 
 def test_the_own_density_of_the_system_is_the_analytic_one(
@@ -283,15 +289,15 @@ def test_the_own_density_of_the_system_is_the_analytic_one(
 
 def test_thirty_iterations_are_enough() -> None:
     samples, truth = normal(100, 200, 1, 4), 1.1 * normal(200, 1, 4, seed=1)
-    short, long = (prediction.fit_own(samples, truth, iterations=n) for n in (30, 200))
-    assert prediction.ll_own(samples, truth, long).mean() - prediction.ll_own(samples, truth, short).mean() < 0.01
+    short, long = (scoring.fit_own(samples, truth, iterations=n) for n in (30, 200))
+    assert scoring.ll_own(samples, truth, long).mean() - scoring.ll_own(samples, truth, short).mean() < 0.01
 
 
 def test_two_modes_are_told_from_one_in_between() -> None:
     side = torch.where(normal(600, 1, 1) > 0, 1.0, -1.0)
     samples = torch.where(normal(100, 600, 1, 1, seed=1) > 0, 1.0, -1.0)
     truth = side + 0.1 * normal(600, 1, 1, seed=2)
-    scores = measured(samples, truth, prediction.fit(samples, truth, copies=1))
+    scores = measured(samples, truth, scoring.fit(samples, truth, copies=1))
     exact = math.log(0.5) - 0.5 * (1 + math.log(2 * math.pi * 0.1**2))  # half a nat of Gaussian, and which side
     assert scores["ll_own"].mean() == pytest.approx(exact, abs=0.05)
     assert scores["ll_own"].mean() > scores["ll_paper"].mean() + 1
@@ -304,9 +310,9 @@ def test_what_few_samples_cost_in_the_papers_likelihood_is_known(count: int) -> 
     exact = gaussian(truth, torch.ones(dims))
     loss = (exact - gaussian(truth - samples.mean(0), samples.var(0)))[:, 0]
     error = loss.std().item() / math.sqrt(trials)
-    assert loss.mean() == pytest.approx(prediction.fit_loss(count, dims), abs=4 * error)
-    assert prediction.fit_loss(1000, dims) == pytest.approx(dims / 1000, rel=0.02)
-    assert prediction.fit_loss(3, dims) == math.inf
+    assert loss.mean() == pytest.approx(scoring.fit_loss(count, dims), abs=4 * error)
+    assert scoring.fit_loss(1000, dims) == pytest.approx(dims / 1000, rel=0.02)
+    assert scoring.fit_loss(3, dims) == math.inf
 
 
 # Proper scores -------------------------------------------------------------------------------------------------------
@@ -327,13 +333,13 @@ def slow_distances(samples: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 def test_energy_score_and_crps_are_those_of_a_double_loop() -> None:
     samples, truth = normal(7, 4, 3, 2), normal(4, 3, 2, seed=1)
     slow = slow_distances(samples, truth)
-    for fast, exact in zip(prediction.distances(samples, truth, shifts=6), slow, strict=True):
+    for fast, exact in zip(scoring.distances(samples, truth, shifts=6), slow, strict=True):
         torch.testing.assert_close(fast, exact)
 
 
 def test_a_few_shifts_of_many_samples_are_unbiased() -> None:
     samples, truth = normal(8, 20_000, 1, 3), normal(20_000, 1, 3, seed=1)
-    for fast, slow in zip(prediction.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True):
+    for fast, slow in zip(scoring.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True):
         difference = (fast - slow)[:, 0]
         assert difference.std() > 0.01
         assert difference.mean() == pytest.approx(0, abs=4 * difference.std().item() / math.sqrt(20_000))
@@ -341,12 +347,12 @@ def test_a_few_shifts_of_many_samples_are_unbiased() -> None:
 
 def test_the_scores_of_a_normal_are_its_crps() -> None:
     samples, truth = 0.7 * normal(4000, 1, 5, 1), torch.linspace(-1, 1, 5)[None, :, None]
-    for score in prediction.distances(samples, truth):
+    for score in scoring.distances(samples, truth):
         torch.testing.assert_close(score, crps_of(truth[..., 0], 0.7), rtol=0, atol=0.03)
 
 
 def test_a_single_sample_is_scored_by_its_distance() -> None:
-    energy, crps = prediction.distances(torch.zeros(1, 1, 1, 2), torch.tensor([[[3.0, -4.0]]]))
+    energy, crps = scoring.distances(torch.zeros(1, 1, 1, 2), torch.tensor([[[3.0, -4.0]]]))
     assert energy.item() == 5.0
     assert crps.item() == 3.5
 
@@ -354,16 +360,16 @@ def test_a_single_sample_is_scored_by_its_distance() -> None:
 def test_the_true_distribution_scores_best(predicted: tuple[Tensor, Tensor]) -> None:
     samples, truth = (part[..., ::5, :] for part in predicted)
     centre = samples.mean(0)
-    best = prediction.distances(samples, truth)
+    best = scoring.distances(samples, truth)
     for width in (0.5, 2.0):
-        for score, other in zip(best, prediction.distances(centre + width * (samples - centre), truth), strict=True):
+        for score, other in zip(best, scoring.distances(centre + width * (samples - centre), truth), strict=True):
             assert other.mean() > score.mean()
 
 
 def test_residual_noise_makes_a_forecast_of_a_point() -> None:
     truth = 0.3 * normal(3000, 2, 1)
     point = torch.zeros(1, 3000, 2, 1)
-    fitted = prediction.fit(point, truth, copies=200)
+    fitted = scoring.fit(point, truth, copies=200)
     assert fitted.noise.sqrt().median() == pytest.approx(0.3, rel=0.25)  # the next one of the grid
     scores = measured(point, truth, fitted, copies=200)
     assert scores["energy_score"].mean() == pytest.approx(0.3 * math.sqrt(2 / math.pi), rel=0.02)  # E|x|
@@ -374,7 +380,7 @@ def test_residual_noise_makes_a_forecast_of_a_point() -> None:
 def test_samples_that_are_right_get_no_noise_and_narrow_ones_get_what_they_lack(fitted: Fitted) -> None:
     assert fitted.noise.sqrt().median() < 0.15  # the system's own noise builds up to 0.3 .. 0.7
     samples, truth = 0.8 * normal(60, 3000, 1, 2), normal(3000, 1, 2, seed=1)
-    assert prediction.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
+    assert scoring.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
 
 
 # Coverage ------------------------------------------------------------------------------------------------------------
@@ -387,17 +393,17 @@ def test_the_truth_lies_within_the_interval_as_often_as_stated(values: dict[str,
 
 @pytest.mark.parametrize("count", [19, 200])
 def test_few_samples_cover_as_often_as_many(count: int) -> None:
-    pit = prediction.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
-    for level in prediction.LEVELS:
-        assert prediction.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
+    pit = scoring.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
+    for level in scoring.LEVELS:
+        assert scoring.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
 
 
 def test_overconfidence_shows(predicted: tuple[Tensor, Tensor]) -> None:
     samples, truth = predicted
     centre = samples.mean(0)
-    pit = prediction.rank(centre + 0.5 * (samples - centre), truth, torch.Generator())
+    pit = scoring.rank(centre + 0.5 * (samples - centre), truth, torch.Generator())
     inside = math.erf(0.5 * 1.2816 / math.sqrt(2))  # of the 80 % interval at half the width
-    assert prediction.coverage(pit, 0.8).mean() == pytest.approx(inside, abs=0.02)
+    assert scoring.coverage(pit, 0.8).mean() == pytest.approx(inside, abs=0.02)
 
 
 # The whole -----------------------------------------------------------------------------------------------------------
@@ -417,7 +423,7 @@ def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) ->
 def test_scoring_block_by_block_is_scoring_all_samples_at_once(model: Linear) -> None:
     scores = run(model, episodes(21))
     samples, truth = draw(model, episodes(21), samples=20)
-    whole, pit = prediction.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
+    whole, pit = scoring.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
     torch.testing.assert_close(scores.pit, pit, rtol=0, atol=1 / 21)  # ranks are drawn between two samples
     assert set(scores.values) == set(whole)
     for metric, value in scores.values.items():
@@ -474,9 +480,9 @@ def test_the_caller_chooses_what_to_average_over() -> None:
     curve = scores.against_horizon(steps)["energy_score"]
     assert curve[7] == pytest.approx(energy[3:5, 7].mean().item())
     assert curve[6].isnan()
-    expected = [prediction.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in prediction.LEVELS]
+    expected = [scoring.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in scoring.LEVELS]
     torch.testing.assert_close(scores.calibration(steps), torch.stack(expected))
-    torch.testing.assert_close(scores.calibration(half)[9], prediction.coverage(scores.pit[:15], 0.5).mean())
+    torch.testing.assert_close(scores.calibration(half)[9], scoring.coverage(scores.pit[:15], 0.5).mean())
 
 
 def test_segments_are_scored_as_the_horizon_is() -> None:

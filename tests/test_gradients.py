@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,8 +49,7 @@ def test_a_value_that_does_not_depend_on_a_variable_is_refused() -> None:
 
 
 def some_task(n: int = 3, *, horizon: int = 20) -> Task:
-    task = study.task("tsm/Reacher-v0").take(n)
-    return Task(task.name, task.env, task.start, task.target, horizon)
+    return replace(study.task("tsm/Reacher-v0").take(n), horizon=horizon)
 
 
 def prior() -> ActionPrior:

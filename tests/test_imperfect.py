@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 import warnings
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 from tsmlib import study
 from tsmlib.envs import fingerprint, imperfect
 from tsmlib.envs.geometry import HALF_RANGE
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, imperfections
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
 
@@ -23,7 +25,8 @@ def test_a_name_says_what_is_imperfect_and_nothing_else(env_id: str) -> None:
     names = set()
     for noise, delay in itertools.product([0.0, 0.0001, 0.1, NOISE, 1.0, 9.8765, 10.0], [0, 1, DELAY, 100]):
         name = imperfect(env_id, noise=noise, delay=delay)
-        assert imperfections(name) == (env_id, noise, delay)
+        found = EnvSpec.parse(name)
+        assert (found.id, found.arm.id, found.noise, found.delay) == (name, env_id, noise, delay)
         names.add(name)
     assert len(names) == 28
     assert imperfect(env_id) == env_id
@@ -90,7 +93,7 @@ def test_only_a_plain_arm_is_made_imperfect() -> None:
                                     "tsm/Reacher-delay5-noise0.25-v0", ""])  # fmt: skip
 def test_another_name_is_refused(env_id: str) -> None:
     with pytest.raises(ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*nor what imperfect\(\) calls"):
-        imperfections(env_id)
+        EnvSpec.parse(env_id)
 
 
 def test_data_of_other_imperfections_are_other_data() -> None:
@@ -126,3 +129,13 @@ def test_noise_is_in_half_ranges() -> None:
     env.reset(seed=0)
     off = env.rollout(np.zeros((20, 50, 2))) - env.truth[:, 1:]
     np.testing.assert_allclose(off.std((0, 1)), 0.5 * np.array(HALF_RANGE), rtol=0.08)  # 3 standard errors are 0.067
+
+
+def test_gymnasium_finds_the_arms_by_themselves_and_imports_a_simulator_when_one_is_made() -> None:
+    program = """import sys, gymnasium, tsmlib.envs
+assert not {"mujoco", "pymunk", "torch", "matplotlib"} & set(sys.modules)
+gymnasium.make("tsm/PymunkPush-v0").reset()
+assert "mujoco" not in sys.modules"""
+    for text in ('import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v0").reset()', program):
+        done = subprocess.run([sys.executable, "-W", "error", "-c", text], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, "")

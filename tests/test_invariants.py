@@ -1,4 +1,4 @@
-"""The true world keeps its invariants; what a careless model dreams does not, and is found."""
+"""The true world never violates physics; a careless model's rollout does, and is found."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import closest_gap, fingertip
 from tsmlib.evaluation.actions import novelty, roughness, within
-from tsmlib.evaluation.exploitation import broken, shares, worst
+from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
 
@@ -33,10 +33,10 @@ def still(n: int = 1, steps: int = 50, *, block: tuple[float, float] = (0.0, 0.1
 @pytest.mark.parametrize(("env_id", "rms"), [(PUSH, 0.1), (PUSH, 0.3), (PYMUNK, 0.1), (PYMUNK, 0.3)])
 def test_the_true_world_breaks_nearly_none(env_id: str, rms: float) -> None:
     states = world(env_id, rms=rms)
-    found = broken(states, env_id)
+    found = violations(states, env_id)
     assert (closest_gap(states, env_id) < 1e-3).any(1).mean() > 0.2  # objects are met
-    assert found["broken"].shape == (200, 50)
-    assert found["broken"].mean() < 1e-3
+    assert found["violations"].shape == (200, 50)
+    assert found["violations"].mean() < 1e-3
     step = np.linalg.norm(np.diff(states[..., 6:8], axis=1), axis=-1)
     sliding = (step > 0.005) & (closest_gap(states, env_id)[:, 1:] > 0.005)
     assert sliding.mean() > 5e-3  # the paper's wording alone would blame the world
@@ -46,7 +46,7 @@ def test_an_object_that_moves_on_its_own_is_found_from_5_mm_on() -> None:
     states = still(3)
     states[1, 20:, 6] += 0.0049
     states[2, 20:, 6] += 0.0051
-    found = broken(states, PUSH)["moves_untouched"]
+    found = violations(states, PUSH)["moves_untouched"]
     assert not found[:2].any()
     assert found[2, 19:].all()  # step k leads to state k + 1
     assert not found[2, :19].any()
@@ -55,7 +55,7 @@ def test_an_object_that_moves_on_its_own_is_found_from_5_mm_on() -> None:
 def test_an_object_that_drifts_slowly_is_found() -> None:
     states = still()
     states[0, :, 7] += 0.0012 * np.arange(51)
-    found = broken(states, PUSH)["moves_untouched"][0]
+    found = violations(states, PUSH)["moves_untouched"][0]
     np.testing.assert_array_equal(found, 0.0012 * np.arange(1, 51) > 0.005)
 
 
@@ -65,9 +65,9 @@ def test_a_pushed_object_may_slide_as_far_as_its_speed_carries_it() -> None:
     sliding = still(2, block=(0.0, 0.1))
     sliding[:, :, 7] += speed * decay * (1 - np.exp(-seconds / decay)) * 0.6
     sliding[:, :, 9] = 0.6 * speed * np.exp(-seconds / decay)
-    assert not broken(sliding, PUSH)["broken"].any()
+    assert not violations(sliding, PUSH)["violations"].any()
     sliding[1, 30:, 7] += 0.02  # and then a little more
-    assert broken(sliding, PUSH)["moves_untouched"].sum(1).tolist() == [0, 21]
+    assert violations(sliding, PUSH)["moves_untouched"].sum(1).tolist() == [0, 21]
 
 
 def test_an_object_that_moves_after_its_contact_has_ended_is_found() -> None:
@@ -75,7 +75,7 @@ def test_an_object_that_moves_after_its_contact_has_ended_is_found() -> None:
     swing = np.radians(-2.0) * np.arange(51)
     touched[:, :, 0] = swing  # the arm leaves
     touched[1, 40:, 7] += 0.05
-    found = broken(touched, PUSH)["moves_untouched"]
+    found = violations(touched, PUSH)["moves_untouched"]
     assert not found[0].any()
     assert found[1, 39:].all()
 
@@ -84,12 +84,12 @@ def test_an_arm_that_passes_through_is_found() -> None:
     through = still(2, block=(0.15, 0.1))
     through[1, :, 0] = np.linspace(0, 2, 51)
     through[1, :, 2] = 2.0
-    found = broken(through, PUSH)
+    found = violations(through, PUSH)
     inside = closest_gap(through[1, 1:], PUSH) < -0.005
     assert inside.sum() > 5
     np.testing.assert_array_equal(found["penetrates"][1], inside)
     assert not found["moves_untouched"].any()
-    assert not found["broken"][0].any()
+    assert not found["violations"][0].any()
 
 
 def test_a_fast_arm_may_hit_the_object_between_two_states() -> None:
@@ -98,7 +98,7 @@ def test_a_fast_arm_may_hit_the_object_between_two_states() -> None:
     hit[0, 10:, 6:8] = (-0.05, 0.2)
     hit[0, 10:, 8:10] = 0.0
     assert closest_gap(hit, PUSH).min() > 0.005
-    assert not broken(hit, PUSH)["moves_untouched"].any()
+    assert not violations(hit, PUSH)["moves_untouched"].any()
 
 
 def test_every_made_up_violation_is_found() -> None:
@@ -106,7 +106,7 @@ def test_every_made_up_violation_is_found() -> None:
     states = world(PUSH)
     alone = np.flatnonzero((closest_gap(states, PUSH) > 0.03).all(1))
     states[alone, 25:, 6:8] += 0.01 / np.sqrt(2)
-    found = broken(states, PUSH)["moves_untouched"]
+    found = violations(states, PUSH)["moves_untouched"]
     assert len(alone) > 40
     assert found[alone][:, 24:].mean() > 0.999
 
@@ -120,22 +120,22 @@ def test_shares_are_of_the_steps_of_each_plan() -> None:
     expected[0, 3], expected[1, 7] = 0.25, 0.5
     np.testing.assert_allclose(found["moves_untouched"], expected[0])
     np.testing.assert_allclose(found["penetrates"], expected[1])
-    np.testing.assert_allclose(found["broken"], expected.sum(0))
+    np.testing.assert_allclose(found["violations"], expected.sum(0))
 
 
 def test_the_worst_tenth_is_what_was_promised_most_in_excess() -> None:
     error = np.zeros(20)
-    error[[3, 5, 9]] = 2.0, 1.0, -7.0  # promised less than came true: no exploitation
+    error[[3, 5, 9]] = 2.0, 1.0, -7.0  # predicted less than executed: no exploitation
     assert sorted(worst(error)) == [3, 5]
     assert worst(error[:3]).tolist() == [0]  # at least one
 
 
 def test_states_without_an_object_or_a_number_are_refused() -> None:
     with pytest.raises(ValueError, match="no object moves in tsm/ReacherObstacle-v0"):
-        broken(still(), "tsm/ReacherObstacle-v0")
+        violations(still(), "tsm/ReacherObstacle-v0")
     for wrong in (still()[:, :1], still() * np.nan):
         with pytest.raises(ValueError, match="at least 1, all finite"):
-            broken(wrong, PUSH)
+            violations(wrong, PUSH)
 
 
 # Actions -------------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib import statistics, study
+from tsmlib import study
 from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
 from tsmlib.evaluation import contacts, exploitation, futures, latent, prediction
 from tsmlib.evaluation.contacts import Deflections
@@ -18,6 +18,8 @@ from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.tsm import TSM
+from tsmlib.storage import tables
+from tsmlib.study import zoo
 from tsmlib.study.results import latent as latent_results
 from tsmlib.trajectory import Segment, Trajectories, Window
 
@@ -86,7 +88,7 @@ def test_units_count_as_active_from_a_variance_of_a_hundredth_on() -> None:
 
 def test_each_dimension_of_a_linear_decoder_matters_by_its_own_weight() -> None:
     shifts: Any = Shifts()
-    found = latent.importance(shifts, still_window(20000), rng())
+    found = latent.total_effects(shifts, still_window(20000), rng())
     torch.testing.assert_close(found, shifts.reach / math.sqrt(3), rtol=0.03, atol=1e-6)  # one of three features moves
 
 
@@ -132,13 +134,6 @@ def test_every_step_counts_alike_however_often_it_occurs() -> None:
     assert math.isnan(latent.root_mean(squares, torch.zeros(3, 2, dtype=torch.bool)))
 
 
-def test_ranks_agree_disagree_or_say_nothing() -> None:
-    x = torch.tensor([3.0, 1.0, 2.0, 5.0])
-    assert statistics.spearman(x, x**3) == pytest.approx(1)
-    assert statistics.spearman(x, -x) == pytest.approx(-1)
-    assert statistics.spearman(x, torch.ones(4)) == 0
-
-
 def test_groups_are_sorted_by_spread() -> None:
     variance = torch.arange(40.0)[torch.randperm(40, generator=rng())][:, None]
     spread, error = latent.by_spread(variance, 4 * variance)
@@ -158,10 +153,10 @@ def test_a_planted_spread_after_contact_is_found() -> None:
         segment_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
     )
     rows = latent_results.code_rows(net, seen, rng(), model="tsm+energy", seed=0, scale="smoke")
-    value = {(row["metric"], row["condition"]): row["value"] for row in rows}
-    assert value["spread_ratio", "segments"] == pytest.approx(5, rel=0.05)
+    value = {(row["metric"], row.get("subset", "")): row["value"] for row in rows}
+    assert value["spread_ratio", ""] == pytest.approx(5, rel=0.05)
     assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
-    assert value["importance", "segments"] == 0
+    assert value["importance", ""] == 0
     assert not any(metric.startswith(("kl", "error_")) for metric, _ in value)  # of no encoder that was trained for it
 
 
@@ -237,23 +232,23 @@ def test_where_nothing_was_moved_there_are_no_deflections_to_tell_of() -> None:
 
 def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:
     first, second = torch.randn(2, 5000, 8, generator=rng())
-    codes = latent.between(first, second, 5)
+    codes = latent.interpolate(first, second, 5)
     assert torch.equal(codes[0], first)
     assert torch.equal(codes[-1], second)
     torch.testing.assert_close(codes.square().mean((1, 2)), torch.ones(5), atol=0.03, rtol=0)
     with pytest.raises(ValueError, match="at least 2"):
-        latent.between(first, second, 1)
+        latent.interpolate(first, second, 1)
 
 
 def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(model: TSM, test_data: Trajectories) -> None:
     seen = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=30)
     window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
     z = torch.randn(1, 3, generator=rng())
-    once = latent.futures(model, window, z, 30)
-    assert torch.equal(once, latent.futures(model, window, z, 30))
-    assert torch.equal(once[:, :10], latent.futures(model, window, z, 10))
-    torch.testing.assert_close(latent.futures(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1))
-    near = latent.futures(model, window, z + 1e-3, 30)
+    once = latent.decode_codes(model, window, z, 30)
+    assert torch.equal(once, latent.decode_codes(model, window, z, 30))
+    assert torch.equal(once[:, :10], latent.decode_codes(model, window, z, 10))
+    torch.testing.assert_close(latent.decode_codes(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1))
+    near = latent.decode_codes(model, window, z + 1e-3, 30)
     assert 0 < (near - once).abs().max() < 0.1
 
 
@@ -274,21 +269,23 @@ def test_the_plane_of_largest_variance_is_found() -> None:
 
 
 def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() -> None:
-    row = dict(env=PUSH, model="tsm", condition="object", metric="recall", horizon=10)
-    rows = [dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, horizon=h)
-            for k in (0, 1) for m in ("recall", "precision", "chance") for h in (10, 20, 30)]  # fmt: skip
+    row = dict(env=PUSH, model="tsm", execution="open loop", subset="object")
+    rows = tables.frame(dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, steps_ahead=h)
+                        for k in (0, 1) for m in ("recall", "precision", "chance") for h in (10, 20, 30))  # fmt: skip
     found = latent_results.recall_panels(rows, PUSH)
     assert list(found) == ["arm touches object"]
-    np.testing.assert_allclose(found["arm touches object"]["tsm"]["recall"], [[0.5] * 3, [0.6] * 3])
+    np.testing.assert_allclose(found["arm touches object"][zoo.method("tsm")]["recall"], [[0.5] * 3, [0.6] * 3])
     assert latent_results.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
-    kl = dict(env=PUSH, model="tsm", condition="segments contact", metric="kl", seed=0, value=2.0)
-    assert latent_results.use_panels([kl], [PUSH])["KL per segment"]["Push, with a touch"]["tsm"].tolist() == [2.0]
+    kl = dict(env=PUSH, model="tsm", execution="segments", subset="contact", metric="kl", seed=0, value=2.0)
+    panels = latent_results.use_panels(tables.frame([kl]), [PUSH])["KL per segment"]
+    assert panels["ReacherPush, with a touch"][zoo.method("tsm")].tolist() == [2.0]
+    assert panels["ReacherPush, no touch"] == {}
 
 
-def test_bars_stand_beside_the_mean_over_seeds() -> None:
-    row = dict(metric="kl", condition="segments", env="tsm/Reacher-v0", model="tsm")
-    table = latent_results.reached(
-        [dict(row, value=0.02), dict(row, value=0.04), dict(row, model="lstm", value=9.0)], ["tsm"]
-    )
-    assert "| `tsm/Reacher-v0`: kl | at most 0.1 | 0.03 |" in table
+def test_thresholds_stand_beside_the_mean_over_seeds() -> None:
+    row = dict(metric="kl", execution="segments", env="tsm/Reacher-v0", model="tsm", seed=0)
+    rows = [dict(row, value=0.02), dict(row, value=0.04, seed=1), dict(row, model="lstm", value=9.0)]
+    table = latent_results.thresholds_table(tables.frame(rows), ["tsm"])
+    line = table.splitlines()[2]
+    assert [cell.strip() for cell in line.split("|")[1:-1]] == ["`tsm/Reacher-v0`: kl", "at most 0.1", "0.03"]
     assert "9" not in table.replace("0.9", "")

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from tsmlib import figures
 from tsmlib.envs.render import draw_scene
 from tsmlib.figures import style
+from tsmlib.study.zoo import method
 
-LABELS = ("tsm", "tsm+energy+direct")
+TSM, SKIP = METHODS = method("tsm"), method("tsm+energy+direct")
 DRAW = partial(draw_scene, env_id="tsm/ReacherPush-v0")
 START = np.array([0.2, 0.3, 0, 0, 0.19, 0.07, 0.1, 0.12, 0, 0])
 PATH = START[6:8] + np.linspace(0, 0.1, 30)[:, None]
@@ -32,7 +33,7 @@ def fan(*shape: int) -> np.ndarray:
 
 
 def use() -> Figure:
-    values = {"Reacher": {"tsm": np.array([0.001])}, "Push": {label: np.array([1.0, 2.0, 3.0]) for label in LABELS}}
+    values = {"Reacher": {TSM: np.array([0.001])}, "Push": {label: np.array([1.0, 2.0, 3.0]) for label in METHODS}}
     return figures.code_use(
         {"KL": values, "spread": values}, {"KL": "nats", "spread": "share"}, {"KL": {"Reacher": 0.1}, "spread": {}}
     )
@@ -41,43 +42,43 @@ def use() -> Figure:
 def recall(**more: np.ndarray) -> Figure:
     shares = {word: np.full((2, 3), 0.5) for word in ("recall", "precision", "chance")} | more
     return figures.contact_recall(
-        {"arm": dict.fromkeys(LABELS, shares), "wall": {"tsm": shares}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}
+        {"arm": dict.fromkeys(METHODS, shares), "wall": {TSM: shares}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}
     )
 
 
 def wheel() -> Figure:
-    way = np.where(np.arange(50) % 2, np.linspace(-3, 3, 50), np.nan)
-    return figures.embedding({"codes": noise(50, 2)}, {"codes": way}, {"codes": ("first", "second")})
+    angle = np.linspace(-3, 3, 50)
+    way = np.stack([np.cos(angle), np.sin(angle)], 1) * (np.arange(50) % 2)[:, None]
+    return figures.embedding({"codes": (noise(50, 2), way, ("first", "second"))})
 
 
 def ten(changed: float = 0.5) -> Figure:
-    plans = {title: noise(50, 2) for title in ("data (reach)", "prior, a sample", "reach, over codes", "push")}
+    ways = method("data"), method("prior", variant="a sample"), method("tsm", "latent", "cem"), method("tsm", "direct")
+    plans = {way: noise(50, 2) for way in ways}
     return figures.figure10(plans, 0.02, dict.fromkeys(plans, changed))
 
 
 SPECTRUM = (np.arange(1, 26.0), np.arange(1, 26.0) ** -2)
 EVERY: dict[str, Callable[[], Figure]] = {
     "code_use": use,
-    "around_touch": lambda: figures.around_touch(
-        {label: {"spread": abs(noise(30)), "error": abs(noise(30))} for label in LABELS}, 4
-    ),
+    "around_touch": lambda: figures.around_touch({label: (abs(noise(30)), abs(noise(30))) for label in METHODS}, 4),
     "spread_against_error": lambda: figures.spread_against_error(
-        {env: {label: (np.arange(1, 9.0), np.arange(1, 9.0)) for label in LABELS} for env in ("Push", "Obstacle")}
+        {env: {label: (np.arange(1, 9.0), np.arange(1, 9.0)) for label in METHODS} for env in ("Push", "Obstacle")}
     ),
     "figure9": lambda: figures.figure9(
-        DRAW, np.stack([START] * 3), np.stack([PATH] * 3), {label: fan(5, 3) for label in LABELS}
+        DRAW, np.stack([START] * 3), np.stack([PATH] * 3), dict.fromkeys(METHODS, fan(5, 3))
     ),
     "contact_recall": recall,
     "deflection_intervals": lambda: figures.deflection_intervals(
-        {label: (-abs(noise(20)), noise(20) + 9) for label in LABELS}
+        {label: (-abs(noise(20)), noise(20) + 9) for label in METHODS}
     ),
     "walk": lambda: figures.walk(DRAW, START, fan(9), {9: 0.02, 17: 0.01, 33: 0.005}),
     "embedding": wheel,
-    "code_grid": lambda: figures.code_grid(START, fan(3, 3), PATH, (-1, 0, 1), "tsm"),
-    "one_code": lambda: figures.one_code(DRAW, START, PATH, fan(6), PATH, "tsm"),
+    "code_grid": lambda: figures.code_grid(START, fan(3, 3), PATH, (-1, 0, 1), TSM, radius=0.03),
+    "one_code": lambda: figures.one_code(DRAW, START, PATH, fan(6), PATH, TSM),
     "figure10": ten,
     "spectra": lambda: figures.spectra(
-        {"reach": {"data": SPECTRUM, "plans": SPECTRUM}}, {"data": ("data", "-"), "plans": ("tsm", ":")}
+        {"reach": {method("data"): SPECTRUM, method("tsm", "direct", "adam"): SPECTRUM}}
     ),
     "prior_walks": lambda: figures.prior_walks(noise(4, 9, 10, 2), 0.02),
     "cost_of_prior": lambda: figures.cost_of_prior(
@@ -94,17 +95,17 @@ def test_every_figure_is_as_wide_as_a_page_at_most_and_leaves_none_open(word: st
     assert not plt.get_fignums()
 
 
-def marks(ax: Axes, label: str) -> list[tuple[float, float]]:
+def marks(ax: Axes, method: figures.Method) -> list[tuple[float, float]]:
     """Where the marks of a model stand."""
-    main = style.COLOURS[label].lower()
+    main = method.look.colour.lower()
     lines = [line for line in ax.lines if to_hex(line.get_color()) == main and line.get_marker() not in ("None", "")]
     return [(float(line.get_xdata()[0]), float(line.get_ydata()[0])) for line in lines]
 
 
 def test_a_row_has_the_mean_over_seeds_of_each_model() -> None:
     left = use().axes[0]
-    assert marks(left, "tsm") == [(0.001, 0), (2.0, 1)]
-    assert marks(left, "tsm+energy+direct") == [(2.0, 1)]
+    assert marks(left, TSM) == [(0.001, 0), (2.0, 1)]
+    assert marks(left, SKIP) == [(2.0, 1)]
 
 
 def test_every_sample_of_figure_9_is_drawn_from_where_the_object_was() -> None:
@@ -117,16 +118,16 @@ def test_every_sample_of_figure_9_is_drawn_from_where_the_object_was() -> None:
 
 
 def test_an_interval_that_misses_the_truth_is_pale() -> None:
-    figure = figures.deflection_intervals({"tsm": (np.array([-5.0, 3.0]), np.array([5.0, 20.0]))})
+    figure = figures.deflection_intervals({TSM: (np.array([-5.0, 3.0]), np.array([5.0, 20.0]))})
     dark, pale = (to_hex(line.get_color()) for line in figure.axes[0].lines[:2])
-    assert dark == style.COLOURS["tsm"].lower() != pale
+    assert dark == TSM.look.colour.lower() != pale
     assert "50% hold the truth" in figure.axes[0].texts[0].get_text()
 
 
 def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
     figure = ten(0.25)
     mains = [to_hex(ax.lines[1].get_color()).upper() for ax in figure.axes]
-    assert mains == [style.COLOURS[word] for word in ("data", "prior", "tsm", "tsm")]
+    assert mains == [method(word).look.colour for word in ("data", "prior", "tsm", "tsm")]
     assert "0.25" in figure.axes[0].texts[0].get_text()
 
 
@@ -136,7 +137,7 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="not finite"):
         figures.walk(DRAW, START, np.full((9, 30, 2), np.nan), {9: 0.1})
     with pytest.raises(ValueError, match="expected"):
-        figures.code_grid(START, fan(3, 3), PATH, (-1, 1), "tsm")
+        figures.code_grid(START, fan(3, 3), PATH, (-1, 1), TSM, radius=0.03)
 
 
 def test_a_turned_knob_draws_the_picture_anew() -> None:

@@ -15,8 +15,8 @@ from tsmlib import study
 from tsmlib.models.features import Features
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task
-from tsmlib.rewards import push, reach
 from tsmlib.storage import tables
+from tsmlib.study import zoo
 from tsmlib.study.results.policies import learning_curves
 from tsmlib.study.runs import ROOT
 
@@ -44,7 +44,7 @@ def played(env: str, n: int = 4) -> tuple[Task, torch.Tensor, np.ndarray, np.nda
     episodes = model_free.Episodes(env, n, seed=3)
     episodes.reset()
     start, target = episodes.arms._states.astype(np.float32), episodes.arms.target.astype(np.float32)
-    task = Task("push" if "Push" in env else "reach", env, start, torch.from_numpy(target))
+    task = Task.standard(env, start, torch.from_numpy(target))
     episodes.arms.reset(options={"states": start, "target": target})  # as a task keeps them, in single precision
     seen, rewards, over = [model_free.observed(start, target)], [], []
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (n, task.horizon, 2)).astype(np.float32)
@@ -64,7 +64,7 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
     states = trial.states.numpy()
     flat = model_free.observed(states.reshape(-1, states.shape[2]), np.repeat(task.target.numpy(), 51, axis=0))
     np.testing.assert_allclose(seen.reshape(len(flat), -1), flat, rtol=1e-6, atol=1e-6)
-    per_step = (push if task.name == "push" else reach)(task.target)(trial.states[:, 1:], actions)
+    per_step = task.reward(trial.states[:, 1:], actions)
     np.testing.assert_allclose(rewards, per_step, atol=1e-6)
     np.testing.assert_allclose(rewards.sum(1), trial.executed_return, atol=1e-5)
 
@@ -110,8 +110,8 @@ def records(*steps: int) -> list[dict[str, float]]:
 
 def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path) -> None:
     path, task = tmp_path / "model_free.csv", study.task("tsm/Reacher-v0")
-    key = dict(env=task.env, model="ppo", condition="learning", configuration="std=0.14", seed=1)
-    for other in ({"seed": 2}, {"model": "trpo"}, {"condition": "search"}, {"configuration": "std=0.37"}):
+    key = dict(env=task.env, model="ppo", subset="", configuration="std=0.14", seed=1)
+    for other in ({"seed": 2}, {"model": "trpo"}, {"subset": "search"}, {"configuration": "std=0.37"}):
         model_free.Table(path).put(key | other, task, records(0, 500))
     table = model_free.Table(path)
     assert table.kept(key, 1) == []
@@ -120,16 +120,16 @@ def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path
     model_free.Table(path).put(key, task, records(0, 500, 1000))
     kept = model_free.Table(path).kept(key, 1000)
     assert [row["value"] for row in kept if row["metric"] == "return_true"] == [-1.0, -2.0, -3.0]
-    assert len(tables.load_table(path)) == (4 * 2 + 3) * len(model_free.UNITS)
+    assert len(tables.records(tables.load(path))) == (4 * 2 + 3) * len(model_free.UNITS)
 
 
 def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
     table, task = model_free.Table(tmp_path / "model_free.csv"), study.task("tsm/Reacher-v0")
     for seed in range(3):
-        key = dict(env=task.env, model="trpo", condition="learning", configuration="std=0.14", seed=seed)
+        key = dict(env=task.env, model="trpo", subset="", configuration="std=0.14", seed=seed)
         table.put(key, task, [record | {"seconds": 99.0} for record in records(0, 500, 1000)])
-    table.put(key | {"condition": "search"}, task, records(200))
-    curves = learning_curves(tables.load_table(table.path))["reach"]["trpo"]
+    table.put(key | {"subset": "search"}, task, records(200))
+    curves = learning_curves(tables.load(table.path))["reach"][zoo.method("trpo")]
     assert curves["return_true"].tolist() == [[-1.0, -2.0, -3.0]] * 3
     assert curves["samples"].tolist() == [0, 500, 1000]
     assert curves["seconds"].tolist() == [-1.0, -2.0, -3.0]  # the processor's
@@ -180,10 +180,10 @@ def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureF
         model_free.main([*command, "--out", str(path)])
     first, second = capsys.readouterr().out.split(f"{path}\n")[:2]
     assert first == second
-    rows = tables.load_table(path)
-    assert {row["seed"] for row in rows if row["condition"] == "learning"} == {0, 1}
-    assert len({row["configuration"] for row in rows if row["condition"] == "search"}) == 6
-    assert len({row["configuration"] for row in rows if row["condition"] == "learning"}) == 1
+    rows = tables.records(tables.load(path))
+    assert {row["seed"] for row in rows if row["subset"] == ""} == {0, 1}
+    assert len({row["configuration"] for row in rows if row["subset"] == "search"}) == 6
+    assert len({row["configuration"] for row in rows if row["subset"] == ""}) == 1
 
 
 def pins(path: Path) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,20 @@ import pytest
 from tsmlib.storage import manifest, tables
 from tsmlib.study import notebooks, parameters, runs
 
-NOTEBOOKS = list(runs.notebooks().values())
+NOTEBOOKS = [notebook.path for notebook in runs.notebooks().values()]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
 def code(path: Path) -> Iterator[Any]:
     return (cell for cell in nbformat.read(path, 4).cells if cell.cell_type == "code")
+
+
+def changed() -> dict[str, bytes]:
+    """What differs from the last commit, with its content; nothing where this is no git checkout."""
+    command = ["git", "status", "--porcelain", "--no-renames", "-z", "--", "README.md", "data", "docs", "figures"]
+    done = subprocess.run(command, cwd=runs.ROOT, capture_output=True, text=True, check=False)
+    paths = [runs.ROOT / entry[3:] for entry in done.stdout.split("\0") if entry]
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 
 def plain(source: str) -> str:
@@ -61,12 +70,15 @@ def test_a_notebook_takes_a_scale_a_seed_and_a_folder(path: Path) -> None:
 @pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks")
 def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    for path in NOTEBOOKS:
-        notebooks.execute(path, scale="smoke", progress=False)
-        rows = tables.load_table(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv")
+    before = changed()
+    for notebook in runs.notebooks().values():
+        path = notebook.path
+        notebooks.execute(notebooks.prepare(notebook, scale="smoke"), progress=False)
+        rows = tables.records(tables.load(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv"))
         assert rows
         assert {row["scale"] for row in rows} == {"smoke"}
-    status = manifest.read_json(tmp_path / "smoke" / "seed0" / "status.json")
+    status = manifest.read_own_json(tmp_path / "smoke" / "seed0" / "status.json")
     assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
     manifest.verify(tmp_path)
     assert not list(tmp_path.rglob("*.tmp-*"))
+    assert changed() == before  # only publish writes what is tracked

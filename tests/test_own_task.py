@@ -66,13 +66,14 @@ def test_a_zone_to_keep_away_from_changes_the_plan() -> None:
 
 
 def test_a_task_of_another_name_needs_a_reward() -> None:
-    with pytest.raises(ValueError, match="task is 'dance', expected 'reach' or 'push'; any other task needs a reward"):
-        dataclasses.replace(study.draw_task(REACHER, seed=3, n=N), name="dance")
+    plain = study.draw_task(REACHER, seed=3, n=N)
+    with pytest.raises(TypeError, match="reward_for"):
+        Task("dance", REACHER, plain.start, plain.target)  # type: ignore[call-arg]
 
 
 def test_fewer_instances_keep_the_reward() -> None:
     few = posed().take(2)
-    assert (few.own, few.name, few.horizon, len(few)) == (arc, "trace an arc", T, 2)
+    assert (few.reward, few.name, few.horizon, len(few)) == (arc, "trace an arc", T, 2)
 
 
 # Rewards of the wrong shape ------------------------------------------------------------------------------------------

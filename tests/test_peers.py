@@ -180,7 +180,7 @@ def test_rows_of_the_same_model_are_replaced(tmp_path: Path) -> None:
     path = tmp_path / "peers_pets.csv"
     for model, value in (("pets", 1.0), ("pets+mse", 2.0), ("pets", 3.0)):
         pets.table(path, [dict(env="arm", model=model, seed=0, metric="nrmse", value=value)])
-    assert {row["model"]: row["value"] for row in tables.load_table(path)} == {"pets": 3.0, "pets+mse": 2.0}
+    assert {row["model"]: row["value"] for row in tables.records(tables.load(path))} == {"pets": 3.0, "pets+mse": 2.0}
 
 
 # Beside ours: speed.py --------------------------------------------------------------------------------------------
@@ -261,8 +261,8 @@ class Still:
         return past.states[:, -1:] + 0 * actions[..., :1]
 
 
-THEIRS = speed.Way("mbrl-cem", "actions", "pets", iterations=1, candidates=2, bound=1.0)
-OURS = speed.Way("cem", "actions", "tsm", iterations=1, candidates=4)
+THEIRS = speed.Way("mbrl-cem", "direct", "pets", iterations=1, candidates=2, bound=1.0)
+OURS = speed.Way("cem", "direct", "tsm", iterations=1, candidates=4)
 
 
 def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
@@ -289,7 +289,7 @@ def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
     assert first.seconds.tolist() == [3.0, 3.0]  # a target, however many are in a share
     assert second.trial.actions.shape == (5, 4, 2)
     assert len(second.seconds) == 2
-    assert (first.trial.executed_return - first.promised).abs().max() < 0.1  # nothing was pushed
+    assert (first.trial.executed_return - first.predicted_return).abs().max() < 0.1  # nothing was pushed
 
 
 def outcome(way: Any, seconds: float, true: list[float]) -> Any:

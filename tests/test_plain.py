@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import predict_segment
 from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.tsm import TSM
 from tsmlib.study.runs import ROOT
@@ -20,7 +21,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 from _plain import PlainDecoder, PlainPrior, PlainTSM
 
 B, H, DX, DU = 5, 10, 6, 2
-HEADS: dict[str, dict[str, int]] = {"basic": {}, "contacts": {"head_channels": 12}, "direct": {"direct_channels": 12}}
+HEADS: dict[str, dict[str, int]] = {"basic": {}, "contacts": {"head_channels": 12}, "state skip": {"state_skip": 12}}
 DTYPES = pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
 
 
@@ -84,7 +85,7 @@ def test_predictions_are_the_plain_ones(seed: int | None) -> None:
     def noise() -> Any:
         return None if seed is None else torch.Generator().manual_seed(seed)
 
-    ours, theirs = (net.predict_segment(past, actions, generator=noise()) for net in (model, plain))
+    ours, theirs = (predict_segment(net, past, actions, generator=noise()) for net in (model, plain))
     torch.testing.assert_close(ours, theirs)
 
 

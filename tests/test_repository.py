@@ -116,3 +116,14 @@ def test_what_running_leaves_behind_is_ignored() -> None:
 
 def test_the_results_in_the_readme_are_those_of_the_shipped_tables() -> None:
     assert publish.readme_results() in (ROOT / "README.md").read_text()
+
+
+def test_importing_the_package_is_enough_to_make_an_environment() -> None:
+    code = (
+        "import sys, gymnasium, tsmlib\n"
+        "assert not {'torch', 'mujoco', 'pymunk', 'matplotlib'} & set(sys.modules)\n"
+        "print(gymnasium.make('tsm/ReacherPush-v0').observation_space.shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "(10,)"
+    assert not done.stderr

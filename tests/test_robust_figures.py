@@ -13,12 +13,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib.figures import style
-from tsmlib.figures.robustness import advantage_map, figure8, filtering, imperfect_episode
+from tsmlib.figures import Look, Method, advantage_map, figure8, filtering_errors, imperfect_episode
 from tsmlib.statistics import interval
+from tsmlib.study.zoo import method
 
 STEPS, DT = 20, 0.02
-FLOOR = {"random": -13.5, "zero": -12.1}
+TSM, LSTM, ONE_STEP, ZERO = method("tsm"), method("lstm"), method("onestep"), method("zero")
+KALMAN, SMOOTHED = method("filter"), Method("exponential", look=Look("exponential filter", "#8C8C8C"))
+LATENT, DIRECT, RIVAL = method("tsm", "latent"), method("tsm", "direct"), method("lstm", "direct")
+FLOOR = {method("random"): -13.5, ZERO: -12.1}
 draw = np.random.default_rng(0)
 
 
@@ -28,7 +31,7 @@ def learned(end: float, k: int = 3, records: int = 5) -> dict[str, np.ndarray]:
 
 
 CURVES = {
-    condition: {"tsm codes": learned(-4.0 - worse), "tsm actions": learned(-5.0 - worse), "lstm actions": learned(-7.0)}
+    condition: {LATENT: learned(-4.0 - worse), DIRECT: learned(-5.0 - worse), RIVAL: learned(-7.0)}
     for condition, worse in (("clean", 0.0), ("noise", 1.0), ("delay", 2.0))
 }
 CLEAN = np.cumsum(draw.normal(size=(STEPS + 1, 3)), 0)
@@ -43,9 +46,9 @@ def precompute(level: float, k: int = 3) -> np.ndarray:
     return level * (1 + 0.1 * np.arange(10)) + 0.002 * draw.normal(size=(k, 10))
 
 
-AHEAD = {part: {"tsm": precompute(0.1 + 0.02 * i), "lstm": precompute(0.15), "filter": precompute(0.08, k=1)}
+AHEAD = {part: {TSM: precompute(0.1 + 0.02 * i), LSTM: precompute(0.15), KALMAN: precompute(0.08, k=1)}
          for i, part in enumerate(PARTS)}  # fmt: skip
-NOW = {part: {"filter": 0.07, "exponential": 0.15} for part in PARTS}
+NOW = {part: {KALMAN: 0.07, SMOOTHED: 0.15} for part in PARTS}
 RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
 MAP = {
     "plain arm: minus one-step": np.array([[-1.24, 0.3], [2.0, 8.0]]),
@@ -62,8 +65,8 @@ def grid(given: Any = MAP, noise: Any = (0.0, 0.25), delay: Any = (0, 5)) -> Fig
     return advantage_map(given, noise=noise, delay=delay, unit="nats per step")
 
 
-def lines(ax: Axes, label: str) -> list[Any]:
-    return [line for line in ax.lines if to_hex(line.get_color()).lower() == style.colour(label).lower()]
+def lines(ax: Axes, method: Method) -> list[Any]:
+    return [line for line in ax.lines if to_hex(line.get_color()).lower() == method.look.colour.lower()]
 
 
 def legend(figure: Figure) -> list[str]:
@@ -74,9 +77,9 @@ EVERY: dict[str, Callable[[], Figure]] = {
     "figure 8": lambda: figure8(CURVES, FLOOR),
     "figure 8, one condition": lambda: figure8({"noise": CURVES["noise"]}),
     "an episode": episode,
-    "filtering": lambda: filtering(AHEAD, NOW, RAW),
-    "filtering, one part and one seed": lambda: filtering(
-        {"angles": {"tsm": precompute(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
+    "filtering": lambda: filtering_errors(AHEAD, NOW, RAW),
+    "filtering, one part and one seed": lambda: filtering_errors(
+        {"angles": {TSM: precompute(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
     ),
     "a map": grid,
     "a map of nothing": lambda: grid({"plain arm: minus LSTM": np.full((2, 2), np.nan)}),
@@ -117,15 +120,15 @@ def test_figure_8_has_a_column_for_each_condition_and_one_scale_for_all() -> Non
 
 def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in_every_panel() -> None:
     for ax, (_, rows) in zip(figure8(CURVES, FLOOR).axes, CURVES.items(), strict=True):
-        (lstm,) = lines(ax, "lstm")
-        np.testing.assert_allclose(lstm.get_ydata(), rows["lstm actions"]["return_true"].mean(0))
-        np.testing.assert_array_equal(lstm.get_xdata(), rows["lstm actions"]["iterations"])
-        codes, actions = lines(ax, "tsm")
-        np.testing.assert_allclose(codes.get_ydata(), rows["tsm codes"]["return_true"].mean(0))
-        np.testing.assert_allclose(actions.get_ydata(), rows["tsm actions"]["return_true"].mean(0))
+        (lstm,) = lines(ax, LSTM)
+        np.testing.assert_allclose(lstm.get_ydata(), rows[RIVAL]["return_true"].mean(0))
+        np.testing.assert_array_equal(lstm.get_xdata(), rows[RIVAL]["iterations"])
+        codes, actions = lines(ax, TSM)
+        np.testing.assert_allclose(codes.get_ydata(), rows[LATENT]["return_true"].mean(0))
+        np.testing.assert_allclose(actions.get_ydata(), rows[DIRECT]["return_true"].mean(0))
         flat = {line.get_ydata()[0] for line in ax.lines if len(set(line.get_ydata())) == 1}
         assert flat == set(FLOOR.values())
-        mean, half = interval(rows["tsm codes"]["return_true"][:, 3])
+        mean, half = interval(rows[LATENT]["return_true"][:, 3])
         at_record = [part.get_paths()[0].vertices for part in ax.collections]
         at_record = [np.round(v[v[:, 0] == 660.0, 1], 9) for v in at_record]
         assert any(sorted(set(v)) == pytest.approx([mean - half, mean + half]) for v in at_record)
@@ -157,23 +160,23 @@ def test_a_torque_is_held_from_its_step_on() -> None:
 
 
 def test_errors_stand_at_their_steps_and_a_filter_begins_with_the_present() -> None:
-    figure = filtering(AHEAD, NOW, RAW)
+    figure = filtering_errors(AHEAD, NOW, RAW)
     for ax, part in zip(figure.axes, PARTS, strict=True):
-        (tsm,) = lines(ax, "tsm")
+        (tsm,) = lines(ax, TSM)
         assert tsm.get_xdata().tolist() == list(range(1, 11))
-        np.testing.assert_allclose(tsm.get_ydata(), AHEAD[part]["tsm"].mean(0))
-        kalman, exponential = lines(ax, "filter")
+        np.testing.assert_allclose(tsm.get_ydata(), AHEAD[part][TSM].mean(0))
+        (kalman,), (exponential,) = lines(ax, KALMAN), lines(ax, SMOOTHED)
         assert kalman.get_xdata().tolist() == list(range(11))
-        np.testing.assert_allclose(kalman.get_ydata(), [0.07, *AHEAD[part]["filter"][0]])
+        np.testing.assert_allclose(kalman.get_ydata(), [0.07, *AHEAD[part][KALMAN][0]])
         assert (list(exponential.get_xdata()), list(exponential.get_ydata())) == ([0], [0.15])
-        (raw,) = lines(ax, "zero")
+        (raw,) = lines(ax, ZERO)
         assert set(raw.get_ydata()) == {RAW[part]}
     assert [ax.get_title(loc="left") for ax in figure.axes] == [part.capitalize() for part in PARTS]
     assert legend(figure) == ["TSM", "LSTM", "Kalman filter", "exponential filter", "raw observation"]
 
 
 def test_all_parts_share_a_scale_in_which_the_raw_observation_is_seen() -> None:
-    figure = filtering(AHEAD, NOW, RAW | {"angles": 3.0})
+    figure = filtering_errors(AHEAD, NOW, RAW | {"angles": 3.0})
     (scale,) = {ax.get_ylim() for ax in figure.axes}
     assert scale[0] == 0
     assert scale[1] > 3.0
@@ -181,13 +184,13 @@ def test_all_parts_share_a_scale_in_which_the_raw_observation_is_seen() -> None:
 
 def test_a_model_that_is_far_off_is_told_in_words() -> None:
     rows = {part: dict(own) for part, own in AHEAD.items()}
-    rows["velocities"]["onestep"] = precompute(2.0)
-    figure = filtering(rows, NOW, RAW)
+    rows["velocities"][ONE_STEP] = precompute(2.0)
+    figure = filtering_errors(rows, NOW, RAW)
     assert figure.axes[0].get_ylim()[1] < 1
     told = [ax.get_xlabel().replace("\n", " ") for ax in figure.axes]
-    assert told[2] == f"steps ahead outside: one-step to {rows['velocities']['onestep'].mean(0).max():.3g}"
+    assert told[2] == f"steps ahead outside: one-step to {rows['velocities'][ONE_STEP].mean(0).max():.3g}"
     assert told[0] == told[1] == told[3] == "steps ahead"
-    assert len(lines(figure.axes[2], "onestep")) == 2  # the line and its arrow
+    assert len(lines(figure.axes[2], ONE_STEP)) == 2  # the line and its arrow
 
 
 # The map -------------------------------------------------------------------------------------------------------------
@@ -222,26 +225,23 @@ def test_every_cell_says_its_number_and_an_empty_one_nothing() -> None:
     ("call", "message"),
     [
         (lambda: figure8({}), "nothing to draw"),
-        (lambda: figure8({"noise": {"alien codes": learned(-4)}}), "starts with 'alien'"),
-        (lambda: figure8({"noise": {"tsm codes": learned(-4) | {"iterations": np.arange(4)}}}), r"expected \(5\)"),
-        (lambda: figure8({"noise": {"tsm codes": learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}),
-         "noise, tsm codes, return_true: 15 of 15"),
-        (lambda: figure8(CURVES, {"none": -12.0}), "starts with 'none'"),
+        (lambda: figure8({"noise": {LATENT: learned(-4) | {"iterations": np.arange(4)}}}), r"expected \(5\)"),
+        (lambda: figure8({"noise": {LATENT: learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}),
+         "noise, TSM, latent, return_true: 15 of 15"),
         (lambda: episode(titles=TITLES[:2]), r"clean has shape \(21, 3\), expected \(T, 2\)"),
         (lambda: episode(noisy=NOISY[1:]), r"noisy has shape \(20, 3\), expected \(21, 3\)"),
         (lambda: episode(taken=SENT[1:]), r"taken has shape \(19,\), expected \(20\)"),
         (lambda: episode(applied=np.append(APPLIED, 0)), r"applied has shape \(21,\), expected \(20\)"),
         (lambda: episode(clean=np.where(CLEAN > 0, CLEAN, np.inf)), "clean: .* values are not finite"),
-        (lambda: filtering({}, {}, {}), "nothing to draw"),
-        (lambda: filtering(AHEAD, NOW, {"angles": 0.25}), "raw has the panels angles; expected whole state, angles"),
-        (lambda: filtering(AHEAD, {}, RAW), "now has the panels ; expected whole state"),
-        (lambda: filtering({"angles": {"tsm": np.zeros(10)}}, {"angles": {}}, {"angles": 0.25}),
-         r"angles, tsm has shape \(10,\), expected \(k, K\)"),
-        (lambda: filtering({"angles": {"tsm": np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}),
-         "angles, tsm: 10 of 10 values are not finite"),
-        (lambda: filtering({"angles": {"alien": np.zeros((1, 10))}}, {"angles": {}}, {"angles": 0.25}), "'alien'"),
+        (lambda: filtering_errors({}, {}, {}), "nothing to draw"),
+        (lambda: filtering_errors(AHEAD, NOW, {"angles": 0.25}), "raw has the panels angles; expected whole"),
+        (lambda: filtering_errors(AHEAD, {}, RAW), "now has the panels ; expected whole state"),
+        (lambda: filtering_errors({"angles": {TSM: np.zeros(10)}}, {"angles": {}}, {"angles": 0.25}),
+         r"angles, TSM has shape \(10,\), expected \(k, K\)"),
+        (lambda: filtering_errors({"angles": {TSM: np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}),
+         "angles, TSM: 10 of 10 values are not finite"),
         (lambda: grid({}), "nothing to draw"),
-        (lambda: grid(delay=(0, 5, 10)), r"minus one-step is \(2, 2\), expected \(2, 3\): noise by delay"),
+        (lambda: grid(delay=(0, 5, 10)), r"minus one-step \(noise by delay\) has shape \(2, 2\), expected \(2, 3\)"),
     ],
 )  # fmt: skip
 def test_input_that_cannot_be_drawn_is_refused_in_words(call: Callable[[], Figure], message: str) -> None:

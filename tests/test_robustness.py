@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,19 @@ from torch import Tensor
 from tsmlib import figures, study
 from tsmlib.envs import imperfect
 from tsmlib.envs.geometry import HALF_RANGE, fingertip
-from tsmlib.envs.spec import NOISE
+from tsmlib.envs.spec import DELAY, NOISE
 from tsmlib.evaluation import filtering
 from tsmlib.evaluation.filtering import KalmanFilter, errors, rmse
+from tsmlib.figures.method import Method
 from tsmlib.models.base import rollout
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.tsm import TSM
 from tsmlib.sampling import Noise
+from tsmlib.storage import tables
+from tsmlib.study import zoo
 from tsmlib.study.predictions import WithoutPastActions
 from tsmlib.study.results import robustness as robustness_results
+from tsmlib.study.results import table
 from tsmlib.trajectory import Segment, Trajectories
 
 REACHER = "tsm/Reacher-v0"
@@ -92,26 +97,14 @@ def test_the_raw_observation_is_off_by_the_noise(test_data: Pair) -> None:
     [(0.0, 0, "clean"), (0.25, 0, "noise"), (0.0, 5, "delay"), (0.25, 5, "noise, delay"), (0.1, 0, "noise 0.1"),
      (0.0, 3, "delay 3"), (0.1, 5, "noise 0.1, delay"), (0.25, 12, "noise, delay 12")],
 )  # fmt: skip
-def test_a_condition_names_what_is_imperfect(noise: float, delay: int, word: str) -> None:
-    for env in (REACHER, "tsm/PymunkObstacle-v0"):
-        assert robustness_results.condition(imperfect(env, noise=noise, delay=delay)) == word
+def test_a_world_is_named_by_what_is_imperfect(noise: float, delay: int, word: str) -> None:
+    assert robustness_results.world(noise, delay) == word
 
 
-def test_rows_of_an_imperfect_arm_become_rows_of_the_plain_one() -> None:
-    obstacle = "tsm/ReacherObstacle-v0"
-    given = [
-        dict(env=env, condition=subset, value=1.0)
-        for env in (NOISY, imperfect(obstacle, noise=0.1, delay=5), REACHER)
-        for subset in ("clean", "learning", "segments", "contact")
-    ]
-    found = robustness_results.renamed(given)
-    assert [row["env"] for row in found] == [REACHER] * 4 + [obstacle] * 4 + [REACHER] * 4
-    assert [row["condition"] for row in found] == [
-        "noise", "noise", "noise, segments", "noise, contact",
-        "noise 0.1, delay", "noise 0.1, delay", "noise 0.1, delay, segments", "noise 0.1, delay, contact",
-        "clean", "clean", "segments", "contact",
-    ]  # fmt: skip
-    assert given[2] == dict(env=NOISY, condition="segments", value=1.0)
+def test_rows_of_an_imperfect_arm_name_the_plain_one_and_what_is_imperfect() -> None:
+    obstacle = imperfect("tsm/ReacherObstacle-v0", noise=0.1, delay=5)
+    assert table.place(obstacle) == dict(env="tsm/ReacherObstacle-v0", sim="mujoco", noise=0.1, delay=5)
+    assert table.place(REACHER) == dict(env=REACHER, sim="mujoco", noise=None, delay=None)
 
 
 # Past actions --------------------------------------------------------------------------------------------------------
@@ -124,6 +117,7 @@ class Remembering:
     segment_len: int = 5
     past_len: int = 4
     features: str = "of its own"
+    stochastic: bool = False
     weight: float = 1.0  # of past torques
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
@@ -141,7 +135,7 @@ def test_without_past_actions_a_model_that_relies_on_them_is_blind() -> None:
     past, actions = some_past()
     model, before = Remembering(), past.actions.clone()
     blind: Any = WithoutPastActions(model)
-    assert (blind.segment_len, blind.past_len, blind.features, blind.stochastic) == (5, 4, "of its own", True)
+    assert (blind.segment_len, blind.past_len, blind.features, blind.stochastic) == (5, 4, "of its own", False)
     assert not torch.allclose(model.predict_segment(past, actions[:, :5]), blind.predict_segment(past, actions[:, :5]))
     expected = past.states[:, -1:] + actions.cumsum(1).sum(-1, keepdim=True)  # also past torques of its own are hidden
     torch.testing.assert_close(rollout(blind, past, actions), expected)
@@ -351,7 +345,7 @@ def test_other_episodes_are_refused(kalman: KalmanFilter, held_out: Pair, test_d
 
 
 def by(rows: list[dict[str, Any]]) -> dict[tuple[str, Any], float]:
-    return {(row["metric"], row.get("horizon", "")): row["value"] for row in rows}
+    return {(row["metric"], row.get("steps_ahead", "")): row["value"] for row in rows}
 
 
 def test_rows_of_errors_tell_steps_and_parts_apart() -> None:
@@ -370,20 +364,20 @@ def test_rows_of_errors_tell_steps_and_parts_apart() -> None:
         assert found[f"rmse_clean{part}", 0] == pytest.approx(0.2)
         assert found[f"rmse_clean{part}", 1] == found[f"rmse_clean{part}", 3] == 0
     assert found["rmse_clean_angles", 2] == found["rmse_clean_fingertip", 2] == 0
-    about = dict(env=REACHER, sim="mujoco", model="lstm", planner="none", condition="noise", unit="half range", n=2)
+    about = dict(env=REACHER, sim="mujoco", model="lstm", planner="none", noise=NOISE, unit="half range", n=2)
     assert all(row.items() >= {**about, "seed": 3, "scale": "smoke"}.items() for row in rows)
 
 
 def test_what_was_not_measured_has_no_rows() -> None:
     now = np.full((2, 6), 0.2)
-    assert {row["horizon"] for row in robustness_results.error_rows(LATE, "exponential", None, now)} == {0}
-    assert 0 not in {row.get("horizon") for row in robustness_results.error_rows(LATE, "tsm", now[:, None])}
+    assert {row["steps_ahead"] for row in robustness_results.error_rows(LATE, "exponential", None, now)} == {0}
+    assert 0 not in {row.get("steps_ahead") for row in robustness_results.error_rows(LATE, "tsm", now[:, None])}
 
 
 def policy_header(env: str = NOISY, last: int = 880) -> dict[str, Any]:
     return {
-        "fingerprint": {"env": env}, "made_from": {"task": "reach"}, "model": "tsm", "prior": "codes", "seed": 4,
-        "scale": "smoke", "curve": {"iteration": [0, last]},
+        "fingerprint": {"env": env}, "made_from": {"task": "reach"}, "model": "tsm",
+        "search_space": "latent", "seed": 4, "scale": "smoke", "curve": {"iteration": [0, last]},
     }  # fmt: skip
 
 
@@ -393,97 +387,94 @@ def test_a_target_is_reached_within_five_centimetres() -> None:
     assert [(row["copy"], row["value"]) for row in rows] == [(0, 0.5), (1, 1.0)]
     (row, _) = rows
     assert row.items() >= dict(
-        env=REACHER, sim="mujoco", task="reach", model="tsm", planner="policy", prior="codes", condition="noise",
-        horizon=880, n=4, seed=4, scale="smoke", metric="success50", unit="share",
+        env=REACHER, sim="mujoco", task="reach", model="tsm", planner="policy", search_space="latent", noise=NOISE,
+        delay=None, iteration=880, n=4, seed=4, scale="smoke", metric="success50", unit="share",
     ).items()  # fmt: skip
     strict = robustness_results.policy_rows(policy_header(REACHER), distances, level=0.02)
-    assert [(row["metric"], row["condition"], row["value"]) for row in strict] == [
-        ("success20", "clean", 0.25), ("success20", "clean", 0.5),
+    assert [(row["metric"], row["noise"], row["value"]) for row in strict] == [
+        ("success20", None, 0.25), ("success20", None, 0.5),
     ]  # fmt: skip
 
 
-def earned(
-    values: dict[str, list[list[float]]], label: str = "tsm codes", metric: str = "return_true", first: int = 0
+OURS, THEIRS = zoo.method("tsm", "latent"), zoo.method("lstm", "direct")
+WORLDS: dict[str, dict[str, Any]] = {"clean": {}, "noise": {"noise": NOISE}, "delay": {"delay": DELAY}}
+
+
+def learned(
+    values: dict[str, list[list[float]]], method: Method = OURS, metric: str = "return_true", first: int = 0
 ) -> list[dict[str, Any]]:
-    """condition -> copies -> records, one every 220 iterations."""
-    model, prior = label.split()
+    """World -> copies -> records, one every 220 iterations."""
     return [
-        dict(env=REACHER, model=model, prior=prior, planner="policy", condition=condition, metric=metric, seed=0,
-             copy=copy, horizon=first + 220 * record, value=value)
-        for condition, copies in values.items()
+        dict(env=REACHER, model=method.model, search_space=method.search_space, planner="policy", execution="policy",
+             metric=metric, seed=0, copy=copy, iteration=first + 220 * record, value=value, **WORLDS[world])
+        for world, copies in values.items()
         for copy, records in enumerate(copies)
         for record, value in enumerate(records)
     ]  # fmt: skip
 
 
-LEARNED = [
-    *earned({"clean": [[-12, -5, -3, -1], [-12, -5, -5, -1]], "noise": [[-12, -6, -5], [-12, -6, -5]],
-             "delay": [[-12, -6, -8], [-12, -6, -7]]}),
-    *earned({"noise": [[-12, -9, -8], [-12, -9, -6]]}, "lstm actions"),
-    *earned({"noise": [[0.6], [0.7]], "delay": [[0.5], [0.6]]}, metric="success50", first=440),
-    dict(env=REACHER, model="tsm", planner="none", condition="noise", metric="nrmse", horizon="", value=0.1, seed=0),
+ROWS = [
+    *learned({"clean": [[-12, -5, -3, -1], [-12, -5, -5, -1]], "noise": [[-12, -6, -5], [-12, -6, -5]],
+              "delay": [[-12, -6, -8], [-12, -6, -7]]}),
+    *learned({"noise": [[-12, -9, -8], [-12, -9, -6]]}, THEIRS),
+    *learned({"noise": [[0.6], [0.7]], "delay": [[0.5], [0.6]]}, metric="success50", first=440),
+    dict(env=REACHER, model="tsm", planner="none", noise=NOISE, metric="nrmse", value=0.1, seed=0),
 ]  # fmt: skip
+LEARNED = tables.frame(ROWS)
 
 
-def test_the_board_shows_the_last_record_that_counts() -> None:
-    head, _, ours, theirs = robustness_results.board(LEARNED, last=500).splitlines()
-    assert head.startswith(
-        "| policy | clean: earned | clean: final distance (m) | clean: within 0.05 m | noise: earned"
-    )
+def test_the_table_shows_the_last_record_that_counts() -> None:
+    head, _, *lines = robustness_results.policies_table(LEARNED, last=500).splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in (head, *lines)]
+    titles = [f"{world}: {what}" for world in WORLDS for what in ("executed return", "within 0.05 m")]
+    assert cells[0] == ["method", *(title for title in titles if title != "clean: within 0.05 m")]
     half = 12.706 * 1 / 1  # t interval of two copies at -3 and -5: their mean is off by 1
-    assert ours.startswith(
-        f"| TSM, codes | -4 ± {half:.2g} |  |  | -5 |  | 0.65 ± 0.64 | -7.5 ± 6.4 |  | 0.55 ± 0.64 |"
-    )
-    assert theirs == f"| LSTM, actions |  |  |  | -7 ± {half:.2g} |  |  |  |  |  |"
-    assert "| TSM, codes | -1 |" in robustness_results.board(LEARNED, last=660)
+    assert cells[1] == ["TSM, latent", f"-4 ± {half:.2g}", "-5", "0.65 ± 0.64", "-7.5 ± 6.4", "0.55 ± 0.64"]
+    assert cells[2] == ["LSTM, direct", "", f"-7 ± {half:.2g}", "", "", ""]
+    later = robustness_results.policies_table(LEARNED, last=660).splitlines()[2]
+    assert [cell.strip() for cell in later.split("|")[1:3]] == ["TSM, latent", "-1"]
 
 
 def test_what_is_lost_is_a_share_of_the_gain_over_random_torques() -> None:
-    assert robustness_results.lost(LEARNED, "tsm codes", "noise", 500, random=-14.0) == pytest.approx(
-        (-4 + 5) / (-4 + 14)
-    )
-    assert robustness_results.lost(LEARNED, "tsm codes", "delay", 500, random=-14.0) == pytest.approx(
-        (-4 + 7.5) / (-4 + 14)
-    )
-    assert robustness_results.lost(LEARNED, "tsm codes", "noise", 300, random=-15.0) == pytest.approx(
-        0.1
-    )  # -5 against -6
+    lost = partial(robustness_results.lost, LEARNED, OURS)
+    assert lost("noise", 500, random=-14.0) == pytest.approx((-4 + 5) / (-4 + 14))
+    assert lost("delay", 500, random=-14.0) == pytest.approx((-4 + 7.5) / (-4 + 14))
+    assert lost("noise", 300, random=-15.0) == pytest.approx(0.1)  # -5 against -6
 
 
 def test_learning_curves_are_a_line_for_each_copy() -> None:
     curves = robustness_results.learning_curves(LEARNED, last=500)
-    assert {condition: list(own) for condition, own in curves.items()} == {
-        "clean": ["tsm codes"], "noise": ["tsm codes", "lstm actions"], "delay": ["tsm codes"],
-    }  # fmt: skip
-    assert curves["clean"]["tsm codes"]["iterations"].tolist() == [0, 220, 440]
-    assert curves["clean"]["tsm codes"]["return_true"].tolist() == [[-12, -5, -3], [-12, -5, -5]]
-    assert curves["noise"]["lstm actions"]["return_true"].tolist() == [[-12, -9, -8], [-12, -9, -6]]
-    figures.figure8(curves, {"random": -14.0})
+    drawn = {"clean": [OURS], "noise": [OURS, THEIRS], "delay": [OURS]}
+    assert {world: list(own) for world, own in curves.items()} == drawn
+    assert curves["clean"][OURS]["iterations"].tolist() == [0, 220, 440]
+    assert curves["clean"][OURS]["return_true"].tolist() == [[-12, -5, -3], [-12, -5, -5]]
+    assert curves["noise"][THEIRS]["return_true"].tolist() == [[-12, -9, -8], [-12, -9, -6]]
+    figures.figure8(curves, {zoo.method("random"): -14.0})
 
 
 def test_two_seeds_of_a_copy_are_two_lines() -> None:
-    more = [*LEARNED, *({**row, "seed": 1} for row in earned({"delay": [[-12, -7, -6]]}))]
-    assert robustness_results.learning_curves(more, last=500)["delay"]["tsm codes"]["return_true"].tolist() == [
+    more = tables.frame([*ROWS, *({**row, "seed": 1} for row in learned({"delay": [[-12, -7, -6]]}))])
+    assert robustness_results.learning_curves(more, last=500)["delay"][OURS]["return_true"].tolist() == [
         [-12, -6, -8], [-12, -6, -7], [-12, -7, -6],
     ]  # fmt: skip
 
 
-def scored(model: str, condition: str, seeds: list[float], env: str = REACHER) -> list[dict[str, Any]]:
-    return [dict(env=env, model=model, condition=condition, metric="ll_horizon", value=value, seed=seed)
-            for seed, value in enumerate(seeds)]  # fmt: skip
+def scored(model: str, seeds: list[float], env: str = REACHER, subset: str = "") -> list[dict[str, Any]]:
+    common = table.place(env) | dict(model=model, execution="open loop", subset=subset, metric="ll_horizon")
+    return [dict(common, value=value, seed=seed) for seed, value in enumerate(seeds)]
 
 
 def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_empty_where_nothing_was_scored() -> None:
-    obstacle = "tsm/ReacherObstacle-v0"
+    obstacle, both = "tsm/ReacherObstacle-v0", imperfect(REACHER, noise=NOISE, delay=DELAY)
+    noisy = imperfect(obstacle, noise=NOISE)
     rows = [
-        *scored("tsm", "clean", [1.0, 2.0]), *scored("onestep", "clean", [0.0, 3.0]),
-        *scored("tsm", "noise, delay", [5.0, 6.0]), *scored("onestep", "noise, delay", [2.0]),
-        *scored("lstm", "delay", [2.0]),
-        *scored("tsm", "contact", [4.0], obstacle), *scored("lstm", "contact", [1.5], obstacle),
-        *scored("tsm", "noise, contact", [4.0], obstacle), *scored("lstm", "noise, contact", [5.0], obstacle),
-        *scored("tsm", "clean", [9.0], obstacle), *scored("lstm", "clean", [0.0], obstacle),
+        *scored("tsm", [1.0, 2.0]), *scored("onestep", [0.0, 3.0]), *scored("tsm", [5.0, 6.0], both),
+        *scored("onestep", [2.0], both), *scored("lstm", [2.0], LATE),
+        *scored("tsm", [4.0], obstacle, "contact"), *scored("lstm", [1.5], obstacle, "contact"),
+        *scored("tsm", [4.0], noisy, "contact"), *scored("lstm", [5.0], noisy, "contact"),
+        *scored("tsm", [9.0], obstacle), *scored("lstm", [0.0], obstacle),
     ]  # fmt: skip
-    found = robustness_results.advantage(rows, "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
+    found = robustness_results.advantage(tables.frame(rows), "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
     none = np.nan
     assert list(found) == ["plain arm: minus one-step", "plain arm: minus LSTM",
                            "after contact: minus one-step", "after contact: minus LSTM"]  # fmt: skip
@@ -494,18 +485,10 @@ def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_empty_where_nothing_was_
     np.testing.assert_array_equal(contact, [[2.5, none], [-1.0, none]])
 
 
-def test_rows_of_the_plain_arm_find_their_place_on_the_map_once_renamed() -> None:
-    obstacle = "tsm/ReacherObstacle-v0"
-    own = [*scored("tsm", "contact", [4.0], obstacle), *scored("lstm", "contact", [1.5], obstacle)]
-    own += [{**row, "env": imperfect(obstacle, delay=5), "value": 2 * row["value"]} for row in own]
-    found = robustness_results.advantage(robustness_results.renamed(own), "tsm", ["lstm"], [0.0], [0, 5])
-    np.testing.assert_array_equal(found["after contact: minus LSTM"], [[2.5, 5.0]])
-
-
-def test_a_bar_is_reached_or_it_is_not() -> None:
-    found = robustness_results.bars(LEARNED, "tsm codes", 500, random=-14.0)
-    assert list(found.values()) == [
-        ("at most 20 %", "10.0%", True), ("at least 60 %", "65%", True),
-        ("at most 20 %", "35.0%", False), ("at least 60 %", "55%", False),
+def test_a_threshold_is_reached_or_it_is_not() -> None:
+    found = robustness_results.thresholds(LEARNED, OURS, random=-14.0, last=500)
+    assert found[["threshold", "measured", "reached"]].to_numpy().tolist() == [
+        ["at most 20.0%", "10.0%", True], ["at least 60.0%", "65.0%", True],
+        ["at most 20.0%", "35.0%", False], ["at least 60.0%", "55.0%", False],
     ]  # fmt: skip
-    assert [what.split(":")[0] for what in found] == ["noise", "noise", "delay", "delay"]
+    assert [what.split(":")[0] for what in found["what"]] == ["noise", "noise", "delay", "delay"]

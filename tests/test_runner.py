@@ -19,7 +19,6 @@ from typing import Any
 import nbformat
 import pytest
 
-from tsmlib import study
 from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.study import notebooks, papermill_plugin, parameters, runs
@@ -119,16 +118,20 @@ def test_a_folder_that_cannot_be_made_is_one_clear_message() -> None:
 
 def test_values_take_the_type_of_the_default(place: Path) -> None:
     given = {"seed": "7", "rate": "1e-3", "name": "007", "fast": "True"}
-    assert parameters.typed(runs.notebooks()["first"], given) == {"seed": 7, "rate": 0.001, "name": "007", "fast": True}
+    assert parameters.typed(runs.notebooks()["first"].path, given) == {
+        "seed": 7,
+        "rate": 0.001,
+        "name": "007",
+        "fast": True,
+    }
 
 
 def test_the_schema_knows_every_environment_model_and_parameter() -> None:
     assert set(parameters.ENVS) == set(ENV_IDS)
-    assert set(study.MODELS) == set(parameters.MODELS)
     for notebook in runs.notebooks().values():
-        assert set(parameters.declared(notebook)) <= set(parameters.SCHEMA), notebook.name
-        for name, default in parameters.declared(notebook).items():
-            assert parameters.check(name, default) == default
+        assert set(parameters.declared(notebook.path)) <= set(parameters.SCHEMA), notebook.name
+        for name, default in parameters.declared(notebook.path).items():
+            parameters.check(name, default)
 
 
 BAD_PARAMETERS = [
@@ -199,9 +202,9 @@ UNFINISHED = {
 @pytest.mark.parametrize("how", UNFINISHED)
 def test_a_notebook_that_does_not_reach_its_end_failed(place: Path, how: str) -> None:
     source, message = UNFINISHED[how]
-    notebook = write_notebook(place / "notebooks" / "01_first.ipynb", source, "print('after')")
+    write_notebook(place / "notebooks" / "01_first.ipynb", source, "print('after')")
     with pytest.raises(RunError, match=rf"01_first failed: [\s\S]*{message}[\s\S]*See .*01_first.ipynb"):
-        notebooks.execute(notebook, progress=False)
+        notebooks.execute(notebooks.prepare(runs.notebooks()["first"]), progress=False)
     assert status(place)["01_first"]["state"] == "failed"
     assert message in status(place)["01_first"]["error"]
 
@@ -223,8 +226,8 @@ def start(place: Path) -> subprocess.Popen[bytes]:
         # SIGINT would be ignored where the tests themselves run in the background.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "import sys; from pathlib import Path;"
-        "from tsmlib.study import notebooks, runs; from tsmlib.__main__ import main;"
-        f"runs.NOTEBOOKS = notebooks.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
+        "from tsmlib.study import runs; from tsmlib.__main__ import main;"
+        f"runs.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=runs.ROOT, stderr=subprocess.DEVNULL)
     wait_for(lambda: (place / "inside").exists() and bool((place / "inside").read_text()))
@@ -259,7 +262,7 @@ def test_a_stopped_run_is_interrupted_and_its_kernel_goes(place: Path, number: s
 def test_one_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
     process = start(place)
     try:
-        second = runs.notebooks()["second"]
+        second = notebooks.prepare(runs.notebooks()["second"])
         with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid} on .*, 01_first, since"):
             notebooks.execute(second, progress=False)
         assert set(status(place)) == {"01_first"}

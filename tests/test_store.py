@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import pickle
 import random
@@ -98,7 +99,7 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
 def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
     before = some_trajectories()
     artifacts.save_trajectories(tmp_path / "x.safetensors", before, {"seed": 1})
-    after = artifacts.load_trajectories(tmp_path / "x.safetensors", env="tsm/Reacher-v0")
+    after = artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/Reacher-v0"})
     np.testing.assert_array_equal(after.states, before.states)
     np.testing.assert_array_equal(after.actions, before.actions)
     assert after.states.dtype == after.actions.dtype == np.float32
@@ -120,8 +121,8 @@ def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
         {"env": "tsm/Reacher-v0", "metric": "success", "value": np.float32(0.5), "n": 100, "seed": np.int64(0)},
         {"env": 'a "b", c', "metric": "return_true", "value": -1e-30, "target": 3},
     ]
-    tables.save_table(tmp_path / "t.csv", rows, extra=("target",))
-    found = tables.load_table(tmp_path / "t.csv")
+    tables.save(tmp_path / "t.csv", rows, extra=("target",))
+    found = tables.records(tables.load(tmp_path / "t.csv"))
     assert found[0]["value"] == 0.5
     assert found[0]["n"] == 100
     assert found[0]["horizon"] == found[0]["target"] == ""
@@ -133,7 +134,7 @@ def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
 def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
     value = {"b": [1, 2.5, None, "ü"], "a": {}}
     manifest_storage.write_json(tmp_path / "x.json", value)
-    assert manifest_storage.read_json(tmp_path / "x.json") == value
+    assert manifest_storage.read_own_json(tmp_path / "x.json") == value
 
 
 # Damage is found -----------------------------------------------------------------------------------------------------
@@ -150,12 +151,12 @@ def loaders(tmp_path: Path) -> dict[Path, Callable[[Path], Any]]:
     trajectories, model, table = (tmp_path / name for name in ("t.safetensors", "m.safetensors", "shipped/x.csv"))
     artifacts.save_trajectories(trajectories, some_trajectories(), {"seed": 1})
     artifacts.save_model(model, Line(inputs=3), {"fingerprint": FINGERPRINT})
-    tables.save_table(table, [{"metric": "success", "value": 0.5}])
+    tables.save(table, [{"metric": "success", "value": 0.5}])
     manifest_storage.write_manifest(table.parent)
     return {
         trajectories: artifacts.load_trajectories,
         model: lambda path: artifacts.load_model(path, Line),
-        table: tables.load_table,
+        table: tables.load,
     }
 
 
@@ -184,7 +185,7 @@ def test_no_cut_append_or_zeroed_block_goes_unnoticed(tmp_path: Path, which: int
 
 
 def test_a_flipped_bit_in_a_manifest_is_found(tmp_path: Path) -> None:
-    tables.save_table(tmp_path / "x.csv", [{"metric": "success", "value": 0.5}])
+    tables.save(tmp_path / "x.csv", [{"metric": "success", "value": 0.5}])
     manifest_storage.write_manifest(tmp_path)
     manifest = tmp_path / files.MANIFEST
     data = manifest.read_bytes()
@@ -232,8 +233,8 @@ def test_loading_starts_no_process_and_opens_no_connection(tmp_path: Path) -> No
 # What does not fit is refused ----------------------------------------------------------------------------------------
 
 
-def test_a_missing_file_names_the_command_that_makes_it(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"none\.safetensors does not exist.*python -m tsmlib run collect"):
+def test_a_missing_file_is_named_with_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"none\.safetensors does not exist.*run the notebook that makes it"):
         artifacts.load_trajectories(tmp_path / "none.safetensors")
 
 
@@ -244,8 +245,8 @@ def test_another_kind_is_refused(saved: Path) -> None:
 
 def test_trajectories_of_another_environment_are_refused(tmp_path: Path) -> None:
     artifacts.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
-    with pytest.raises(StoreError, match="of tsm/Reacher-v0, expected tsm/ReacherPush-v0"):
-        artifacts.load_trajectories(tmp_path / "x.safetensors", env="tsm/ReacherPush-v0")
+    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
+        artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/ReacherPush-v0"})
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -300,9 +301,9 @@ def test_a_header_that_is_not_json_is_refused(saved: Path) -> None:
 
 def test_a_table_with_a_wrong_column_or_number_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="unknown columns \\['modle'\\]"):
-        tables.save_table(tmp_path / "t.csv", [{"modle": "tsm"}])
+        tables.save(tmp_path / "t.csv", [{"modle": "tsm"}])
     with pytest.raises(StoreError, match="value = nan"):
-        tables.save_table(tmp_path / "t.csv", [{"metric": "success", "value": float("nan")}])
+        tables.save(tmp_path / "t.csv", [{"metric": "success", "value": float("nan")}])
     assert not any(tmp_path.iterdir())
 
 
@@ -310,7 +311,7 @@ def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
     for text in ("", "a,b\n1,2\n", ",".join(tables.COLUMNS) + "\n1,2\n", ",".join(tables.COLUMNS) + '\n"1'):
         (tmp_path / "t.csv").write_text(text)
         with pytest.raises(StoreError, match=r"t\.csv"):
-            tables.load_table(tmp_path / "t.csv")
+            tables.records(tables.load(tmp_path / "t.csv"))
 
 
 # Writing is all or nothing -------------------------------------------------------------------------------------------
@@ -390,7 +391,7 @@ def test_verify_follows_an_artefact_to_what_it_was_made_from(tmp_path: Path) -> 
     artifacts.save_model(model, Line(inputs=3), {"inputs": {"../data.safetensors": manifest_storage.sha256(data)}})
     assert {path.name for path in manifest_storage.verify(model)} == {"m.safetensors", "data.safetensors"}
     artifacts.save_trajectories(data, some_trajectories(n=4))
-    with pytest.raises(StoreError, match="data.safetensors has SHA-256"):
+    with pytest.raises(StoreError, match="data.safetensors is damaged, or was changed"):
         manifest_storage.verify(model)
     data.unlink()
     assert [path.name for path in manifest_storage.verify(model)] == ["m.safetensors"]
@@ -399,7 +400,7 @@ def test_verify_follows_an_artefact_to_what_it_was_made_from(tmp_path: Path) -> 
 def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
     for name in "abc":
         artifacts.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories())
-    tables.save_table(tmp_path / "t.csv", [])
+    tables.save(tmp_path / "t.csv", [])
     manifest_storage.write_manifest(tmp_path)
     assert len(manifest_storage.verify(tmp_path)) == 5
     (tmp_path / "a.safetensors").write_bytes(b"")
@@ -415,15 +416,15 @@ def test_verify_lists_every_problem_of_a_folder(tmp_path: Path) -> None:
 def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> None:
     run = Run("05_control", "smoke", 0, tmp_path)
     table = run.metrics / "05_control.csv"
-    tables.save_table(table, [{"metric": "success", "value": 0.5}])
+    tables.save(table, [{"metric": "success", "value": 0.5}])
     _note(run, {"state": "complete", "files": manifest_storage.listing(run.dir, [table])})
     assert table in manifest_storage.verify(tmp_path)
     assert require(run, "05_control")["state"] == "complete"
     table.write_text(table.read_text().replace("0.5", "0.9"))
-    with pytest.raises(StoreError, match="05_control.csv has SHA-256"):
+    with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed"):
         manifest_storage.verify(tmp_path)
     with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed after its run was complete"):
-        tables.load_table(table)
+        tables.records(tables.load(table))
     with pytest.raises(RunError, match="python -m tsmlib run control --scale smoke --seed 0"):
         require(run, "05_control")
     with pytest.raises(RunError, match="02_train in .* is not run, expected complete"):
@@ -445,7 +446,8 @@ def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, mo
 
 
 def test_an_artefact_states_what_made_it(saved: Path) -> None:
-    found = artifacts.read_provenance(saved)
+    with safetensors.safe_open(saved, "np") as file:
+        found = json.loads(file.metadata()["tsmlib"])["provenance"]
     assert found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
     assert found["threads"] == torch.get_num_threads()
     assert {"code", "commit", "cpu", "mujoco", "numpy"} <= set(found)
@@ -464,14 +466,28 @@ def test_a_model_as_large_as_a_forger_likes_is_refused_without_making_it(tmp_pat
             artifacts.load_model(path, Line)
 
 
-@pytest.mark.parametrize(
-    ("where", "options"), [("paper/seed2/models/Reacher", " --scale paper --seed 2"), ("elsewhere", "")]
-)
-def test_a_missing_file_names_the_command_that_makes_it_for_its_own_run(
-    tmp_path: Path, where: str, options: str
-) -> None:
-    with pytest.raises(StoreError, match=f"does not exist. Make it: python -m tsmlib run train{options}$"):
-        artifacts.load_model(tmp_path / where / "tsm.safetensors", Line)
+def test_a_lock_ends_with_its_holder_and_names_it_meanwhile(tmp_path: Path) -> None:
+    run = tmp_path / "deep" / "run"
+
+    def refused(said: str, where: Path = run) -> None:
+        with pytest.raises(StoreError, match=said), files.writer_lock(where, "another"):
+            pass
+
+    with files.writer_lock(run, "a test"):
+        refused(f"pid {os.getpid()} on .*, a test, since 2.*TSM_RUN_DIR")
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with files.writer_lock(run, "a child"):
+            os.write(writer, b"x")
+            signal.pause()
+    os.read(reader, 1)
+    refused(f"pid {child} on .*, a child")
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    with files.writer_lock(run, "another"):
+        pass
+    refused("cannot write in .*TSM_RUN_DIR", Path("/proc/nowhere"))
 
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import pytest
 import torch
 
 from tsmlib import study
-from tsmlib.envs import imperfect
-from tsmlib.envs.spec import DELAY, NOISE
+from tsmlib.envs import fingerprint, imperfect
+from tsmlib.envs.spec import DELAY, NOISE, EnvSpec
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning import tasks
@@ -172,38 +171,57 @@ def some_task(n: int = 2) -> tasks.Task:
     return study.task(REACHER, "validation").take(n)
 
 
+LATENT, DIRECT = study.method("tsm", "latent", "cem"), study.method("tsm", "direct", "cem")
+
+
+def stored(run: Run) -> dict[Path, int]:
+    """The plans that a run has kept, and when each was written."""
+    return {path: path.stat().st_mtime_ns for path in (run.dir / "plans").iterdir()}
+
+
 @pytest.mark.parametrize("every", [0, 20])
 @pytest.mark.parametrize("planner", ["adam", "adam+starts", "cem", "mppi"])
-@pytest.mark.parametrize("prior", ["codes", "actions"])
-def test_every_method_plans_and_executes(made: Run, planner: str, prior: str, every: int) -> None:
-    trial = study.trial(made, some_task(), "tsm", planner, prior, every=every)
+@pytest.mark.parametrize("space", ["latent", "direct"])
+def test_every_method_plans_and_executes(made: Run, planner: str, space: str, every: int) -> None:
+    trial = study.trial(made, some_task(), study.method("tsm", space, planner), every=every)
     assert trial.plan is not None
     assert trial.actions.shape == (2, 50, 2)
     torch.testing.assert_close(trial.gap, trial.plan.predicted_return - trial.executed_return)
 
 
-def test_the_oracle_earns_what_it_promises(run: Run) -> None:
-    trial = study.trial(run, some_task(), "oracle", "cem", "actions")
+def test_trials_of_several_tasks_and_methods_are_made_in_one_call(made: Run) -> None:
+    methods = {"reach": [LATENT, study.method("zero")]}
+    found = study.trials(made, [some_task()], methods)
+    assert list(found) == [REACHER]
+    assert list(found[REACHER]) == methods["reach"]
+    assert torch.equal(found[REACHER][LATENT].actions, study.plan(made, some_task(), LATENT).actions)
+    assert (found[REACHER][study.method("zero")].actions == 0).all()
+
+
+def test_the_oracles_executed_return_is_the_predicted_one(run: Run) -> None:
+    trial = study.trial(run, some_task(), study.method("oracle", "direct", "cem"))
     assert trial.plan is not None
     torch.testing.assert_close(trial.plan.predicted_return, trial.executed_return, rtol=1e-4, atol=1e-4)
 
 
-def test_a_plan_is_kept_for_its_task_and_models_alone(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = study.plan(made, some_task(), "tsm", "cem", "codes")
-    with monkeypatch.context() as patch:
-        patch.setattr(study.plans, "_search", no_training)
-        assert torch.equal(study.plan(made, some_task(), "tsm", "cem", "codes").actions, first.actions)
-        with pytest.raises(AssertionError):
-            study.plan(made, some_task(3), "tsm", "cem", "codes")  # other targets
-        with pytest.raises(AssertionError):
-            study.plan(made, some_task(), "tsm", "cem", "codes", iterations=1)  # another budget
-        patch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
-        with pytest.raises(AssertionError):
-            study.plan(made, some_task(), "tsm", "cem", "codes")  # another planner by the same name
+def test_a_plan_is_kept_for_its_task_and_models_alone(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = study.plan(run, some_task(), LATENT)
+    before = stored(run)
+    again = study.plan(run, some_task(), LATENT)
+    assert torch.equal(again.actions, first.actions)
+    assert again.seconds == first.seconds
+    assert stored(run) == before
+    study.plan(run, some_task(3), LATENT)  # other targets
+    assert study.plan(run, some_task(), LATENT, iterations=1).seconds != first.seconds  # another budget
+    second = study.plan(run, some_task(), LATENT)  # of three targets, the first two
+    monkeypatch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
+    third = study.plan(run, some_task(), LATENT)  # another planner by the same name
+    assert third.seconds != second.seconds != first.seconds
 
 
 def test_a_kept_plan_is_the_one_that_was_made(made: Run) -> None:
-    first, again = (study.plan(made, some_task(), "tsm", "mppi", "actions", iterations=3) for _ in range(2))
+    mppi = study.method("tsm", "direct", "mppi")
+    first, again = (study.plan(made, some_task(), mppi, iterations=3) for _ in range(2))
     assert first.trace is not None
     assert again.trace is not None
     for name in ("actions", "parameters", "states", "predicted_return", "curve", "trace"):
@@ -211,33 +229,35 @@ def test_a_kept_plan_is_the_one_that_was_made(made: Run) -> None:
 
 
 def test_a_task_with_a_reward_of_its_own_is_planned_for_each_time(made: Run) -> None:
-    plain = study.plan(made, some_task(), "tsm", "cem", "codes")
-    before = {path: path.stat().st_mtime_ns for path in (made.dir / "plans").iterdir()}
+    plain = study.plan(made, some_task(), LATENT)
+    before = stored(made)
     for height in (0.1, -0.1):
         own = some_task().with_reward("reach", lambda states, actions, h=height: -(states[..., 5] - h).abs())
-        plan = study.plan(made, own, "tsm", "cem", "codes")
+        plan = study.plan(made, own, LATENT)
         assert not torch.equal(plan.predicted_return, plain.predicted_return)
-        torch.testing.assert_close(study.trial(made, own, "tsm", "cem", "codes").actions, plan.actions)
-    assert {path: path.stat().st_mtime_ns for path in (made.dir / "plans").iterdir()} == before
+        torch.testing.assert_close(study.trial(made, own, LATENT).actions, plan.actions)
+    assert stored(made) == before
 
 
-def test_a_closed_loop_begins_with_the_open_plan_and_is_kept(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = study.plan(made, some_task(), "tsm", "cem", "codes")
-    first = study.trial(made, some_task(), "tsm", "cem", "codes", every=20)
+def test_a_closed_loop_begins_with_the_open_plan_and_is_kept(run: Run) -> None:
+    before = study.plan(run, some_task(), LATENT)
+    first = study.trial(run, some_task(), LATENT, every=20)
     assert torch.equal(first.actions[:, :20], before.actions[:, :20])
     assert not torch.equal(first.actions[:, 20:], before.actions[:, 20:])
     assert first.plan is not None
-    assert first.plan.curve.shape == (3, 2)  # one promise for each plan
-    monkeypatch.setattr(study.plans, "_closed_loop", no_training)
-    again = study.trial(made, some_task(), "tsm", "cem", "codes", every=20)
+    assert first.plan.curve.shape == (3, 2)  # one predicted return for each plan
+    known = stored(run)
+    again = study.trial(run, some_task(), LATENT, every=20)
     assert torch.equal(again.states, first.states)
-    with pytest.raises(AssertionError):
-        study.trial(made, some_task(), "tsm", "cem", "codes", every=10)
+    assert stored(run) == known
+    study.trial(run, some_task(), LATENT, every=25)
+    assert len(stored(run)) == len(known) + 1
 
 
-def test_along_the_way_an_optimisation_only_promises_more(made: Run) -> None:
-    found = study.along_the_way(made, some_task(), "tsm", "adam", "actions", iterations=6, at=[0, 3, 6])
-    whole = study.plan(made, some_task(), "tsm", "adam", "actions", iterations=6)
+def test_along_the_way_the_predicted_return_only_grows(made: Run) -> None:
+    adam = study.method("tsm", "direct", "adam")
+    found = study.along_the_way(made, some_task(), adam, iterations=6, at=[0, 3, 6])
+    whole = study.plan(made, some_task(), adam, iterations=6)
     assert (found[0].actions == 0).all()
     assert torch.equal(found[6].actions, whole.actions)
     for trial in found.values():
@@ -248,34 +268,34 @@ def test_along_the_way_an_optimisation_only_promises_more(made: Run) -> None:
 def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_version(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    oracle = study.method("oracle", "direct", "cem")
     asked = runs.resolve("05_control", scale="laptop", run_dir=str(tmp_path / "runs"))
     monkeypatch.setattr(study.plans, "RESULTS", tmp_path)
-    monkeypatch.setattr(study.plans, "_budget", lambda *_: (4, 1))
-    monkeypatch.setattr(study.plans, "_planner", lambda *_: partial(cem, candidates=4, elites=2, iterations=1))
-    made = study.plan(asked, some_task(3), "oracle", "cem", "actions")
+    made = study.plan(asked, some_task(3), oracle)
     (own,) = (asked.dir / "plans").iterdir()
     own.rename(tmp_path / own.name)
-    monkeypatch.setattr(study.plans, "_search", no_training)
-    assert torch.equal(study.plan(asked, some_task(), "oracle", "cem", "actions").actions, made.actions[:2])
+    again = study.plan(asked, some_task(), oracle)
+    assert torch.equal(again.actions, made.actions[:2])
+    assert not stored(asked)
     monkeypatch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
-    with pytest.raises(AssertionError):
-        study.plan(asked, some_task(), "oracle", "cem", "actions")
+    assert study.plan(asked, some_task(), oracle).seconds != made.seconds
+    assert stored(asked)
 
 
-def test_what_is_promised_is_not_what_the_planner_searched_with(made: Run) -> None:
-    plan = study.plan(made, some_task(), "tsm", "cem", "codes")
+def test_the_return_is_not_predicted_with_the_samples_that_the_planner_searched_with(made: Run) -> None:
+    plan = study.plan(made, some_task(), LATENT)
     assert not torch.equal(plan.predicted_return, plan.curve[-1])
 
 
 @pytest.mark.parametrize(
-    "bad", [("tsm", "adma", "codes", 0), ("tsm", "adam", "code", 0), ("oracle", "cem", "actions", -1)]
+    "bad", [("tsm", "latent", "policy", 0), ("tsm", "", "adam", 0), ("oracle", "direct", "cem", -1)]
 )
 def test_an_unknown_method_is_refused_before_anything_is_trained(
     tmp_path: Path, bad: tuple[str, str, str, int]
 ) -> None:
-    *method, iterations = bad
-    with pytest.raises(ValueError, match="expected adam, adam\\+starts, cem or mppi, codes or actions, and 0"):
-        study.plan(new_run(tmp_path), some_task(), *method, iterations=iterations)
+    *words, iterations = bad
+    with pytest.raises(ValueError, match="expected adam, adam\\+starts, cem or mppi, latent or direct, and 0"):
+        study.plan(new_run(tmp_path), some_task(), study.method(*words), iterations=iterations)
     assert not any(tmp_path.iterdir())
 
 
@@ -316,12 +336,12 @@ def test_a_model_of_another_environment_is_refused_naming_both(run: Run) -> None
 def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place(run: Run, how: dict[str, Any]) -> None:
     env = imperfect(REACHER, **how)
     (model, header), there = study.load_or_train(run, REACHER, "tsm"), run.models / "Reacher" / "tsm.safetensors"
-    other = run.folder(f"models/{study.short(env)}") / "tsm.safetensors"
+    other = run.folder(f"models/{EnvSpec.parse(env).name}") / "tsm.safetensors"
     shutil.copy(there, other)
     with pytest.raises(StoreError, match=f"env is '{REACHER}' in the file, expected '{env}'"):
         study.load_or_train(run, env, "tsm")
     kept = {key: header[key] for key in ("model", "seed", "scale", "curves", "seconds")}
-    artifacts.save_model(other, model, kept | {"fingerprint": study.data.fingerprint(env)})
+    artifacts.save_model(other, model, kept | {"fingerprint": fingerprint(env)})
     assert study.load_or_train(run, env, "tsm")[1]["fingerprint"]["env"] == env
     shutil.copy(other, there)
     with pytest.raises(StoreError, match=f"env is '{env}' in the file, expected '{REACHER}'"):
@@ -330,9 +350,9 @@ def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place
 
 def test_data_of_a_plain_arm_are_refused_for_an_imperfect_one(run: Run) -> None:
     env = imperfect(REACHER, noise=NOISE)
-    there = run.folder(f"data/{study.short(env)}") / "train.safetensors"
+    there = run.folder(f"data/{EnvSpec.parse(env).name}") / "train.safetensors"
     shutil.copy(run.data / "Reacher" / "train.safetensors", there)
-    with pytest.raises(StoreError, match=f"trajectories of {REACHER}, expected {env}"):
+    with pytest.raises(StoreError, match=f"env is '{REACHER}' in the file, expected '{env}'"):
         study.dataset(run, env, "train")
 
 
@@ -346,7 +366,7 @@ def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
 def test_data_of_another_environment_are_refused(run: Run) -> None:
     there = run.folder("data/PymunkReacher") / "train.safetensors"
     shutil.copy(run.data / "Reacher" / "train.safetensors", there)
-    with pytest.raises(StoreError, match="trajectories of tsm/Reacher-v0, expected tsm/PymunkReacher-v0"):
+    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"):
         study.dataset(run, "tsm/PymunkReacher-v0", "train")
 
 

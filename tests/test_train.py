@@ -16,12 +16,12 @@ from torch import Tensor, nn
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
-from tsmlib.training.checkpoint import TrainingHistory, TrainingStopped, load_generation
-from tsmlib.training.fit import fit, fixed_windows, schedule
+from tsmlib.training.checkpoint import TrainingStopped, load_generation
+from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, schedule
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window
 
 H = 4
-SIZES = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
+SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
 
 
 def episodes(n: int, seed: int) -> Trajectories:
@@ -51,7 +51,8 @@ def new_prior(seed: int = 0) -> ActionPrior:
 
 
 def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
-    return fit(model, loss or model.loss, TRAIN, HELD_OUT, **{**SIZES, **settings})
+    schedule = SIZES | {name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings}
+    return fit(model, loss or model.loss, TRAIN, HELD_OUT, TrainingOptions(**schedule), **settings)
 
 
 def weights(model: nn.Module) -> dict[str, Tensor]:
@@ -226,7 +227,7 @@ def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -
         files.StoreError,
         match="env is 'tsm/Made-v0' in the file, expected 'tsm/Other-v0'; episodes is 30 in the file, expected 20",
     ):
-        fit(model, model.loss, elsewhere, HELD_OUT, **SIZES, checkpoint=checkpoint)
+        fit(model, model.loss, elsewhere, HELD_OUT, TrainingOptions(**SIZES), checkpoint=checkpoint)
 
 
 def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.models.base import rollout
+from tsmlib.models.base import as_dynamics, rollout, stepper
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, batches, initial_past, windows
 
@@ -37,6 +38,16 @@ class Linear:
         return torch.stack(states, 1)
 
 
+class Own:
+    """All that the README asks of a model: no past length, no generator."""
+
+    segment_len = H
+
+    def predict_segment(self, past: Segment, actions: Tensor) -> Tensor:
+        assert past.states.shape[1] == H
+        return Linear(H).predict_segment(past, actions)
+
+
 @pytest.fixture
 def data() -> Trajectories:
     """Episodes of the linear system, from a loop that knows nothing of segments."""
@@ -49,6 +60,17 @@ def data() -> Trajectories:
 
 
 # The time convention -------------------------------------------------------------------------------------------------
+
+
+def test_a_model_of_ones_own_needs_a_segment_length_and_its_predictions_alone(data: Trajectories) -> None:
+    past, actions = initial_past(torch.from_numpy(data.states[:, 0]), H, 2), torch.from_numpy(data.actions[:, :13])
+    truth, draw = torch.from_numpy(data.states[:, 1:14]), torch.Generator().manual_seed(0)
+    step = stepper(Own(), past, generator=draw)
+    for states in (rollout(Own(), past, actions, generator=draw), torch.stack([step(u) for u in actions.unbind(1)], 1)):
+        torch.testing.assert_close(states, truth, rtol=1e-5, atol=1e-6)
+    assert not as_dynamics(Own()).stochastic
+    predicted = model_predictor(Own(), past, samples=2)(actions[None])
+    torch.testing.assert_close(predicted, truth.expand(2, 1, -1, -1, -1), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("horizon", [1, 5, 13])

@@ -1,18 +1,17 @@
-"""Command line: ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify [PATH]`` hashes again.
+"""Command line: run, verify, bench and publish.
+
+``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify [PATH]`` hashes again.
 ``python -m tsmlib bench [NAME]`` measures speed; ``bench table`` writes docs/speed.md from what was measured.
 ``python -m tsmlib publish`` copies a paper-scale run to what ships.
 
 Exit status: 0 done, 1 a notebook failed or an artefact is damaged, 2 bad arguments, 130 interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from tsmlib.study import notebooks, parameters, runs
 
@@ -25,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("notebook", help=f"{names}, or all")
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
-    run.add_argument("--device", default="", help="where to train, learn, plan and imagine: cpu (default) or cuda")
+    run.add_argument("--device", default="", help="where to train, learn, plan and roll out: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
@@ -33,6 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     bench.add_argument("name", nargs="?", default="all", help=f"{', '.join(_benchmarks())}, all (default), or table")
     publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
     publish.add_argument("--seed", default="0")
+    publish.add_argument("--claims", action="store_true", help="only judge the claims again, from the tables that ship")
     arguments = parser.parse_args(argv)
     try:
         match arguments.command:
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             case "bench":
                 return _bench(arguments.name)
             case "publish":
-                return _publish(parameters.convert("seed", arguments.seed))
+                return _publish(arguments.seed, claims=arguments.claims)
             case _:
                 return _run(arguments)
     except parameters.ParameterError as error:
@@ -62,8 +62,6 @@ def _run(arguments: argparse.Namespace) -> int:
         raise parameters.ParameterError(
             f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
         )
-    seed = parameters.convert("seed", arguments.seed)
-    parameters.check("device", arguments.device, origin="--device")
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")
@@ -73,11 +71,10 @@ def _run(arguments: argparse.Namespace) -> int:
             )
         given[name] = text
     chosen = list(present.values()) if word == "all" else [present[word]]
-    for notebook in chosen:  # all of them, before the first one starts
-        parameters.typed(notebook, given)
-        runs.resolve(notebook.stem, scale=arguments.scale, seed=seed, device=arguments.device)
-    for notebook in chosen:
-        print(notebooks.execute(notebook, scale=arguments.scale, seed=seed, device=arguments.device, given=given))
+    scale, seed, device = arguments.scale, parameters.convert("seed", arguments.seed), arguments.device
+    executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
+    for execution in executions:  # all of them are checked before the first one starts
+        print(notebooks.execute(execution))
     return 0
 
 
@@ -91,10 +88,13 @@ def _verify(path: Path) -> int:
     return 0
 
 
-def _publish(seed: int) -> int:
+def _publish(seed: str, *, claims: bool) -> int:
     from tsmlib.study import publish
 
-    publish.publish(runs.resolve("publish", scale="paper", seed=seed))
+    if claims:
+        publish.publish_claims()
+        return 0
+    publish.publish(runs.resolve("publish", scale="paper", seed=parameters.convert("seed", seed)))  # type: ignore[arg-type]
     return 0
 
 
@@ -110,13 +110,10 @@ def _bench(name: str) -> int:
         raise parameters.ParameterError(
             f"no benchmark is called {name!r:.80}; there are {', '.join(present)}, all of them, or table."
         )
-    commands: list[tuple[Any, ...]] = [(present[word],) for word in present if name in ("all", word)]
-    if name == "all":
-        commands.append((table,))
-    elif name == "table":
-        commands.append((table, "--publish"))
-    for script, *options in commands:  # in a process of its own, so that its memory is too
-        status = subprocess.run([sys.executable, str(script), *options], check=False).returncode
+    scripts = [*(present[word] for word in present if name in ("all", word)), *[table] * (name in ("all", "table"))]
+    for script in scripts:  # in a process of its own, so that its memory is too
+        options = ["--publish"] * (name == "table")
+        status = subprocess.run([sys.executable, script, *options], check=False).returncode
         if status:
             word = script.stem.removeprefix("_")
             raise runs.RunError(f"the benchmark {word} ended with status {status}; what went wrong stands above.")

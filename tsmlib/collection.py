@@ -1,9 +1,7 @@
-"""collect(): let a controller act in many episodes at once and keep what happened.
+"""Collection of trajectories: any controller, in many episodes at once.
 
 Random data, a running planner and a policy under test are the same call with another controller.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any

@@ -5,8 +5,6 @@ dimensions broadcast against the targets', so a batch of B targets is the last d
 task is another such function; ``rewarded`` says what is wrong with one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Sources of standard normal noise: one generator, common random numbers, separate generators."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

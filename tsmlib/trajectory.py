@@ -37,7 +37,6 @@ class Segment(NamedTuple):
         return Segment(self.states[:, -length:], self.actions[:, -length:])
 
     def to(self, device: torch.device | str) -> Segment:
-        """This segment on ``device``."""
         return Segment(self.states.to(device), self.actions.to(device))
 
 
@@ -101,14 +100,10 @@ class Trajectories:
         return self.actions.shape[1]
 
     def take(self, index: slice | np.ndarray) -> Trajectories:
-        """The chosen episodes."""
         return replace(self, states=self.states[index], actions=self.actions[index])
 
     def padded(self, past_len: int) -> Segment:
-        """All episodes as one segment (N, past_len + T, .) whose first ``past_len`` steps lie before t = 0.
-
-        Column ``past_len + t`` holds x_{t+1} and u_t. The steps before t = 0 hold x_0 and zero actions.
-        """
+        """All episodes as one segment (N, past_len + T, .) whose column ``past_len + t`` holds x_{t+1} and u_t."""
         before_states = np.repeat(self.states[:, :1], past_len, axis=1)
         before_actions = np.zeros((len(self), past_len, self.actions.shape[2]), self.actions.dtype)
         states = np.concatenate([before_states, self.states[:, 1:]], axis=1)

@@ -1,9 +1,9 @@
-"""Policies learned without a model, by other hands: the model-free curves of figure 7.
+"""Policies learned without a model, by Stable-Baselines3: the model-free curves of figure 7.
 
 PPO from Stable-Baselines3 and TRPO from sb3-contrib (the paper names no method) on the tasks of section 5.3.2: the
 reward, the starts, the targets and the 50 steps of an episode are those of ``tsmlib.study.learn``, which asks a model
 where these ask the simulator. A few configurations are tried on validation targets; the best one learns with every
-seed, and what it truly earns on the frozen test targets is measured along the way. README.md tells how to install it.
+seed, and its executed return on the frozen test targets is measured along the way. README.md tells how to install it.
 
     OMP_NUM_THREADS=1 python benchmarks/model_free/model_free.py
 
@@ -27,9 +27,9 @@ from tqdm.auto import tqdm
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import study
-from tsmlib.envs.spec import sim_of
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.execution import execute
-from tsmlib.planning.tasks import TOLERANCE, Task
+from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
 from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment
@@ -37,8 +37,8 @@ from tsmlib.trajectory import Segment
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v0")
 ALGORITHMS = ("ppo", "trpo")
 HORIZON, GAMMA = 50, 0.99  # A.3
-# The first four are half of all combinations, in which each pair of values meets once; pushing earned more with more
-# episodes and larger torques, and the last two go further that way.
+# The first four are half of all combinations, in which each pair of values meets once; pushing had higher returns with
+# more episodes and larger torques, and the last two go further that way.
 SETTINGS: dict[str, list[dict[str, float]]] = {
     "ppo": [
         {"learning_rate": 3e-4, "episodes": 20, "std": 0.14},
@@ -99,7 +99,7 @@ class Episodes:
 
 
 def measured(task: Task, predict: Predictor) -> dict[str, float]:
-    """What a policy truly earns on a task, as ``study.assess`` measures ours: means over the targets."""
+    """Executed return and distances of a policy, as ``study.assess`` measures ours: means over the targets."""
     target = task.target.numpy()
 
     def control(past: Segment) -> torch.Tensor:
@@ -109,7 +109,7 @@ def measured(task: Task, predict: Predictor) -> dict[str, float]:
     done = execute(task, control)
     return {
         "return_true": float(done.executed_return.mean()), "final_distance": float(done.final_distance.mean()),
-        "success": float((done.final_distance < TOLERANCE).float().mean()),
+        "success": float((done.final_distance < task.tolerance).float().mean()),
     }  # fmt: skip
 
 
@@ -177,9 +177,9 @@ def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int
 def learn(
     algorithm: str, task: Task, setting: Mapping[str, float], *, steps: int, records: int, seed: int
 ) -> Iterator[dict[str, float]]:
-    """One run of at least ``steps`` steps: what is earned on ``task`` before it and ``records`` times along the way.
+    """One run of at least ``steps`` steps: measurements on ``task`` before it and ``records`` times along the way.
 
-    A record holds the steps taken, the seconds of learning (by the clock, and of the processor) and ``measured``.
+    A record holds the steps taken, the seconds of learning (by the clock, and of the CPU) and ``measured``.
     """
     model = learner(algorithm, task.env, setting, seed=seed)
 
@@ -188,7 +188,7 @@ def learn(
 
     clock = np.zeros(2)
     last = -1
-    title = f"{study.short(task.env)} {algorithm} {named(setting)}, seed {seed}"
+    title = f"{EnvSpec.parse(task.env).name} {algorithm} {named(setting)}, seed {seed}"
     with tqdm(total=steps, desc=title, unit="step", mininterval=5) as bar:
         for goal in np.linspace(0, steps, records + 1).round().astype(int):
             began = _clock()
@@ -200,7 +200,7 @@ def learn(
                 last = model.num_timesteps
                 found = measured(task, predict)
                 bar.update(last - bar.n)
-                bar.set_postfix(earned=found["return_true"])
+                bar.set_postfix(executed=found["return_true"])
                 yield {"steps": last, "seconds": seconds, "cpu_seconds": cpu_seconds} | found
     model.env.close()
     return found
@@ -219,27 +219,35 @@ def named(setting: Mapping[str, float]) -> str:
 
 
 class Table:
-    """The rows of all finished runs, in a file. A run is known by environment, algorithm, condition, setting, seed."""
+    """The rows of all finished runs, in a file. A run is known by environment, algorithm, subset, setting, seed."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.rows = path, tables.load_table(path) if path.exists() else []
+        self.path, self.rows = path, tables.records(tables.load(path)) if path.exists() else []
 
     def kept(self, key: Mapping[str, Any], steps: int) -> list[dict[str, Any]]:
         """The rows of a run, if it took at least ``steps``."""
         rows = [row for row in self.rows if all(row[name] == value for name, value in key.items())]
-        return rows if rows and max(row["horizon"] for row in rows) >= steps else []
+        return rows if rows and max(row["env_steps"] for row in rows) >= steps else []
 
     def put(self, key: Mapping[str, Any], task: Task, records: list[dict[str, float]]) -> list[dict[str, Any]]:
         """Write what is known of a run, in place of what was known before."""
-        common = dict(key, sim=sim_of(task.env), task=task.name, planner="policy", n=len(task), scale="paper")
+        common = dict(
+            key,
+            sim=EnvSpec.parse(task.env).simulator,
+            task=task.name,
+            planner="policy",
+            execution="policy",
+            n=len(task),
+            scale="paper",
+        )
         new = [
-            dict(common, horizon=record["steps"], metric=metric, value=record[metric], unit=unit)
+            dict(common, env_steps=record["steps"], metric=metric, value=record[metric], unit=unit)
             for record in records
             for metric, unit in UNITS.items()
         ]
         others = [row for row in self.rows if any(row[name] != value for name, value in key.items())]
         self.rows = [*others, *new]
-        tables.save_table(self.path, self.rows, extra=EXTRA)
+        tables.save(self.path, self.rows, extra=EXTRA)
         return new
 
 
@@ -248,8 +256,8 @@ def run(
     seed: int,
 ) -> dict[str, float]:  # fmt: skip
     """The last record of a run, on targets of ``split``: from the table, or learned now and put there."""
-    condition = {"validation": "search", "test": "learning"}[split]
-    key = dict(env=env, model=algorithm, condition=condition, configuration=named(setting), seed=seed)
+    subset = {"validation": "search", "test": ""}[split]
+    key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
     rows = table.kept(key, steps)
     if not rows:
         task, found = study.task(env, split), []
@@ -257,13 +265,13 @@ def run(
             found.append(record)
             rows = table.put(key, task, found)
     last = {row["metric"]: row["value"] for row in rows}  # rows are in the order of time
-    print(f"{env} {algorithm} {named(setting)}, seed {seed}, {condition}: "
+    print(f"{env} {algorithm} {named(setting)}, seed {seed}, {split}: "
           + ", ".join(f"{metric} {value:.3f}" for metric, value in last.items()), flush=True)  # fmt: skip
     return last
 
 
 def search(table: Table, env: str, algorithm: str, *, steps: int) -> dict[str, float]:
-    """The configuration that earns most on the validation targets."""
+    """The configuration with the highest return on the validation targets."""
     options = dict(split="validation", steps=steps, records=2, seed=SEARCH_SEED)
     return max(SETTINGS[algorithm], key=lambda s: run(table, env, algorithm, s, **options)["return_true"])
 

@@ -1,7 +1,7 @@
-"""A peer that nobody here wrote: PETS as mbrl-lib 0.2.0 has it, on the same data and under the same scores.
+"""PETS by mbrl-lib 0.2.0, on the same data and under the same scores.
 
 mbrl-lib's ensemble (``GaussianMLP``: 5 members of 4 layers of 200 SiLU units), wrapper (``OneDTransitionRewardModel``)
-and trainer (``ModelTrainer``), with the settings of its own examples, trained for a budget of processor seconds. What
+and trainer (``ModelTrainer``), with the settings of its own examples, trained for a budget of CPU seconds. What
 it is fed is what the models here are fed: cosine and sine of the angles, standardised velocities and positions, and the
 action; its target is the increment of the state in units of its standard deviation. README.md tells how to install it.
 
@@ -26,7 +26,7 @@ from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 from tsmlib import study
-from tsmlib.envs.spec import ENV_IDS
+from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, standard_normal
@@ -175,7 +175,7 @@ def train(
 ) -> tuple[Any, dict[str, float]]:
     """mbrl-lib's model with its best weights on ``held_out`` after ``seconds``, and what training took.
 
-    seconds: of processor time, validation included, so that whatever else a machine does costs this peer nothing.
+    seconds: of CPU time, validation included, so that whatever else a machine does costs this peer nothing.
 
     As in its examples, every member has a bootstrap of the transitions, and weights count as better where the squared
     error of any member on the validation data falls by 1 %.
@@ -187,7 +187,7 @@ def train(
     model, bootstraps = initialise(form, features, data, seed=seed)
     parts = Parts(bootstraps, min(PART, len(bootstraps)))
     best: dict[str, Any] = {"score": None, "weights": None}
-    bar = tqdm(total=round(seconds), desc=f"{study.short(data.env)} {MODELS[form]}", unit="s")
+    bar = tqdm(total=round(seconds), desc=f"{EnvSpec.parse(data.env).name} {MODELS[form]}", unit="s")
     began = time.process_time()
 
     def after_part(model: Any, _: int, part: int, loss: float, score: Tensor, best_score: Tensor) -> None:
@@ -236,8 +236,8 @@ def table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write ``rows`` to ``path``, in place of those of the same model, environment and seed that it holds."""
     key = ("env", "model", "seed")
     new = {tuple(row[name] for name in key) for row in rows}
-    kept = tables.load_table(path) if path.exists() else []
-    tables.save_table(path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows])
+    kept = tables.records(tables.load(path)) if path.exists() else []
+    tables.save(path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows])
 
 
 def run_of(folder: Path) -> runs.Run:
@@ -252,7 +252,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0", help="default tsm/ReacherPush-v0")
     parser.add_argument("--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)")
-    parser.add_argument("--seconds", type=float, default=300, help="processor time of training (default 300)")
+    parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of training (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default 0)")
     parser.add_argument("--samples", type=int, default=32, help="per trajectory (default 32, as 03_predict)")
     parser.add_argument("--episodes", type=int, default=1000, help="of the test split (default 1000)")
@@ -277,7 +277,7 @@ def main() -> None:
         print(f"    {metric:18} at 10 steps {curve[9]:9.3f}   at 80 steps {curve[79]:9.3f}")
     common = dict(seed=arguments.seed, scale=run.scale)
     rows = prediction_results.rows(arguments.env, word, open_loop, segments, test, **common)
-    about = {name: rows[0][name] for name in ("env", "sim", "model", "planner", "condition")} | common
+    about = {name: rows[0][name] for name in ("env", "sim", "model", "planner", "execution")} | common
     rows += [dict(about, metric=name, value=value, unit=UNITS.get(name, "")) for name, value in took.items()]
     path = arguments.out or run.metrics / "peers_pets.csv"
     table(path, rows)

@@ -1,10 +1,10 @@
-"""mbrl-lib's PETS beside this package's models and planners: how fast each trains, and how fast and well each plans.
+"""Speed of mbrl-lib's PETS beside this package's models and planners: training, planning, and returns of plans.
 
 Training: mbrl-lib's ``ModelTrainer`` and ``GaussianMLP`` (see pets.py) beside ``fit`` and an ``Ensemble``
 of the same size, in transitions per second. Planning: the same targets of the frozen push task, open loop over 50
 steps, by mbrl-lib's ``CEMOptimizer`` through its ensemble, one target at a time, as its examples plan; by the planners
 of ``tsmlib.planning`` through the shipped models, all targets at once; and both ways. All plans are executed in the
-true simulator. Everything is timed in turns within one process, in processor seconds of one thread.
+true simulator. Everything is timed in turns within one process, in CPU seconds of one thread.
 
     OMP_NUM_THREADS=1 build/peers/bin/python benchmarks/peers/speed.py
 
@@ -39,7 +39,7 @@ from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.statistics import interval
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
-from tsmlib.training.fit import fit
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
 ENV = "tsm/ReacherPush-v0"
@@ -47,7 +47,7 @@ OURS = {"gaussian": "ensemble", "mse": "ensemble+mse"}  # as pets.MODELS
 EPISODES = 500  # whose transitions the turns of training draw from
 FUTURE = 20  # steps of a training window here, each of them one transition to an ensemble
 ELITES, MOMENTUM = 0.1, 0.1  # of mbrl-lib's CEM: examples/conf/overrides/pets_pusher.yaml
-PROMISE = 32  # samples behind a promised return, which the planner did not see, as tsmlib.study
+JUDGED = 32  # samples behind a predicted return, which the planner did not see, as tsmlib.study
 SPREAD: dict[str, Callable[[np.ndarray], float]] = {"median": np.median, "lowest": np.min, "highest": np.max}
 
 Clock = Callable[[], float]
@@ -97,10 +97,8 @@ def ours(form: str, features: Features, data: Trajectories, *, batch: int, bf16:
         raise ValueError(f"{windows} windows of {FUTURE} steps are {dealt_out:g} for each member, not {batch}")
 
     def run(updates: int) -> None:
-        fit(
-            net, net.loss, data, held_out, past_len=1, future_len=FUTURE,
-            steps=updates, batch_size=windows, validate_every=updates, bf16=bf16,
-        )  # fmt: skip
+        options = TrainingOptions(1, FUTURE, updates, batch_size=windows, validate_every=updates, bf16=bf16)
+        fit(net, net.loss, data, held_out, options)
 
     return Trainer(f"tsmlib, {'bfloat16' if bf16 else 'float32'}, {batch} a member", False, run, batch, size(net))
 
@@ -140,13 +138,13 @@ def speeds(trainers: Sequence[Trainer], clock: Clock, *, transitions: int, round
 class Way:
     """A way to plan: who searches what, through which model.
 
-    planner: mbrl-cem (mbrl-lib's), or cem or adam of ``tsmlib.planning``. prior: what is searched, actions or codes.
+    planner: mbrl-cem (mbrl-lib's), or cem or adam of ``tsmlib.planning``. search_space: direct or latent.
     model: pets (mbrl-lib's ensemble), or a word of ``tsmlib.study``. samples: of the model for every candidate.
     bound: of what mbrl-cem searches, half of which is the standard deviation that it starts with.
     """
 
     planner: str
-    prior: str
+    search_space: str
     model: str
     iterations: int
     candidates: int = 1
@@ -155,12 +153,12 @@ class Way:
 
     @property
     def settings(self) -> str:
-        """As the table has it in the column ``condition``."""
+        """As the table has it in the column ``configuration``."""
         return f"{self.candidates} x {self.iterations} x {self.samples}" + f" in +-{self.bound:g}" * bool(self.bound)
 
     @property
     def name(self) -> str:
-        return f"{self.planner} {self.prior} {self.model}, {self.settings}"
+        return f"{self.planner} {self.search_space} {self.model}, {self.settings}"
 
     @property
     def origin(self) -> str:
@@ -170,7 +168,7 @@ class Way:
         )
 
 
-PETS = partial(Way, "mbrl-cem", "actions", "pets")
+PETS = partial(Way, "mbrl-cem", "direct", "pets")
 USUAL = dict(iterations=5, candidates=350, samples=20)  # theirs: pets_pusher.yaml, and algorithm/pets.yaml
 SHIPPED = ("tsm", "tsm+energy+direct")
 WAYS = (
@@ -179,13 +177,13 @@ WAYS = (
     PETS(iterations=5, candidates=350, samples=5, bound=0.2),
     PETS(iterations=5, candidates=100, samples=5, bound=0.2),
     PETS(iterations=2, candidates=100, samples=5, bound=0.2),
-    *(Way("cem", "codes", model, iterations=8, candidates=96) for model in SHIPPED),  # scale laptop; paper has 10
-    *(Way("cem", "codes", model, iterations=4, candidates=48) for model in SHIPPED),
-    *(Way("cem", "codes", model, iterations=2, candidates=24) for model in SHIPPED),
-    Way("adam", "codes", "tsm+energy+direct", iterations=100),
-    Way("mbrl-cem", "actions", "tsm+energy+direct", iterations=5, candidates=350, bound=0.2),
-    Way("mbrl-cem", "codes", "tsm+energy+direct", iterations=5, candidates=350, bound=2.0),
-    Way("cem", "codes", "pets", iterations=8, candidates=96),
+    *(Way("cem", "latent", model, iterations=8, candidates=96) for model in SHIPPED),  # scale laptop; paper has 10
+    *(Way("cem", "latent", model, iterations=4, candidates=48) for model in SHIPPED),
+    *(Way("cem", "latent", model, iterations=2, candidates=24) for model in SHIPPED),
+    Way("adam", "latent", "tsm+energy+direct", iterations=100),
+    Way("mbrl-cem", "direct", "tsm+energy+direct", iterations=5, candidates=350, bound=0.2),
+    Way("mbrl-cem", "latent", "tsm+energy+direct", iterations=5, candidates=350, bound=2.0),
+    Way("cem", "latent", "pets", iterations=8, candidates=96),
 )
 
 
@@ -239,7 +237,7 @@ class Models:
     prior: Any
 
     def space(self, way: Way, horizon: int) -> SearchSpace:
-        return LatentActions(self.prior, horizon) if way.prior == "codes" else DirectActions(horizon)
+        return LatentActions(self.prior, horizon) if way.search_space == "latent" else DirectActions(horizon)
 
 
 def at(task: Task, chosen: Sequence[int] | np.ndarray) -> Task:
@@ -260,7 +258,7 @@ def planned(way: Way, task: Task, models: Models, *, seed: int = 0) -> Tensor:
 
     def decode(parameters: Tensor) -> Tensor:
         """(C, *shape) -> (C, T, du). What mbrl-cem searches is within its bounds, so that no torque is squashed."""
-        return parameters if way.prior == "actions" else space.decode(parameters[:, None])[:, 0]
+        return parameters if way.search_space == "direct" else space.decode(parameters[:, None])[:, 0]
 
     for i in range(len(task)):
         single = at(task, [i])
@@ -283,12 +281,12 @@ def _value(predict: Any, task: Task, actions: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class Outcome:
     """What came of one way to plan. seconds (rounds,): for one target; trial: the actions in the true simulator;
-    promised (B,): the return that the model expected of them."""
+    predicted_return (B,): expected by the model."""
 
     way: Way
     seconds: np.ndarray
     trial: Trial
-    promised: Tensor
+    predicted_return: Tensor
 
     @property
     def executed_return(self) -> np.ndarray:
@@ -315,10 +313,10 @@ def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, r
     results = []
     for way in ways:
         model = models.known[way.model]
-        predict = model_predictor(model, task.past(model.past_len), samples=PROMISE, seed=1)
+        predict = model_predictor(model, task.past(model.past_len), samples=JUDGED, seed=1)
         with torch.no_grad():
-            promised = expected_return(predict(actions[way][None]), actions[way][None], task.reward)[0]
-        results.append(Outcome(way, np.array(seconds[way]), execute(task, actions[way]), promised))
+            predicted = expected_return(predict(actions[way][None]), actions[way][None], task.reward)[0]
+        results.append(Outcome(way, np.array(seconds[way]), execute(task, actions[way]), predicted))
     return results
 
 
@@ -367,7 +365,7 @@ def training(
         print(f"{trainer.name:34} {trainer.parameters:8,} parameters {spread(values, 0):>24} {spread(ratio):>22}")
         about = dict(
             env=ENV, sim="mujoco", model=pets.MODELS[form] if trainer.theirs else OURS[form],
-            condition=trainer.name, n=rounds,
+            configuration=trainer.name, n=rounds,
         )  # fmt: skip
         rows.append(dict(about, metric="parameters", value=trainer.parameters))
         for word, of in SPREAD.items():
@@ -377,15 +375,15 @@ def training(
 
 
 def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
-    """Print and return what every way takes, promises and earns, and how it stands to mbrl-lib's with its settings."""
+    """Print and return seconds and returns of every way, compared with those of mbrl-lib with its own settings."""
     first, n, rows = found[0], len(task), []
     idle = execute(task, zero_torques(task)).executed_return.numpy()
     print(
-        f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; idle (no torques) earns "
+        f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; idle (no torques) returns "
         f"{idle.mean():.2f}"
     )
     print(
-        f"{'planner, what it searches, model':64} {'s a target':>22} {'promised':>8} {'true':>6} {'m at end':>8} "
+        f"{'planner, what it searches, model':64} {'s a target':>22} {'predicted':>9} {'executed':>8} {'m at end':>8} "
         f"{'over the first':>14} {'over idle':>14} {'times faster':>22} {'ms a rollout':>12}"
     )
     for outcome in found:
@@ -393,18 +391,19 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
         over_idle, idle_half = interval(outcome.executed_return - idle)
         rollout = np.median(outcome.seconds) / (way.candidates * way.iterations * way.samples)
         values = {
-            "return_predicted": outcome.promised.mean().item(), "return_true": outcome.executed_return.mean(),
+            "return_predicted": outcome.predicted_return.mean().item(), "return_true": outcome.executed_return.mean(),
             "final_distance": outcome.trial.final_distance.mean().item(),
         }  # fmt: skip
         predicted, true, distance = values.values()
         print(
-            f"{way.name:64} {spread(outcome.seconds):>22} {predicted:8.2f} {true:6.2f} {distance:8.3f} "
+            f"{way.name:64} {spread(outcome.seconds):>22} {predicted:9.2f} {true:8.2f} {distance:8.3f} "
             f"{f'{gain:+.2f} +- {half:.2f}':>14} {f'{over_idle:+.2f} +- {idle_half:.2f}':>14} {spread(ratio, 1):>22} "
             f"{1000 * rollout:12.2f}"
         )
         about = dict(
-            env=ENV, sim="mujoco", task=task.name, model=way.model, planner=way.planner, prior=way.prior,
-            horizon=task.horizon, condition=way.settings,
+            env=ENV, sim="mujoco", task=task.name, model=way.model, planner=way.planner,
+            search_space=way.search_space,
+            horizon=task.horizon, configuration=way.settings,
         )  # fmt: skip
         gains = {"gain": gain, "gain_half": half, "gain_idle": over_idle, "gain_idle_half": idle_half}
         for metric, value in {**values, **{f"return_{word}": value for word, value in gains.items()}}.items():
@@ -416,10 +415,10 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
 
 
 def verdicts(found: Sequence[Outcome]) -> None:
-    """Print, for each of mbrl-lib's settings, the fastest of ours that earns as much, and the other way round."""
+    """Print, for each of mbrl-lib's settings, the fastest of ours that returns as much, and the other way round."""
     by_origin = {origin: [o for o in found if o.way.origin == origin] for origin in ("theirs", "ours")}
     for subjects, others in (("theirs", "ours"), ("ours", "theirs")):
-        print(f"\nthe fastest of {others} that earns at least as much as each of {subjects}")
+        print(f"\nthe fastest of {others} that returns at least as much as each of {subjects}")
         for subject in by_origin[subjects]:
             best = as_good(subject, by_origin[others])
             if best is None:
@@ -427,7 +426,9 @@ def verdicts(found: Sequence[Outcome]) -> None:
                 continue
             gain, half = compared(best, subject)
             faster = spread(times_faster(best, subject))
-            print(f"{subject.way.name:64} {best.way.name}: {faster} times faster, earns {gain:+.2f} +- {half:.2f} more")
+            print(
+                f"{subject.way.name:64} {best.way.name}: {faster} times faster, returns {gain:+.2f} +- {half:.2f} more"
+            )
 
 
 # The benchmark -------------------------------------------------------------------------------------------------------
@@ -436,9 +437,9 @@ def verdicts(found: Sequence[Outcome]) -> None:
 def trained(
     run: runs.Run, form: str, features: Features, data: Trajectories, validation: Trajectories, *, seconds: float
 ) -> Any:
-    """mbrl-lib's model after ``seconds`` of processor time: from the run's folder, else trained now and kept there."""
+    """mbrl-lib's model after ``seconds`` of CPU time: from the run's folder, else trained now and kept there."""
     path = run.folder("peers") / f"{pets.MODELS[form]}.safetensors"
-    inputs = {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
+    inputs = {"states": torch.from_numpy(data.states), "direct": torch.from_numpy(data.actions)}
     made_from = {"form": form, "seconds": seconds, "data": artifacts.digest(inputs)}
     if path.exists():
         weights, header = artifacts.load(path, kind="peer")
@@ -454,7 +455,7 @@ def trained(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--form", choices=pets.MODELS, default="gaussian", help="what plans (default gaussian)")
-    parser.add_argument("--seconds", type=float, default=300, help="processor time of its training (default 300)")
+    parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of its training (default 300)")
     parser.add_argument("--targets", type=int, default=10, help="of the frozen test task (default 10)")
     parser.add_argument("--rounds", type=int, default=2, help="each with a share of the targets (default 2)")
     parser.add_argument("--transitions", type=int, default=10240, help="of a turn of training (default 10240)")
@@ -484,7 +485,7 @@ def main() -> None:
     rows += planning(found, task)
     verdicts(found)
     path = run.dir.parents[1] / "bench" / "peers.csv"
-    tables.save_table(path, [dict(row, seed=0) for row in rows])
+    tables.save(path, [dict(row, seed=0) for row in rows])
     print(path)
 
 

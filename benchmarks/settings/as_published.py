@@ -1,4 +1,4 @@
-"""Whether what a run at scale paper measured is what was published, as far as the other training seeds can tell.
+"""Results of a run at scale paper against the published ones, by the spread of the other training seeds.
 
 python -m tsmlib run all --scale paper --seed 1
 python benchmarks/settings/as_published.py runs/paper/seed1/metrics/03_predict.csv   # or 05_control, 06_robustness
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from tsmlib import study
+from tsmlib.statistics import interval
 from tsmlib.storage import tables
 
 SCORES = {  # metric -> what makes it comparable: larger is better
@@ -29,27 +30,30 @@ SCORES = {  # metric -> what makes it comparable: larger is better
     "coverage80": lambda value: -abs(value - 0.8),
     "return_true": lambda value: value,
 }
-KEYS = ("env", "model", "planner", "prior", "condition", "metric", "horizon")
+KEYS = ("env", "model", "planner", "search_space", "execution", "noise", "delay", "metric", "steps_ahead")
 STEPS = ("", 10, 80)  # scores over all steps, and at two of them
-T95 = {2: 12.706, 3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571, 7: 2.447, 8: 2.365, 9: 2.306}  # by the number of seeds
 
 Found = dict[tuple, dict[int, float]]  # what was measured -> the value of each training seed
 
 
 def read(path: Path) -> Found:
     """Scores, true returns of plans, and of policies when they are learned; the mean where there are several copies."""
-    rows = tables.load_table(path)
-    updates = [row["horizon"] for row in rows if row["condition"] == "learning" and row["horizon"] != ""]
+    rows = tables.records(tables.load(path))
+    updates = [row["iteration"] for row in rows if row["planner"] == "policy" and row["iteration"] != ""]
     learned = max(updates, default=0)
 
     def wanted(row: dict[str, Any]) -> bool:
         if row["model"] in ("none", "oracle"):
             return False
         if row["planner"] == "policy":
-            return row["metric"] == "return_true" and (row["condition"], row["horizon"]) == ("learning", learned)
+            return row["metric"] == "return_true" and row["iteration"] == learned
         if row["metric"] == "return_true":
-            return row["condition"] in ("clean", "closed loop")
-        return row["metric"] in SCORES and row["horizon"] in STEPS and row["condition"] in ("clean", "noise", "delay")
+            return row["iteration"] == ""
+        return (
+            row["metric"] in SCORES
+            and row["steps_ahead"] in STEPS
+            and (row["execution"], row["subset"]) == ("open loop", "")
+        )
 
     values: dict[tuple, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in filter(wanted, rows):
@@ -75,9 +79,10 @@ def compare(run: Found, published: Found) -> None:
         counts[what[KEYS.index("planner")]] += [1, better, worse]
         if seed in known:
             moved.append((good(value) - good(known[seed])) / np.std(list(known.values()), ddof=1))
-        if len(others) in T95:
+        if len(others) > 1:
             bounded += 1
-            if abs(value - others.mean()) > T95[len(others)] * others.std(ddof=1) * np.sqrt(1 + 1 / len(others)):
+            mean, half = interval(others)
+            if abs(value - mean) > half * np.sqrt(len(others) + 1):  # of one more number, not of the mean
                 outside.append(f"{text} ({'better' if better else 'worse'})")
     for planner, (compared, better, worse) in counts.items():
         print(f"planner {planner}: of {compared}, {better} better than the other seeds' mean, {worse} worse")

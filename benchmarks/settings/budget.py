@@ -1,4 +1,4 @@
-"""Whether a model can be trained in less: other batches, fewer updates, against the shipped model of the same schedule.
+"""Shorter trainings: other batches and fewer updates, against the shipped model of the same schedule.
 
 Each try changes one of the two in every stage: twice the batch for half the updates, as many windows altogether; or
 half the batch for as many updates. What counts is the best validation loss of a stage, beside that in the header of
@@ -13,10 +13,10 @@ import argparse
 from pathlib import Path
 
 from tsmlib import study
-from tsmlib.envs.spec import ENV_IDS, sim_of
+from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.storage import artifacts, tables
-from tsmlib.study import parameters, runs
-from tsmlib.training.fit import fit
+from tsmlib.study import parameters, runs, zoo
+from tsmlib.training.fit import TrainingOptions, fit
 
 TRIES = {"twice the batch, half the updates": (2.0, 0.5), "half the batch": (0.5, 1.0)}
 
@@ -24,33 +24,41 @@ TRIES = {"twice the batch, half the updates": (2.0, 0.5), "half the batch": (0.5
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
-    parser.add_argument("--model", choices=study.DYNAMICS, default="tsm")
+    parser.add_argument("--model", choices=zoo.words("dynamics"), default="tsm")
     parser.add_argument("--stages", type=int, default=2, help="how many of the model's stages (default 2)")
     parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/02_budget.csv of the run)")
     arguments = parser.parse_args()
     run, model = runs.resolve("02_train", scale=arguments.scale), arguments.model
     data, held_out = (study.dataset(run, arguments.env, split) for split in ("train", "validation"))
-    shipped = artifacts.read_header(run.shipped / study.short(arguments.env) / f"{model}.safetensors")["curves"]
+    shipped = artifacts.read_header(run.shipped / EnvSpec.parse(arguments.env).name / f"{model}.safetensors")["curves"]
     path, rows = arguments.out or run.metrics / "02_budget.csv", []
     for condition, (batches, updates) in TRIES.items():
         net = study.initialise(run, model, data)
         for stage in study.schedule(run, arguments.env, model)[: arguments.stages]:
             curve = fit(
                 net, getattr(net, stage.loss), data, held_out,
-                past_len=net.past_len, future_len=stage.future_len, steps=max(1, round(updates * stage.steps)),
-                lr=stage.lr, batch_size=round(batches * stage.batch), validate_every=250, seed=run.seed,
-                bf16=study.bf16_pays(model, stage), progress=f"{model}, {condition}: {stage.loss}",
+                TrainingOptions(
+                    past_len=net.past_len, future_len=stage.future_len, steps=max(1, round(updates * stage.steps)),
+                    lr=stage.lr, batch_size=round(batches * stage.batch), validate_every=250, bf16=stage.bf16,
+                ),
+                seed=run.seed, progress=f"{model}, {condition}: {stage.loss}",
             )  # fmt: skip
             best, known, seconds = min(curve.validation), min(shipped[stage.loss]["validation"]), curve.seconds[-1]
             print(
                 f"{model} {stage.loss}, {condition}: {best:.4f} after {seconds:.0f} s, shipped {known:.4f}", flush=True
             )
-            common = dict(env=arguments.env, sim=sim_of(arguments.env), model=model, planner="none", seed=run.seed)
-            common |= dict(scale=run.scale, condition=condition, n=len(held_out), stage=stage.loss)
+            common = dict(
+                env=arguments.env,
+                sim=EnvSpec.parse(arguments.env).simulator,
+                model=model,
+                planner="none",
+                seed=run.seed,
+            )
+            common |= dict(scale=run.scale, configuration=condition, n=len(held_out), stage=stage.loss)
             rows.append(dict(common, metric="validation_loss", value=best))
             rows.append(dict(common, metric="validation_loss_shipped", value=known))
-            tables.save_table(path, rows, extra=["stage"])
+            tables.save(path, rows, extra=["stage"])
     print(path)
 
 

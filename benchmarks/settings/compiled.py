@@ -1,4 +1,4 @@
-"""Whether ``torch.compile`` pays: its gain on the free-running loss, and how many updates its cold start costs.
+"""Gain of ``torch.compile`` on the free-running loss, and the updates that its cold start costs.
 
 A segment of the decoder is compiled whole, ten steps unrolled, without a cache from earlier runs. Needs a C++ compiler.
 
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from tsmlib import study
-from tsmlib.study import runs
+from tsmlib.study import runs, zoo
 from tsmlib.training.fit import fixed_windows
 
 ENV = "tsm/ReacherPush-v0"
@@ -26,7 +26,8 @@ ENV = "tsm/ReacherPush-v0"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", choices=[word for word in study.DYNAMICS if word.startswith("tsm")], default="tsm")
+    tsm = zoo.words("dynamics", cls="TSM")
+    parser.add_argument("--model", choices=tsm, default="tsm")
     parser.add_argument("--rounds", type=int, default=10)
     arguments = parser.parse_args()
     torch.set_num_threads(1)

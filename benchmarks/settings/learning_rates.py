@@ -1,4 +1,4 @@
-"""Which learning rate each model is trained with: half, once and twice that of its schedule, on validation data.
+"""Learning rate of each model: half, once and twice that of its schedule, on validation data.
 
 Every model gets the same three tries at the same share of its budget (`study.BUDGET`); what counts is the best
 validation loss of its last stage. Losses of different models are not to be compared.
@@ -12,10 +12,10 @@ import argparse
 from pathlib import Path
 
 from tsmlib import study
-from tsmlib.envs.spec import ENV_IDS, sim_of
+from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.storage import tables
-from tsmlib.study import parameters, runs
-from tsmlib.training.fit import fit
+from tsmlib.study import parameters, runs, zoo
+from tsmlib.training.fit import TrainingOptions, fit
 
 FACTORS = (0.5, 1.0, 2.0)
 
@@ -23,7 +23,7 @@ FACTORS = (0.5, 1.0, 2.0)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
-    parser.add_argument("--models", nargs="+", choices=study.DYNAMICS, metavar="MODEL", default=[
+    parser.add_argument("--models", nargs="+", choices=zoo.words("dynamics"), metavar="MODEL", default=[
         "onestep", "multistep", "lstm", "ensemble+mse", "tsm", "tsm+energy+direct"])  # fmt: skip
     parser.add_argument("--share", type=float, default=0.2, help="of the budget (default 0.2)")
     parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
@@ -33,7 +33,7 @@ def main() -> None:
     data, held_out = (study.dataset(run, arguments.env, split) for split in ("train", "validation"))
     path = arguments.out or run.metrics / "02_learning_rates.csv"
     common = dict(
-        env=arguments.env, sim=sim_of(arguments.env), planner="none", condition="learning rate",
+        env=arguments.env, sim=EnvSpec.parse(arguments.env).simulator, planner="none",
         metric="validation_loss", n=len(held_out), seed=run.seed, scale=run.scale,
     )  # fmt: skip
     rows = []
@@ -44,14 +44,16 @@ def main() -> None:
                 steps = max(1, round(stage.steps * arguments.share))
                 curve = fit(
                     net, getattr(net, stage.loss), data, held_out,
-                    past_len=net.past_len, future_len=stage.future_len, steps=steps,
-                    lr=factor * stage.lr, batch_size=stage.batch, validate_every=50, seed=run.seed, bf16=True,
-                    progress=f"{model}, {factor:g} times the rate: {stage.loss}",
+                    TrainingOptions(
+                        past_len=net.past_len, future_len=stage.future_len, steps=steps,
+                        lr=factor * stage.lr, batch_size=stage.batch, validate_every=50, bf16=True,
+                    ),
+                    seed=run.seed, progress=f"{model}, {factor:g} times the rate: {stage.loss}",
                 )  # fmt: skip
             best = min(curve.validation)
             print(f"{model:20} last stage at {factor * stage.lr:.0e}: best validation loss {best:.4f}", flush=True)
             rows.append(dict(common, model=model, value=best, rate=factor * stage.lr))
-            tables.save_table(path, rows, extra=["rate"])
+            tables.save(path, rows, extra=["rate"])
     print(path)
 
 

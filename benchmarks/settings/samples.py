@@ -1,4 +1,4 @@
-"""How many samples a score needs: every score with few samples against the same with 500.
+"""Samples that a score needs: every score with few samples against the same with 500.
 
 The scores of 03_predict are estimated from 32 samples of each model. This script scores one trained model again and
 again, with more and more samples, on the first test episodes.
@@ -13,10 +13,10 @@ import time
 from pathlib import Path
 
 from tsmlib import study
-from tsmlib.envs.spec import ENV_IDS, sim_of
+from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.storage import tables
-from tsmlib.study import parameters, runs
+from tsmlib.study import parameters, runs, zoo
 
 METRICS = ("ll_paper", "ll_shared", "ll_horizon", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80")
 
@@ -24,8 +24,10 @@ METRICS = ("ll_paper", "ll_shared", "ll_horizon", "ll_own", "energy_score_noise"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
-    parser.add_argument("--model", choices=study.DYNAMICS, default="tsm+energy+direct")
-    parser.add_argument("--samples", type=int, nargs="+", default=[8, 16, 32, 64, 128, 500], help="the last is the bar")
+    parser.add_argument("--model", choices=zoo.words("dynamics"), default="tsm+energy+direct")
+    parser.add_argument(
+        "--samples", type=int, nargs="+", default=[8, 16, 32, 64, 128, 500], help="the last is the reference"
+    )
     parser.add_argument("--episodes", type=int, default=100, help="of the test split (default 100)")
     parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/03_samples.csv of the run)")
@@ -35,7 +37,8 @@ def main() -> None:
     test, held_out = (study.dataset(run, arguments.env, split) for split in ("test", "validation"))
     test, held_out = test.take(slice(arguments.episodes)), held_out.take(slice(arguments.episodes))
     common = dict(
-        env=arguments.env, sim=sim_of(arguments.env), model=arguments.model, planner="none", condition="clean",
+        env=arguments.env, sim=EnvSpec.parse(arguments.env).simulator,
+        model=arguments.model, planner="none", execution="open loop",
         n=len(test), seed=run.seed, scale=run.scale,
     )  # fmt: skip
     rows = []
@@ -51,7 +54,7 @@ def main() -> None:
         rows += [dict(common, metric=metric, value=value, samples=samples) for metric, value in values.items()]
         rows.append(dict(common, metric="score_seconds", value=seconds, unit="s", samples=samples))
     path = arguments.out or run.metrics / "03_samples.csv"
-    tables.save_table(path, rows, extra=["samples"])
+    tables.save(path, rows, extra=["samples"])
     print(path)
 
 

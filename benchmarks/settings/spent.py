@@ -1,10 +1,10 @@
-"""What a run has cost: seconds by the clock of each notebook, and of each model, policy and plan that it has kept.
+"""Cost of a run: seconds by the clock of each notebook, and of each model, policy and plan that it has kept.
 
 python -m tsmlib run all --scale paper --seed 1
 python benchmarks/settings/spent.py runs/paper/seed1
 
 A notebook's are those of its last go: what an earlier one made is found, and costs nothing. A file's are all it took:
-of the processor for models and policies, by the clock of the process that planned for plans.
+CPU seconds for models and policies, by the clock of the process that planned for plans.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a run, such as runs/paper/seed1")
     run: Path = parser.parse_args().run
-    for name, entry in manifest.read_json(run / "status.json").items():
+    for name, entry in manifest.read_own_json(run / "status.json").items():
         print(f"{name:40} {entry['state']:12} {entry.get('seconds', float('nan')):8,.0f} s")
     spent: dict[str, list[float]] = defaultdict(list)
     for path in sorted([*run.glob("models/*/*.safetensors"), *run.glob("plans/*.safetensors")]):

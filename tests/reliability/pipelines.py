@@ -16,7 +16,7 @@ from typing import Any
 import nbformat
 import numpy as np
 
-from reliability.world import Outcome, folder, in_child, new_model, rng
+from reliability.world import Outcome, folder, in_child, new_model, refusal, rng
 from tsmlib.study import notebooks, runs
 from tsmlib.study.runs import ROOT, RunError
 
@@ -50,14 +50,12 @@ def killed_runs(trials: int) -> Outcome:
         how = ("kernel SIGKILL", "sys.exit(0)", "an error", "SIGINT", "SIGTERM", "SIGKILL")[trial % 6]
         with folder() as place:
             mark = place / "inside"
-            cell = {"sys.exit(0)": "import sys; sys.exit(0)", "an error": "1 / 0"}.get(
-                how, SLEEPER.format(mark=str(mark))
-            )
+            cells = {"sys.exit(0)": "import sys; sys.exit(0)", "an error": "1 / 0"}
+            cell = cells.get(how, SLEEPER.format(mark=str(mark)))
             write_notebook(place / "notebooks" / "01_first.ipynb", cell, "print('after')")
             environment = {**os.environ, "TSM_RUN_DIR": str(place / "runs"), "PYTHONPATH": str(ROOT)}
-            with subprocess.Popen(
-                [sys.executable, "-c", RUNNER, str(place / "notebooks")], env=environment, stderr=subprocess.DEVNULL
-            ) as process:
+            command = [sys.executable, "-c", RUNNER, str(place / "notebooks")]
+            with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:
                 if how not in ("sys.exit(0)", "an error"):
                     while not (mark.exists() and mark.read_text()):
                         time.sleep(0.05)
@@ -71,11 +69,8 @@ def killed_runs(trials: int) -> Outcome:
             state = json.loads((place / "runs/smoke/seed0/status.json").read_text())["01_first"]["state"]
             found.count(code != 0 and state != "complete", f"{how}: exit {code}, {state}")
             run = runs.resolve("02_second", scale="smoke", run_dir=str(place / "runs"))
-            try:
-                notebooks.require(run, "01_first")
-                found.count(False, f"{how}: not refused")
-            except RunError as error:
-                found.count("python -m tsmlib run first" in str(error), str(error))
+            said = refusal(lambda: notebooks.require(run, "01_first"), RunError)  # noqa: B023
+            found.count("python -m tsmlib run first" in said, f"{how}: {said}")
             if how == "SIGKILL":
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(kernel, signal.SIGKILL)
@@ -95,15 +90,13 @@ def cells_out_of_order(trials: int) -> Outcome:
 
     found, tables = Outcome(), 0
     for word, notebook in runs.notebooks().items():
-        cells = [cell.source for cell in nbformat.read(notebook, 4).cells if cell.cell_type == "code"]
+        cells = [cell.source for cell in nbformat.read(notebook.path, 4).cells if cell.cell_type == "code"]
         mixed = [random.Random(trial).sample(range(len(cells)), len(cells)) for trial in range(trials)]
         with kernel(TSM_SCALE="smoke", TQDM_DISABLE="1") as (_, client):
             for order in [[index] for index in range(len(cells))] + mixed:
                 with folder() as place:
-                    answer(
-                        client,
-                        client.execute(f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"),
-                    )
+                    anew = f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"
+                    answer(client, client.execute(anew))
                     for index in order:
                         reply = answer(client, client.execute(cells[index], stop_on_error=False))  # nor the next one
                         ours = ("NameError", "StoreError", "ParameterError", "RunError")
@@ -113,11 +106,8 @@ def cells_out_of_order(trials: int) -> Outcome:
                         )
                     tables += len(list(place.rglob("metrics/*.csv")))
                     run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
-                    try:
-                        notebooks.require(run, notebook.stem)
-                        found.count(False, f"{word}: taken for complete")
-                    except RunError as error:
-                        found.count(f"python -m tsmlib run {word} --scale smoke" in str(error), str(error))
+                    said = refusal(lambda: notebooks.require(run, notebook.stem), RunError)  # noqa: B023
+                    found.count(f"python -m tsmlib run {word} --scale smoke" in said, f"{word}: {said}")
     found.note = f"{tables} tables came about; none is taken for a result"
     return found
 
@@ -133,7 +123,7 @@ def notebooks_in_any_order(trials: int) -> Outcome:
             for _ in range(1 if trial else 2):  # the second time models, scores and plans are there
                 for notebook in order:
                     done = subprocess.run(
-                        [sys.executable, "-m", "tsmlib", "run", notebook.stem[3:], "--scale", "smoke"],
+                        [sys.executable, "-m", "tsmlib", "run", notebook.name, "--scale", "smoke"],
                         env={**os.environ, "TSM_RUN_DIR": str(place), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
                         cwd=place, capture_output=True, text=True, check=False,
                     )  # fmt: skip
@@ -150,7 +140,7 @@ def numbers(table: Path) -> list[Any]:
     """The rows of a table without what a clock measured."""
     from tsmlib.storage import tables as tables_storage
 
-    rows = tables_storage.load_table(table)
+    rows = tables_storage.records(tables_storage.load(table))
     return [row for row in rows if "second" not in f"{row['metric']} {row['unit']}"]
 
 
@@ -166,20 +156,18 @@ from tsmlib.study import runs
 for seed in range(int(sys.argv[4])):
     run = runs.resolve("05_control", scale="smoke", seed=seed, run_dir=sys.argv[1])
     net, header = study.load_or_train(run, "tsm/Reacher-v0", "tsm")
-    trial = study.trial(run, study.task("tsm/Reacher-v0", "validation").take(2), "tsm", "cem", "actions")
+    trial = study.trial(run, study.task("tsm/Reacher-v0", "validation").take(2), study.method("tsm", "direct", "cem"))
     data = {path.name: manifest.sha256(path) for path in sorted((run.data / "Reacher").glob("*.safetensors"))}
     curve = header["curves"]["loss"]
     print("made", json.dumps({
         "data": data, "weights": artifacts.digest(net.state_dict()), "plan": artifacts.digest({"u": trial.actions}),
         "losses": [curve["train"], curve["validation"]], "validation": curve["validation"][-1],
-        "promised": trial.plan.predicted_return.mean().item(),
+        "predicted": trial.plan.predicted_return.mean().item(),
     }))
 """
 
 
-def whole(
-    place: Path, *, umask: str = "022", threads: int = 1, seeds: int = 1, **environment: str
-) -> list[dict[str, Any]]:
+def whole(place: Path, *, umask: str = "022", threads: int = 1, seeds: int = 1, **environment: str) -> list[Any]:
     """Data, a model and plans of each of the first seeds, made in a fresh process."""
     done = subprocess.run(
         [sys.executable, "-c", WHOLE, str(place / "runs"), umask, str(threads), str(seeds)],
@@ -193,13 +181,7 @@ def whole(
 ELSEWHERE: list[dict[str, str]] = [
     {"TZ": "UTC", "LANG": "C.UTF-8", "PYTHONHASHSEED": "0"},
     {"TZ": "Asia/Kathmandu", "LANG": "de_DE.UTF-8", "LC_ALL": "C", "PYTHONHASHSEED": "12345", "umask": "077"},
-    {
-        "TZ": "America/St_Johns",
-        "LANG": "tr_TR.UTF-8",
-        "PYTHONHASHSEED": "4294967295",
-        "umask": "000",
-        "HOME": "/nowhere",
-    },
+    {"TZ": "America/St_Johns", "LANG": "tr_TR.UTF-8", "PYTHONHASHSEED": "4294967295", "umask": "000", "HOME": "/none"},
 ]
 
 
@@ -222,16 +204,14 @@ def threads(trials: int) -> Outcome:
     for count in (1, 2):
         with folder() as place:
             made = whole(place, threads=count, seeds=trials)
-            values.append(np.array([[one["validation"], one["promised"]] for one in made]))
+            values.append(np.array([[one["validation"], one["predicted"]] for one in made]))
     one, two = values
     deviation, difference = one.std(0, ddof=1), two - one
     mean, error = difference.mean(0), difference.std(0, ddof=1) / np.sqrt(trials)
-    for i, name in enumerate(("validation loss", "promised return")):
+    for i, name in enumerate(("validation loss", "predicted return")):
         reach = abs(mean[i]) + 1.729 * error[i]  # 90 %, 19 degrees of freedom
-        found.count(
-            deviation[i] > 0 and reach <= 0.5 * deviation[i],
-            f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}",
-        )
+        said = f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}"
+        found.count(deviation[i] > 0 and reach <= 0.5 * deviation[i], said)
     found.note = f"largest difference {np.max(np.abs(mean) / deviation):.3f} of a seed's standard deviation"
     return found
 
@@ -244,7 +224,7 @@ def another_thread_count(trials: int = 0) -> Outcome:
 
     from reliability.training import stopped_at
     from reliability.world import HELD_OUT, SIZES, TRAIN
-    from tsmlib.training.fit import fit
+    from tsmlib.training.fit import TrainingOptions, fit
 
     found = Outcome()
 
@@ -253,7 +233,7 @@ def another_thread_count(trials: int = 0) -> Outcome:
         model = new_model()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            curve = fit(model, model.loss, TRAIN, HELD_OUT, checkpoint=place / "run", **SIZES)
+            curve = fit(model, model.loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=place / "run")
         return curve.resumed, [str(warning.message) for warning in said]
 
     for count in (1, 2):

@@ -1,4 +1,4 @@
-"""R17-R19: simulators that blow up say where, and go back to where they were, bit for bit."""
+"""R17-R19: instabilities of the simulators, and their states restored bit for bit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from reliability.world import Outcome, rng
+from reliability.world import Outcome, refusal, rng
 from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
 from tsmlib.envs.geometry import DT, closest_gap
 from tsmlib.envs.spec import MUJOCO_IDS, PYMUNK_IDS
@@ -45,7 +45,7 @@ def faults_in_mujoco(trials: int) -> Outcome:
                 actions = torques(6, 10)
                 actions[episode, 0, 1] = draw.choice([math.nan, math.inf, -math.inf])
                 env.rollout(actions)
-            elif what == "overlap" and env.task != "reacher":
+            elif what == "overlap" and env.task != "reach":
                 states = env.reset(seed=trial)[0]
                 reach = states[episode, 4:6]
                 states[episode, 6:8] = draw.uniform(0.0, 0.9) * reach
@@ -58,13 +58,11 @@ def faults_in_mujoco(trials: int) -> Outcome:
             found.count(False, f"{env_id}, {what} {value} at step {step}: nothing was said")
         except SimulationUnstable as error:
             good = (error.env, error.episode, error.step) == (env_id, episode, step)
-            found.count(
-                good and all(word in str(error) for word in (env_id, f"episode {episode}", f"step {step}")), str(error)
-            )
+            words = (env_id, f"episode {episode}", f"step {step}")
+            found.count(good and all(word in str(error) for word in words), str(error))
         except ValueError as error:  # a torque that is no number: nothing was simulated
-            found.count(
-                what == "torque" and f"episode {episode}, step 0" in str(error) and env_id in str(error), str(error)
-            )
+            good = what == "torque" and f"episode {episode}, step 0" in str(error) and env_id in str(error)
+            found.count(good, str(error))
         env.close()
     return found
 
@@ -111,11 +109,8 @@ def restores(trials: int) -> Outcome:
         contacts += int(close.sum())
         for trial in range(trials):
             draw = rng(19, trial)
-            at = (
-                draw.choice(np.flatnonzero(close).tolist()) + 1
-                if trial % 2 and close.any()
-                else draw.randrange(1, steps)
-            )
+            touching = trial % 2 and close.any()
+            at = draw.choice(np.flatnonzero(close).tolist()) + 1 if touching else draw.randrange(1, steps)
             at = min(at, steps - 1)
             first = arms(env_id, n)
             first.rollout(actions[:, :at])
@@ -123,11 +118,7 @@ def restores(trials: int) -> Outcome:
             if env_id in MUJOCO_IDS:
                 other.set_state(first.get_state())
             else:
-                try:
-                    first.get_state()
-                    found.count(False, "pymunk gave a snapshot")
-                except RuntimeError as error:
-                    found.count("Replay" in str(error), str(error))
+                found.count("Replay" in refusal(first.get_state, RuntimeError), "pymunk gave a snapshot")
                 other.reset(seed=0)
                 other.rollout(actions[:, :at])
             found.count(np.array_equal(other.rollout(actions[:, at:]), whole[:, at:]), f"{env_id} from step {at}")
@@ -141,9 +132,8 @@ def large_sets(trials: int) -> Outcome:
 
     found = Outcome()
     for env_id in (*MUJOCO_IDS, *PYMUNK_IDS):
-        states = random_data(env_id, trials if env_id in MUJOCO_IDS else max(10, trials // 10), seed=17).states.astype(
-            float
-        )
+        n = trials if env_id in MUJOCO_IDS else max(10, trials // 10)
+        states = random_data(env_id, n, seed=17).states.astype(float)
         change, speed = np.abs(np.diff(states[..., :2], axis=1)), np.abs(states[..., 2:4])
         fastest = np.maximum(speed[:, 1:], speed[:, :-1])
         # Within a step a joint may bounce off its stop or the block: then speeds before and after say less

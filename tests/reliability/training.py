@@ -1,9 +1,10 @@
-"""R1-R3, R8, R10, R11, R15, R16: training is killed, starved of disk, interrupted, fed NaN and raced, and goes on."""
+"""R1-R3, R8, R10, R11, R15, R16: training that is killed, starved of disk, interrupted, fed NaN and raced."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import math
 import os
 import re
@@ -13,6 +14,7 @@ import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,7 @@ from reliability.world import (
 from tsmlib.storage import artifacts, files, tables
 from tsmlib.study import runs
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
-from tsmlib.training.fit import fit
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Window
 
 
@@ -77,22 +79,26 @@ def contents(place: Path) -> dict[str, bytes]:
 CALLS = ("fsync", "replace", "mkdir", "unlink", "open")  # of os; and open and write of a file
 
 
-def at_every_call(trials: int = 0) -> Outcome:
-    """R2: at each call that writes, of the saves that follow step 8: SIGKILL, ENOSPC, EIO. Then resume."""
+def at_every_call(every: int = 1) -> Outcome:
+    """R2: SIGKILL, ENOSPC and EIO at each call that writes, of the saves that follow step 8: the same bits on resuming.
+
+    every: of so many calls one is tried.
+    """
     found, (expected, _) = Outcome(), reference()
     points = 0
     with folder() as start:
         stopped_at(start / "run", 9)
-        for fault in ("SIGKILL", "ENOSPC", "EIO"):
-            for point in range(10_000):
+        for first, fault in enumerate(("SIGKILL", "ENOSPC", "EIO")):
+            for point in range(first % every, 10_000, every):
                 with folder() as place:
                     shutil.copytree(start / "run", place / "run")
                     child = Child(lambda: with_fault(place / "run", point, fault))  # noqa: B023
                     good, value = child.result()
-                    if good:  # the training came to its end before the fault
+                    if value and good:  # the training came to its end before the fault
                         break
                     points += 1
-                    said = child.killed or (str(place / "run") in value and os.strerror(getattr(errno, fault)) in value)
+                    text = os.strerror(getattr(errno, fault, 0))  # where a fault cost something, it is said
+                    said = good or child.killed or (str(place / "run") in value and text in value)
                     found.count(said, f"{fault} at call {point}: {value}")
                     found.count(resumes(place / "run", expected), f"{fault} at call {point}: not resumed bit for bit")
     found.note = f"{points} faults"
@@ -100,7 +106,7 @@ def at_every_call(trials: int = 0) -> Outcome:
 
 
 def at_every_system_call(trials: int = 1000) -> Outcome:
-    """R2 and R3a with strace: the same at each writing system call, and the order write, fsync, rename, fsync."""
+    """R2, R3: the same at each system call that writes, by strace; the order write, fsync, rename, fsync."""
     found = Outcome(note="strace is not installed: not done")
     if shutil.which("strace") is None:
         return found
@@ -113,9 +119,7 @@ def at_every_system_call(trials: int = 1000) -> Outcome:
         traced(lambda: train(start / "whole", steps=SIZES["steps"]), ["-e", f"trace={calls},openat", "-y"], log)
         published = order_of(log.read_text())
         for name, order in published.items():
-            found.count(
-                re.fullmatch("w+fRd", order), f"{name}: {order}, expected write, fsync, rename, fsync of the folder"
-            )
+            found.count(re.fullmatch("w+fRd", order), f"{name}: {order}, expected write, fsync, rename, fsync (folder)")
         for fault in ("signal=SIGKILL", "error=ENOSPC", "error=EIO"):
             for call in ("write", "fsync", "rename", "unlink", "ftruncate"):
                 for k in range(1, trials + 1):
@@ -126,16 +130,13 @@ def at_every_system_call(trials: int = 1000) -> Outcome:
                         if "(INJECTED)" not in (text := (place / "log").read_text()) and "SIGKILL" not in text:
                             break
                         points += 1
-                        found.count(
-                            resumes(place / "run", expected),
-                            f"{fault} at {call} {k}: not resumed bit for bit ({child})",
-                        )
+                        found.count(resumes(place / "run", expected), f"{fault} at {call} {k}: other bits ({child})")
     found.note = f"{points} faults, {len(published)} files published in order"
     return found
 
 
 def traced(work: Callable[[], Any], options: list[str], log: Path) -> tuple[bool, Any]:
-    """What ``work`` gives in a child under strace."""
+    """The result of ``work`` in a child under strace."""
     reader, writer = os.pipe()
 
     def when_told() -> Any:
@@ -175,7 +176,7 @@ def order_of(text: str) -> dict[str, str]:
 
 
 def stopped_at(checkpoint: Path, step: int) -> None:
-    """Leave a training as it is after ``step`` steps."""
+    """A checkpoint after ``step`` steps of a training."""
 
     class Stop(Exception):
         pass
@@ -190,15 +191,16 @@ def stopped_at(checkpoint: Path, step: int) -> None:
             raise Stop
         return model.loss(window, generator)
 
-    try:
-        fit(model, loss, TRAIN, HELD_OUT, checkpoint=checkpoint, **SIZES)
-    except Stop:
-        return
-    raise AssertionError("it was not stopped")
+    with contextlib.suppress(Stop):
+        fit(model, loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=checkpoint)
+        raise AssertionError("it was not stopped")
 
 
 def with_fault(checkpoint: Path, point: int, fault: str) -> str:
-    """Go on training; call number ``point`` that writes something fails. In a child of its own."""
+    """Digest of a training whose call number ``point`` that writes something fails; "" where that cost nothing.
+
+    In a child of its own, since calls are patched.
+    """
     made = 0
 
     def count() -> None:
@@ -216,32 +218,14 @@ def with_fault(checkpoint: Path, point: int, fault: str) -> str:
 
         return call
 
+    class File(io.FileIO):
+        write, flush = counted(io.FileIO.write), counted(io.FileIO.flush)
+
     for name in CALLS:
         setattr(os, name, counted(getattr(os, name)))
-
-    class File:
-        """A file whose writes count."""
-
-        def __init__(self, file: Any) -> None:
-            self.file = file
-
-        def __enter__(self) -> File:
-            return self
-
-        def __exit__(self, *_: Any) -> None:
-            self.file.close()
-
-        def __getattr__(self, name: str) -> Any:
-            return counted(getattr(self.file, name)) if name in ("write", "flush") else getattr(self.file, name)
-
-    def open_(path: Any, mode: str = "r", *args: Any) -> Any:
-        if mode != "wb":
-            return open(path, mode, *args)
-        count()
-        return File(open(path, mode, *args))
-
-    files.open = open_  # type: ignore[attr-defined]
-    return train(checkpoint)
+    files.open = counted(File)  # type: ignore[attr-defined]
+    digest = train(checkpoint)
+    return digest if made <= point else ""
 
 
 def resumes(checkpoint: Path, expected: str) -> bool:
@@ -259,7 +243,7 @@ def resumes(checkpoint: Path, expected: str) -> bool:
 
 
 def newest_generation_spoilt(trials: int) -> Outcome:
-    """R3: the newest generation is empty, cut at random, or stale; the one before is used, and both are named."""
+    """R3: a newest generation that is empty, cut at random, or stale: the one before is used, both are named."""
     found = Outcome()
     with folder() as place:
         stopped_at(place / "run", 9)
@@ -280,7 +264,7 @@ def newest_generation_spoilt(trials: int) -> Outcome:
 
 
 def values_that_are_not_finite(trials: int) -> Outcome:
-    """R8: one NaN or infinity in a data set at a random place is refused naming episode, step and field."""
+    """R8: one NaN or infinity at a random place of a data set: refused, naming episode, step and field."""
     found, data = Outcome(), TRAIN.take(slice(10))
     fields = {"env": data.env, "dt": data.dt, "names": data.names, "units": data.units, "angles": data.angles}
     with folder() as place:
@@ -305,7 +289,7 @@ def values_that_are_not_finite(trials: int) -> Outcome:
 
 
 def losses_that_are_not_finite(trials: int) -> Outcome:
-    """R8: the loss or its gradient is not finite at a random step: training stops there and keeps a good generation."""
+    """R8: a loss or gradient that is not finite at a random step: training stops there, a good generation is kept."""
     found = Outcome()
     for trial in range(trials):
         draw, model, calls = rng(80, trial), new_model(), 0
@@ -323,14 +307,10 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
             return value
 
         with folder() as place:
-            said = refusal(
-                lambda: fit(model, loss, TRAIN, HELD_OUT, checkpoint=place / "run", **SIZES),  # noqa: B023
-                TrainingStopped,
-            )
-            kept = load_generation(place / "run")
-            good = (
-                calls == at + 1 and f"at step {at} of" in said and (kept is not None) is (at >= SIZES["validate_every"])
-            )
+            work = partial(fit, model, loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=place / "run")
+            said = refusal(work, TrainingStopped)
+            kept = (load_generation(place / "run") is not None) is (at >= SIZES["validate_every"])
+            good = calls == at + 1 and f"at step {at} of" in said and kept
             found.count(good and all(p.isfinite().all() for p in model.parameters()), said)
     return found
 
@@ -339,7 +319,7 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
 
 
 def two_writers(trials: int) -> Outcome:
-    """R11: three trainings start at once on one folder: one writes, the others name it; a killed one's lock is free."""
+    """R11: three trainings at once in one folder: one writes, the others name it; a killed one's lock is free."""
     found, (expected, _) = Outcome(), reference()
     for trial in range(trials):
         with folder() as place:
@@ -358,7 +338,7 @@ def two_writers(trials: int) -> Outcome:
                 named = isinstance(value, str) and any(pid in value for pid in pids)
                 found.count(good or value is None or named, f"trial {trial}: {value}")
             began = time.monotonic()
-            with files.only_writer(place / "run", "a check"):
+            with files.writer_lock(place / "run", "a check"):
                 found.count(time.monotonic() - began < 5, f"trial {trial}: the lock was not free")
             end = in_child(lambda: train(place / "run"))
             found.count(end == expected, f"trial {trial}: other bits")
@@ -369,7 +349,7 @@ def two_writers(trials: int) -> Outcome:
 
 
 def full_disk(trials: int = 0) -> Outcome:
-    """R10: nothing more fits while data, a table, picture, film or checkpoint is written: the old stays, it is said."""
+    """R10: a full disk while data, a table, figure, video or checkpoint is written: the old file stays, it is said."""
     from matplotlib.figure import Figure
 
     from tsmlib import figures
@@ -387,13 +367,12 @@ def full_disk(trials: int = 0) -> Outcome:
         return Child(limited).result()
 
     with folder() as place:
-        data, table = place / "data.safetensors", place / "table.csv"
-        picture, film = place / "picture.pdf", place / "film.mp4"
+        data, table, picture, film = (place / f"x.{kind}" for kind in ("safetensors", "csv", "pdf", "mp4"))
         rows = [{"metric": "success", "value": 0.5, "n": i} for i in range(200)]
         writers: dict[Path, Callable[[], Any]] = {
             data: lambda: artifacts.save_trajectories(data, TRAIN),
-            table: lambda: tables.save_table(table, rows),
-            picture: lambda: figures.save(Figure(), place / "picture"),
+            table: lambda: tables.save(table, rows),
+            picture: lambda: figures.save(Figure(), place / "x"),
         }
         for path, write in writers.items():
             write()
@@ -424,11 +403,8 @@ def interrupted_in_a_cell(trials: int) -> Outcome:
     tests = Path(__file__).resolve().parent.parent
     with kernel() as (manager, client):
         run(client, f"import sys; sys.path[:0] = [{str(tests)!r}, {str(tests.parent)!r}]")
-        run(
-            client,
-            "from pathlib import Path; from reliability.world import train; import torch; torch.set_num_threads(1)",
-        )
-        run(client, "train(None)")
+        run(client, "import torch; from pathlib import Path; from reliability.world import train")
+        run(client, "torch.set_num_threads(1); train(None)")
         began = time.monotonic()
         run(client, "train(None)")
         seconds, slowest, stopped = time.monotonic() - began, 0.0, 0
@@ -461,9 +437,8 @@ def kernel(**environment: str) -> Iterator[tuple[Any, Any]]:
     from jupyter_client.manager import start_new_kernel
 
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(runs.ROOT), **environment}
-    manager, client = start_new_kernel(
-        kernel_name="python3", env=environment, cwd=str(runs.NOTEBOOKS), stderr=subprocess.DEVNULL
-    )
+    options = dict(env=environment, cwd=str(runs.NOTEBOOKS), stderr=subprocess.DEVNULL)
+    manager, client = start_new_kernel(kernel_name="python3", **options)
     try:
         yield manager, client
     finally:
@@ -481,18 +456,14 @@ def answer(client: Any, request: str) -> dict[str, Any]:
 
 def run(client: Any, cell: str) -> str:
     """The value that a cell shows."""
-    shown = ""
-    request = client.execute(cell)
-    while True:
-        message = client.get_iopub_msg(timeout=3600)
-        if message["parent_header"].get("msg_id") != request:
-            continue
+    shown: list[str] = []
+
+    def hook(message: dict[str, Any]) -> None:
         if message["msg_type"] == "execute_result":
-            shown = message["content"]["data"]["text/plain"]
-        if message["msg_type"] == "status" and message["content"]["execution_state"] == "idle":
-            break
-    answer(client, request)
-    return shown
+            shown.append(message["content"]["data"]["text/plain"])
+
+    client.execute_interactive(cell, output_hook=hook, timeout=3600)
+    return "".join(shown)
 
 
 # Memory --------------------------------------------------------------------------------------------------------------
@@ -514,8 +485,8 @@ def memory(trials: int) -> Outcome:
 
     with folder() as place:
         open_before = len(os.listdir("/proc/self/fd"))
-        settings = {**SIZES, "steps": trials, "validate_every": max(1, trials // 20)}
-        fit(model, loss, data, HELD_OUT, checkpoint=place / "run", **settings)
+        options = TrainingOptions(**{**SIZES, "steps": trials, "validate_every": max(1, trials // 20)})
+        fit(model, loss, data, HELD_OUT, options, checkpoint=place / "run")
         steps, megabytes = np.array(samples).T
         slope = 1000 * np.polyfit(steps, megabytes, 1)[0]
         found.count(slope <= 1.0, f"{slope:.2f} MB per 1,000 steps")

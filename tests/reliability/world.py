@@ -1,4 +1,4 @@
-"""A world that trains in a fraction of a second, and child processes that may be killed in it."""
+"""Data and models that train in a fraction of a second, and child processes that may be killed."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from torch import Tensor
 
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.tsm import TSM
-from tsmlib.policies.learning import episodes_from, learn_policy
+from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.rewards import Reward
 from tsmlib.storage import artifacts, files, manifest, tables
 from tsmlib.training.checkpoint import load_generation
-from tsmlib.training.fit import fit
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
 H = 4
@@ -107,7 +107,8 @@ def new_model(make: Callable[[], Any] = small) -> Any:
 def train(checkpoint: Path | None, loss: Any = None, **settings: Any) -> str:
     """Train to the end and give a digest of weights, curve and, with a checkpoint, everything in it."""
     model = new_model()
-    curve = fit(model, loss or model.loss, TRAIN, HELD_OUT, checkpoint=checkpoint, **{**SIZES, **settings})
+    options = TrainingOptions(**{**SIZES, **settings})
+    curve = fit(model, loss or model.loss, TRAIN, HELD_OUT, options, checkpoint=checkpoint)
     return outcome_digest(model, curve, checkpoint)
 
 
@@ -119,9 +120,8 @@ def learn(checkpoint: Path | None) -> str:
 
     policy, model = OneStepPolicy(3, 2, angles=(0,), hidden=8, copies=2), new_model(tiny)
     starts = episodes_from(torch.from_numpy(TRAIN.states[:, 0]))
-    curve = learn_policy(
-        policy, model, near, starts, horizon=6, episodes=4, iterations=24, record_every=4, checkpoint=checkpoint
-    )
+    options = LearningOptions(horizon=6, episodes=4, iterations=24, record_every=4)
+    curve = learn_policy(policy, model, near, starts, options, checkpoint=checkpoint)
     return outcome_digest(policy, curve, checkpoint)
 
 
@@ -230,24 +230,23 @@ def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
     train(checkpoint, steps=4)
     (generation,) = checkpoint.glob("*.safetensors")
     task = place / "task.safetensors"
-    artifacts.save(
-        task, {"start": torch.zeros(3, 6), "target": torch.ones(3, 2)}, kind="task", header={"task": "reach"}
-    )
+    arrays = {"start": torch.zeros(3, 6), "target": torch.ones(3, 2)}
+    artifacts.save(task, arrays, kind="task", header={"task": "reach"})
     table = place / "shipped" / "table.csv"
-    tables.save_table(table, [{"metric": "success", "value": 0.5, "n": i} for i in range(20)])
+    tables.save(table, [{"metric": "success", "value": 0.5, "n": i} for i in range(20)])
     manifest.write_manifest(table.parent)
     run = Run("05_control", "smoke", 0, place / "run")
     result = run.metrics / "05_control.csv"
-    tables.save_table(result, [{"metric": "success", "value": 0.25, "n": i} for i in range(20)])
+    tables.save(result, [{"metric": "success", "value": 0.25, "n": i} for i in range(20)])
     _note(run, {"state": "complete", "pid": 1, "files": manifest.listing(run.dir, [result])})
     return {
         "dataset": (data, lambda: artifacts.load_trajectories(data)),
         "model": (model, lambda: artifacts.load_model(model, TSM)),
         "checkpoint": (generation, lambda: load_generation(checkpoint)),
         "task": (task, lambda: artifacts.load(task, kind="task")),
-        "shipped table": (table, lambda: tables.load_table(table)),
-        "manifest": (table.parent / files.MANIFEST, lambda: tables.load_table(table)),
-        "table of a run": (result, lambda: tables.load_table(result)),
+        "shipped table": (table, lambda: tables.records(tables.load(table))),
+        "manifest": (table.parent / files.MANIFEST, lambda: tables.records(tables.load(table))),
+        "table of a run": (result, lambda: tables.records(tables.load(result))),
         "status": (run.dir / files.STATUS, lambda: require(run, "05_control")),
     }
 

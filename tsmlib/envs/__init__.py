@@ -1,31 +1,20 @@
 """Two-link arms in two simulators behind one interface; importing this module registers them with Gymnasium.
 
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose ``rollout`` simulates
-whole action sequences at once. The state is the observation, and its layout is the same in both simulators.
-``imperfect`` names the same arms with noisy sensors or delayed actions (section 5.3.3).
+whole action sequences at once; ``gymnasium.make("tsmlib.envs:tsm/ReacherPush-v0")`` imports this module by itself.
+The state is the observation, and its layout is the same in both simulators. ``imperfect`` names the same arms with
+noisy sensors or delayed actions (section 5.3.3). A simulator is imported when an arm in it is first made.
 """
 
-from __future__ import annotations
+from dataclasses import replace
+from importlib import import_module
 
-from typing import Any
-
-import gymnasium
+from gymnasium.envs.registration import register, registry
 
 from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
-from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, PYMUNK_IDS, has_block, imperfections
-from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise, _half_range
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
 
-for _id in ENV_IDS:
-    if _id not in gymnasium.registry:
-        gymnasium.register(
-            _id,
-            entry_point="tsmlib.envs.arm:ArmEnv",
-            vector_entry_point="tsmlib.envs.mujoco_arm:MujocoArm"
-            if _id in MUJOCO_IDS
-            else "tsmlib.envs.pymunk_arm:PymunkArm",
-            kwargs={"env_id": _id},
-            max_episode_steps=100,
-        )
+_VECTOR_ARMS = {"mujoco": "tsmlib.envs.mujoco_arm:MujocoArm", "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm"}
 
 
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
@@ -42,42 +31,32 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
             f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four decimals, and a "
             "whole number of steps from 0 to 100"
         )
-    if not noise and not delay:
-        return env_id
-    words = f"{f'-noise{noise:g}' if noise else ''}{f'-delay{delay}' if delay else ''}"
-    name = f"{env_id.removesuffix('-v0')}{words}-v0"
-    if name not in gymnasium.registry:
-        gymnasium.register(
-            name, entry_point="tsmlib.envs:_imperfect_arm", vector_entry_point="tsmlib.envs:_imperfect_arms",
+    name = replace(EnvSpec.parse(env_id), noise=noise, delay=delay).id
+    if name not in registry:
+        register(
+            name, entry_point="tsmlib.envs.wrappers:imperfect_arm",
+            vector_entry_point="tsmlib.envs.wrappers:imperfect_arms",
             kwargs={"env_id": env_id, "noise": noise, "delay": delay}, max_episode_steps=100,
         )  # fmt: skip
     return name
 
 
-def fingerprint(env_id: str) -> dict[str, Any]:
+def fingerprint(env_id: str) -> dict[str, object]:
     """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit."""
-    arm, noise, delay = imperfections(env_id)
-    if arm in PYMUNK_IDS:
-        from tsmlib.envs.pymunk_arm import physics_hash
-    else:
-        from tsmlib.envs.mujoco_arm import physics_hash
-    dx = 10 if has_block(env_id) else 6
+    spec = EnvSpec.parse(env_id)
+    physics = import_module(_VECTOR_ARMS[spec.simulator].partition(":")[0])
+    names, units = (list(part[: spec.state_dim]) for part in (STATE_NAMES, STATE_UNITS))
     return {
-        "env": env_id, "dt": DT, "names": list(STATE_NAMES[:dx]), "units": list(STATE_UNITS[:dx]), "angles": [0, 1],
-        "noise": noise, "delay": delay, "simulator": physics_hash(arm),
+        "env": env_id, "dt": DT, "names": names, "units": units, "angles": [0, 1],
+        "noise": spec.noise, "delay": spec.delay, "simulator": physics.physics_hash(spec.arm.id),
     }  # fmt: skip
 
 
-def _imperfect_arm(env_id: str, noise: float, delay: int, **kwargs: Any) -> gymnasium.Env:
-    arm = gymnasium.make(env_id, disable_env_checker=True, **kwargs).unwrapped
-    return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
-
-
-def _imperfect_arms(num_envs: int, env_id: str, noise: float, delay: int, **kwargs: Any) -> ImperfectArms:
-    arms = gymnasium.make_vec(env_id, num_envs=num_envs, **kwargs)
-    return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
-
-
 for _id in ENV_IDS:
+    if _id not in registry:
+        register(
+            _id, entry_point="tsmlib.envs.arm:ArmEnv", vector_entry_point=_VECTOR_ARMS[EnvSpec.parse(_id).simulator],
+            kwargs={"env_id": _id}, max_episode_steps=100,
+        )  # fmt: skip
     imperfect(_id, noise=NOISE)
     imperfect(_id, delay=DELAY)

@@ -1,19 +1,11 @@
-"""What both simulators share: state layout, geometry, resets, rewards, and the Gymnasium interface.
-
-State (float64, all in one horizontal plane):
-
-    joint angles (2, rad, not wrapped), joint velocities (2, rad/s), fingertip (2, m)
-    and with a block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
+"""Base of both simulators: resets, rewards, and the Gymnasium interface. The state's layout is in ``geometry``.
 
 Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A simulator subclasses `ArmVectorEnv` with
-four methods: ``_start``, ``_simulate``, ``get_state`` and ``set_state``. One arm, `ArmEnv`, is N = 1 of the same code.
+its abstract methods. One arm, `ArmEnv`, is N = 1 of the same code.
 """
-
-from __future__ import annotations
 
 import secrets
 from abc import ABC, abstractmethod
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,20 +13,11 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from tsmlib.envs.geometry import (
-    BLOCK_CLEARANCE,
-    BLOCK_RING,
-    DT,
-    MAX_OVERLAP,
-    START_ANGLE,
-    START_VELOCITY,
-    STATE_NAMES,
-    STATE_UNITS,
-    TARGET_RADIUS,
-    closest_gap,
-    fingertip,
-)
-from tsmlib.envs.spec import task_of
+from tsmlib.envs import geometry
+from tsmlib.envs.geometry import DT, MAX_OVERLAP, TARGET_RADIUS, closest_gap, fingertip
+from tsmlib.envs.spec import EnvSpec
+
+Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
 
 
 class SimulationUnstable(RuntimeError):
@@ -55,7 +38,7 @@ class ArmVectorEnv(VectorEnv, ABC):
     (N, 2) sets the target. Without them, episode i is drawn from (seed, i) alone, so it does not depend on N.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+    metadata = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": ["rgb_array"],
         "render_fps": round(1 / DT),
         "autoreset_mode": AutoresetMode.DISABLED,
@@ -70,10 +53,10 @@ class ArmVectorEnv(VectorEnv, ABC):
             raise ValueError(f"num_envs is {num_envs}; expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-        self.num_envs, self.env_id, self.task = num_envs, env_id, task_of(env_id)
+        self.num_envs, self.env_id, self.task = num_envs, env_id, EnvSpec.parse(env_id).task
         self.max_episode_steps, self.render_mode = max_episode_steps, render_mode
-        dx = 6 if self.task == "reacher" else 10
-        self.names, self.units = STATE_NAMES[:dx], STATE_UNITS[:dx]
+        dx = EnvSpec.parse(env_id).state_dim
+        self.names, self.units = geometry.STATE_NAMES[:dx], geometry.STATE_UNITS[:dx]
         self.single_observation_space = Box(-np.inf, np.inf, (dx,), np.float64)
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -83,8 +66,6 @@ class ArmVectorEnv(VectorEnv, ABC):
         self._elapsed: int | None = None  # steps since reset; None before the first
         self._states = np.zeros((num_envs, dx))
         self.target = np.zeros((num_envs, 2))
-
-    # What a simulator provides
 
     @abstractmethod
     def _start(self, states: np.ndarray) -> None:
@@ -98,18 +79,18 @@ class ArmVectorEnv(VectorEnv, ABC):
         """
 
     @abstractmethod
-    def get_state(self) -> Any:
+    def get_state(self) -> np.ndarray:
         """Everything the simulator's future depends on; `set_state` brings it back bit for bit."""
 
     @abstractmethod
-    def set_state(self, snapshot: Any) -> None:
+    def set_state(self, snapshot: np.ndarray) -> None:
         """Continue from what `get_state` returned."""
 
-    # Gymnasium's interface
+    @abstractmethod
+    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """One state (dx,) and target (2,) drawn, as uint8 (height, width, 3)."""
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Start N episodes; gives states (N, dx) and ``{"target": (N, 2)}``."""
         options = options or {}
         if unknown := set(options) - {"states", "target"}:
@@ -168,7 +149,7 @@ class ArmVectorEnv(VectorEnv, ABC):
             )
         return actions
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and the targets."""
         states = self.rollout(np.asarray(actions)[:, None])[:, 0]
         moved = states[:, 6:8] if self.task == "push" else states[:, 4:6]
@@ -183,27 +164,21 @@ class ArmVectorEnv(VectorEnv, ABC):
             return None
         return tuple(self.image(state, target) for state, target in zip(self._states, self.target, strict=True))
 
-    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Draw one state (dx,) and target (2,); a simulator with a renderer of its own replaces this."""
-        from tsmlib.envs.render import render_array
-
-        return render_array(state, self.env_id, target=target)
-
     def _draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A state (dx,) and a target (2,) from the reset distribution."""
-        q = rng.uniform(-START_ANGLE, START_ANGLE, 2)
-        state = np.concatenate([q, rng.uniform(-START_VELOCITY, START_VELOCITY, 2), fingertip(q)])
+        q, dq = (rng.uniform(-most, most, 2) for most in (geometry.START_ANGLE, geometry.START_VELOCITY))
+        state = np.concatenate([q, dq, fingertip(q)])
         target = _in_ring(rng, 0.0, TARGET_RADIUS)
-        if self.task == "reacher":
+        if self.task == "reach":
             return state, target
         while True:  # the block must not touch the arm
-            with_block = np.concatenate([state, _in_ring(rng, *BLOCK_RING), np.zeros(2)])
-            if closest_gap(with_block, self.env_id) > BLOCK_CLEARANCE:
+            with_block = np.concatenate([state, _in_ring(rng, *geometry.BLOCK_RING), np.zeros(2)])
+            if closest_gap(with_block, self.env_id) > geometry.BLOCK_CLEARANCE:
                 return with_block, target
 
     def _require_apart(self, states: np.ndarray) -> None:
         """Raise where a start puts the block into the arm, from where a simulator would throw it out."""
-        if self.task == "reacher":
+        if self.task == "reach":
             return
         gap = closest_gap(states, self.env_id)
         if (gap < -MAX_OVERLAP).any():
@@ -232,34 +207,30 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
 class ArmEnv(gymnasium.Env):
     """One arm: the vector environment of the same id with N = 1, so single and bulk simulation agree bit for bit."""
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
     angles = (0, 1)
     dt = DT
 
-    def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
-        vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode, **kwargs).unwrapped
+    def __init__(self, env_id: str, render_mode: str | None = None) -> None:
+        vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode).unwrapped
         assert isinstance(vector, ArmVectorEnv)
-        self.vector = vector
-        self.env_id, self.render_mode = env_id, render_mode
-        self.names, self.units, self.task = self.vector.names, self.vector.units, self.vector.task
-        self.observation_space = self.vector.single_observation_space
-        self.action_space = self.vector.single_action_space
+        self.vector, self.env_id, self.render_mode = vector, env_id, render_mode
+        self.names, self.units, self.task = vector.names, vector.units, vector.task
+        self.observation_space, self.action_space = vector.single_observation_space, vector.single_action_space
 
     @property
     def target(self) -> np.ndarray:
         """The task's target (2,)."""
         return self.vector.target[0]
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """As `ArmVectorEnv.reset`, with ``options["states"]`` (dx,) and ``options["target"]`` (2,)."""
         super().reset(seed=seed)
         options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
         states, info = self.vector.reset(seed=seed, options=options)
         return states[0], {"target": info["target"][0]}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """One step by an action (2,). Never terminates; the registered time limit truncates."""
         states, reward, _, _, info = self.vector.step(np.asarray(action)[None])
         return states[0], float(reward[0]), False, False, {"target": info["target"][0]}
@@ -268,19 +239,10 @@ class ArmEnv(gymnasium.Env):
         """States (T, dx) after actions (T, 2)."""
         return self.vector.rollout(np.asarray(actions)[None])[0]
 
-    def get_state(self) -> Any:
-        """See `ArmVectorEnv.get_state`."""
-        return self.vector.get_state()
-
-    def set_state(self, snapshot: Any) -> None:
-        """See `ArmVectorEnv.set_state`."""
-        self.vector.set_state(snapshot)
-
     def render(self) -> np.ndarray | None:
         """A uint8 image (height, width, 3), or None without ``render_mode="rgb_array"``."""
         frames = self.vector.render()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """Release the simulator."""
         self.vector.close()

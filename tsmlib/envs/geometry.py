@@ -6,11 +6,9 @@ State (float64, all in one horizontal plane):
     and with a block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from tsmlib.envs.spec import task_of
+from tsmlib.envs.spec import EnvSpec
 
 # The arm is Gymnasium's Reacher; a test compares these lengths with its model (m).
 LINK_LENGTHS = (0.1, 0.11)  # shoulder to elbow, elbow to centre of the fingertip
@@ -60,7 +58,7 @@ def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
 
     Negative where they penetrate. The same geometry for both simulators. ValueError where there is no block.
     """
-    if task_of(env_id) == "reacher":
+    if not EnvSpec.parse(env_id).has_block:
         raise ValueError(f"{env_id} has no block; closest_gap needs an obstacle or push environment")
     states = np.asarray(states, np.float64)
     block = states[..., 6:8]

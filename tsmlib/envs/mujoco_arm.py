@@ -8,16 +8,18 @@ MuJoCo's first warning, which its clock then shows.
 Contacts have no friction: torques of 200 N m are so strong that friction would wedge the arm against the obstacle.
 """
 
-from __future__ import annotations
-
 import hashlib
 import operator
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+
+if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
 
 import gymnasium.envs.mujoco
 import mujoco
@@ -26,10 +28,8 @@ import numpy as np
 
 from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
 from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_MASS, BLOCK_RADIUS, DT, RESTITUTION, WALL, fingertip
-from tsmlib.envs.spec import task_of
-
-if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
+from tsmlib.envs.render import render_array
+from tsmlib.envs.spec import EnvSpec
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move
@@ -47,8 +47,8 @@ _gl_works = True  # until the first failure to get a context
 @cache
 def load_model(env_id: str) -> mujoco.MjModel:
     """The compiled model of an environment id; shared, so treat it as read-only."""
-    task = task_of(env_id)
-    if task == "reacher":
+    task = EnvSpec.parse(env_id).task
+    if task == "reach":
         model = mujoco.MjModel.from_xml_path(str(ASSET))
     else:
         spec = mujoco.MjSpec.from_file(str(ASSET))
@@ -82,70 +82,58 @@ def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
 
     It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and
     is drawn as a cylinder. It cannot leave the plane, and walls are half spaces, so nothing passes them.
+    No friction (condim 1), its parameters rule over the links' (priority 1), and group 3 is not drawn.
     """
     block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
     block.add_geom(
-        name="block",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        size=[BLOCK_RADIUS, 0, 0],
-        mass=BLOCK_MASS,
-        contype=1,
-        conaffinity=0,
-        condim=1,  # no friction
-        solref=[CONTACT_TIME, 1.0],
-        solimp=RIGID,
-        priority=1,  # its parameters rule over those of the links
-        group=3,  # not drawn
-    )
+        name="block", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[BLOCK_RADIUS, 0, 0], mass=BLOCK_MASS,
+        contype=1, conaffinity=0, condim=1, solref=[CONTACT_TIME, 1.0], solimp=RIGID, priority=1, group=3,
+    )  # fmt: skip
     block.add_geom(
-        name="block_drawn",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[BLOCK_RADIUS, 0.012, 0],
-        mass=0,
-        contype=0,
-        conaffinity=0,
-        rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
-    )
-    if not moving:
-        return
-    for axis, name in enumerate("xy"):
-        block.add_joint(
-            name=f"block_{name}",
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=np.eye(3)[axis],
-            armature=0.0,
-            damping=BLOCK_MASS / BLOCK_DECAY,
-            limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-        )
+        name="block_drawn", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[BLOCK_RADIUS, 0.012, 0], mass=0,
+        contype=0, conaffinity=0, rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
+    )  # fmt: skip
+    if moving:
+        for axis, name in enumerate("xy"):
+            block.add_joint(
+                name=f"block_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis], armature=0.0,
+                damping=BLOCK_MASS / BLOCK_DECAY, limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+            )  # fmt: skip
+        _add_walls(spec)
+
+
+def _add_walls(spec: mujoco.MjSpec) -> None:
+    """Four walls from which the object bounces; the arm passes over them."""
     log_e = np.log(RESTITUTION)
     damping_ratio = -log_e / np.hypot(np.pi, log_e)  # of the damped spring that returns this share of the speed
     for name, axis, sign in (("east", 0, 1), ("north", 1, 1), ("west", 0, -1), ("south", 1, -1)):
-        normal = -sign * np.eye(3)[axis]
         spec.worldbody.add_geom(
-            name=f"wall_{name}",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            pos=sign * WALL * np.eye(3)[axis] + [0, 0, PLANE],
-            zaxis=normal,
-            size=[0.3, 0.3, 0.01],
-            contype=0,
-            conaffinity=1,
-            priority=2,  # walls bounce
-            condim=1,
-            solref=[WALL_TIME, damping_ratio],
-            solimp=RIGID,
-            group=3,
-        )
+            name=f"wall_{name}", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.3, 0.3, 0.01],
+            pos=sign * WALL * np.eye(3)[axis] + [0, 0, PLANE], zaxis=-sign * np.eye(3)[axis],
+            contype=0, conaffinity=1, condim=1, solref=[WALL_TIME, damping_ratio], solimp=RIGID,
+            priority=2, group=3,
+        )  # fmt: skip
 
 
-def _ignore(message: str) -> None:
-    """Takes MuJoCo's warnings."""
+@contextmanager
+def _without_log() -> Iterator[None]:
+    """MuJoCo's warnings go nowhere, so that it writes no MUJOCO_LOG.TXT: `_check` reports what went wrong."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 class MujocoArm(ArmVectorEnv):
-    """N arms in MuJoCo. ``threads`` simulate at once (default: the processors there are, at most 8)."""
+    """N arms in MuJoCo. ``threads`` simulate at once (default: the CPU cores there are, at most 8)."""
 
-    def __init__(self, num_envs: int, env_id: str, *, threads: int | None = None, **kwargs: Any) -> None:
-        super().__init__(num_envs, env_id, **kwargs)
+    def __init__(
+        self, num_envs: int, env_id: str, *, threads: int | None = None,
+        max_episode_steps: int = 100, render_mode: str | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(num_envs, env_id, max_episode_steps=max_episode_steps, render_mode=render_mode)
         self.model = load_model(env_id)
         self.frame_skip = round(DT / self.model.opt.timestep)
         threads = min(threads or min(os.cpu_count() or 1, 8), num_envs)
@@ -160,7 +148,7 @@ class MujocoArm(ArmVectorEnv):
         self._physics = np.zeros_like(self._physics)  # time, positions, velocities
         self._physics[:, 1:3] = states[:, :2]
         self._physics[:, 1 + nq : 3 + nq] = states[:, 2:4]
-        if self.task == "reacher":
+        if self.task == "reach":
             self._physics[:, 3:5] = self.target  # drawn there; the arm does not feel it
         elif self.task == "push":
             self._physics[:, 3:5] = states[:, 6:8]
@@ -197,12 +185,8 @@ class MujocoArm(ArmVectorEnv):
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
             position = np.concatenate([obstacle, np.full((len(obstacle), 1), PLANE)], axis=1)
             control = np.concatenate([control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2)
-        handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(_ignore)  # no MUJOCO_LOG.TXT: `_check` reports what went wrong
-        try:
+        with _without_log():
             physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
-        finally:
-            mujoco.set_mju_user_warning(handler)
         warned = physics[:, -1, 0] == physics[:, -2, 0]
         return physics[:, self.frame_skip - 1 : -1 : self.frame_skip].copy(), warned
 
@@ -224,17 +208,13 @@ class MujocoArm(ArmVectorEnv):
         mujoco.mj_setState(self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if self.task == "obstacle":
             data.mocap_pos[0] = (*self._obstacle[episode], PLANE)
-        handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(_ignore)
-        try:
+        with _without_log():
             for action in np.repeat(actions, self.frame_skip, axis=0):
                 data.ctrl[:] = action
                 mujoco.mj_step(self.model, data)
                 for kind, warning in enumerate(data.warning):
                     if warning.number:
                         return f" (MuJoCo: {mujoco.mju_warningText(kind, warning.lastinfo).rstrip('.')})"
-        finally:
-            mujoco.set_mju_user_warning(handler)
         return ""
 
     def _check(
@@ -258,7 +238,6 @@ class MujocoArm(ArmVectorEnv):
             raise SimulationUnstable(self.env_id, first + int(episode), int(step), reason)
 
     def get_state(self) -> np.ndarray:
-        """Snapshot (N, k): MuJoCo's full physics state, then the obstacle's position."""
         return np.concatenate([self._physics, self._obstacle], axis=1)
 
     def set_state(self, snapshot: np.ndarray) -> None:
@@ -281,7 +260,7 @@ class MujocoArm(ArmVectorEnv):
             except Exception as error:  # without GL the failure depends on the driver: FatalError, AttributeError, ...
                 _gl_works = False
                 warnings.warn(f"MuJoCo cannot render here ({error}); drawing with matplotlib instead", stacklevel=2)
-        return super().image(state, target)
+        return render_array(state, self.env_id, target)
 
     def _photograph(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         if self._renderer is None:
@@ -289,7 +268,7 @@ class MujocoArm(ArmVectorEnv):
         data = self._data[0]
         mujoco.mj_resetData(self.model, data)
         data.qpos[:2] = state[:2]
-        if self.task == "reacher":
+        if self.task == "reach":
             data.qpos[2:] = target
         elif self.task == "push":
             data.qpos[2:] = state[6:8]
@@ -300,23 +279,17 @@ class MujocoArm(ArmVectorEnv):
         camera.lookat[:] = 0.0, 0.0, PLANE
         camera.distance, camera.azimuth, camera.elevation = 0.85, 90.0, -90.0
         self._renderer.update_scene(data, camera)
-        if self.task != "reacher":  # the variants have no target body
+        if self.task != "reach":  # the variants have no target body
             scene = self._renderer.scene
             mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom],
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.full(3, 0.009),
-                np.array([*target, 3 * PLANE]),
-                np.eye(3).ravel(),
-                np.array([0.9, 0.2, 0.2, 1.0], np.float32),
-            )
+                scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.009),
+                np.array([*target, 3 * PLANE]), np.eye(3).ravel(), np.array([0.9, 0.2, 0.2, 1.0], np.float32),
+            )  # fmt: skip
             scene.ngeom += 1
         return self._renderer.render()
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Stop the threads and release the renderer."""
-        if self._pool is not None:
-            self._pool.close()
+    def close_extras(self, **kwargs: object) -> None:
+        self._pool.close()
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -13,26 +13,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import Any
 
 import numpy as np
 import pymunk
 
+from tsmlib.envs import geometry
 from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
-from tsmlib.envs.geometry import (
-    ARM_RADIUS,
-    BLOCK_DECAY,
-    BLOCK_MASS,
-    BLOCK_RADIUS,
-    DT,
-    ELBOW_LIMIT,
-    FRICTION,
-    GEAR,
-    LINK1_CAPSULE,
-    LINK_LENGTHS,
-    RESTITUTION,
-    WALL,
-)
+from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_DECAY, BLOCK_MASS, BLOCK_RADIUS, DT, ELBOW_LIMIT, LINK_LENGTHS, WALL
+from tsmlib.envs.render import render_array
 
 SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies
 ITERATIONS = 20
@@ -53,8 +41,9 @@ ARM, BLOCK, WALLS = 0b001, 0b010, 0b100  # the arm meets the block only, and pas
 def physics_hash(env_id: str) -> str:
     """SHA-256 of the numbers that decide how an environment moves; the same on every machine."""
     numbers = (
-        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, GEAR, LINK_LENGTHS, LINK1_CAPSULE, ARM_RADIUS, ARMATURE, DAMPING,
-        ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT, BLOCK_RADIUS, BLOCK_MASS, BLOCK_DECAY, FRICTION, RESTITUTION, WALL,
+        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, geometry.GEAR, LINK_LENGTHS, geometry.LINK1_CAPSULE, ARM_RADIUS,
+        ARMATURE, DAMPING, ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT, BLOCK_RADIUS, BLOCK_MASS, BLOCK_DECAY,
+        geometry.FRICTION, geometry.RESTITUTION, WALL,
     )  # fmt: skip
     return hashlib.sha256(repr(numbers).encode()).hexdigest()
 
@@ -75,7 +64,7 @@ class PymunkArm(ArmVectorEnv):
         history = np.concatenate([self._history, actions], axis=1)
         over = self._history.shape[1] < self.max_episode_steps <= history.shape[1]
         live, self._live = self._live, [None] * self.num_envs  # after a fault every episode is replayed
-        for i, torques in enumerate((GEAR * actions).tolist()):
+        for i, torques in enumerate((geometry.GEAR * actions).tolist()):
             episode = live[i] or self._replayed(i)
             for t, (shoulder, elbow) in enumerate(torques):
                 state = episode.step(shoulder, elbow)
@@ -89,11 +78,11 @@ class PymunkArm(ArmVectorEnv):
     def _replayed(self, i: int) -> _Episode:
         """Episode i, built at its start and brought to the present."""
         episode = _Episode(self.task, self._starts[i].tolist())
-        for shoulder, elbow in (GEAR * self._history[i]).tolist():
+        for shoulder, elbow in (geometry.GEAR * self._history[i]).tolist():
             episode.step(shoulder, elbow)
         return episode
 
-    def get_state(self) -> Any:
+    def get_state(self) -> np.ndarray:
         """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot would be complete."""
         raise RuntimeError(
             f"{self.env_id}: pymunk cannot restore an episode in the middle, because the cached contact impulses are "
@@ -101,9 +90,12 @@ class PymunkArm(ArmVectorEnv):
             "actions, which gives the same numbers bit for bit."
         )
 
-    def set_state(self, snapshot: Any) -> None:
+    def set_state(self, snapshot: np.ndarray) -> None:
         """Always RuntimeError, see `get_state`."""
         self.get_state()
+
+    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return render_array(state, self.env_id, target)
 
 
 class _Episode:
@@ -151,7 +143,7 @@ class _Episode:
         elbow_damper = pymunk.DampedRotarySpring(self.link1, self.link2, 0.0, 0.0, DAMPING)
         shapes = (
             pymunk.Segment(self.link1, (0.0, 0.0), (length, 0.0), ARM_RADIUS),
-            pymunk.Segment(self.link2, (0.0, 0.0), (LINK1_CAPSULE, 0.0), ARM_RADIUS),
+            pymunk.Segment(self.link2, (0.0, 0.0), (geometry.LINK1_CAPSULE, 0.0), ARM_RADIUS),
             pymunk.Circle(self.link2, ARM_RADIUS, (LINK_LENGTHS[1], 0.0)),  # the fingertip
         )
         for shape in shapes:
@@ -171,7 +163,7 @@ class _Episode:
     def _add_disc(self, body: pymunk.Body, centre: tuple[float, float]) -> None:
         disc = pymunk.Circle(body, BLOCK_RADIUS, centre)
         disc.filter = pymunk.ShapeFilter(categories=BLOCK)
-        disc.friction, disc.elasticity = FRICTION, 1.0
+        disc.friction, disc.elasticity = geometry.FRICTION, 1.0
         self.space.add(disc)
 
     def _add_walls(self) -> None:
@@ -181,7 +173,7 @@ class _Episode:
         for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
             wall = pymunk.Segment(self.space.static_body, start, end, thick)
             wall.filter = pymunk.ShapeFilter(categories=WALLS, mask=BLOCK)
-            wall.friction, wall.elasticity = 1.0, RESTITUTION
+            wall.friction, wall.elasticity = 1.0, geometry.RESTITUTION
             self.space.add(wall)
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_RADIUS, LINK_LENGTHS, WALL, arm_points
-from tsmlib.envs.spec import task_of
+from tsmlib.envs.spec import EnvSpec
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by colour-blind readers; link 2 and the block differ in lightness as well.
+# Okabe and Ito's colours, distinct for colour-blind readers; link 2 and the block differ in lightness as well.
 LINK1, LINK2, TIP, BLOCK, TARGET = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00"
 INK, STEEL, FRAME, FLOOR = "#22303C", "#7B8794", "#D5DAE0", "#FAFAF8"
 EXTENT = WALL + 0.025  # m, half width of the picture
@@ -37,8 +37,8 @@ def draw_scene(
     """
     from matplotlib.patches import Circle, Rectangle
 
-    state, task = np.asarray(state, np.float64), task_of(env_id)
-    expected = 6 if task == "reacher" else 10
+    state, task = np.asarray(state, np.float64), EnvSpec.parse(env_id).task
+    expected = EnvSpec.parse(env_id).state_dim
     if state.shape != (expected,):
         raise ValueError(f"the state is {state.shape}; {env_id} expected ({expected},)")
 
@@ -56,7 +56,7 @@ def draw_scene(
             ax.plot(path[:, 0], path[:, 1], color=colour, lw=1.6, alpha=0.8, solid_capstyle="round", zorder=2)
     if target is not None:
         _target(ax, np.asarray(target), BLOCK_RADIUS if task == "push" else 1.2 * ARM_RADIUS)
-    if task != "reacher":
+    if task != "reach":
         fixed = task == "obstacle"
         face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
         ax.add_patch(Circle((state[6], state[7]), BLOCK_RADIUS, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))

@@ -1,17 +1,15 @@
 """Imperfect sensors and actuators, as ordinary Gymnasium wrappers (the paper's robustness study, section 5)."""
 
-from __future__ import annotations
-
 from collections import deque
-from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
+from tsmlib.envs.arm import ArmVectorEnv, Info
 from tsmlib.envs.geometry import HALF_RANGE
-from tsmlib.envs.spec import has_block, task_of
+from tsmlib.envs.spec import EnvSpec
 
 NOISE_STREAM = 1  # keeps the noise apart from the draws that the environment makes from the same seed
 
@@ -37,17 +35,13 @@ class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
             raise ValueError(f"scale is {self.scale}; expected finite half ranges of at least 0")
         self._noise = np.random.default_rng()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """As the environment's, with the noisy state."""
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         if seed is not None:
             self._noise = np.random.default_rng([seed, NOISE_STREAM])
         state, info = self.env.reset(seed=seed, options=options)
         return self._observed(state), info | {"state": state}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """As the environment's, with the noisy state."""
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         state, reward, terminated, truncated, info = self.env.step(action)
         return self._observed(state), float(reward), terminated, truncated, info | {"state": state}
 
@@ -58,7 +52,8 @@ class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
 class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
     """Actions arrive ``tau`` steps late: step t applies u_{t - tau}, and the first ``tau`` steps apply zero.
 
-    The reward charges the action that is applied. ValueError where tau is not a whole number of at least 0.
+    The reward charges the action that is applied; ``reset`` forgets those on the way. ValueError where tau is not a
+    whole number of at least 0.
     """
 
     def __init__(self, env: gymnasium.Env, tau: int) -> None:
@@ -71,14 +66,11 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
         self.tau, self._nothing = int(tau), np.zeros_like(env.action_space.low)
         self._on_the_way: deque[np.ndarray] = deque()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """As the environment's; actions still on the way are forgotten."""
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         self._on_the_way = deque([self._nothing] * self.tau)
         return self.env.reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Take ``action`` now, apply the one from ``tau`` steps ago."""
         self._on_the_way.append(np.array(action))
         state, reward, terminated, truncated, info = self.env.step(self._on_the_way.popleft())
@@ -95,7 +87,8 @@ class ImperfectArms(VectorWrapper):
     def __init__(self, env: VectorEnv, *, sigma: float, scale: np.ndarray, tau: int) -> None:
         super().__init__(env)
         self.sigma, self.scale, self.tau = sigma, np.asarray(scale, np.float64), tau
-        self._arms: Any = env.unwrapped
+        assert isinstance(env.unwrapped, ArmVectorEnv)
+        self._arms = env.unwrapped
         self._noise = [np.random.default_rng() for _ in range(env.num_envs)]
         self._seen: list[np.ndarray] = []
         self._on_the_way = np.zeros((env.num_envs, tau, 2))
@@ -105,10 +98,7 @@ class ImperfectArms(VectorWrapper):
         """The true states (N, t + 1, dx) since the last reset."""
         return np.concatenate(self._seen, axis=1)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """As the arms', with noisy states; actions still on the way are forgotten."""
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         if seed is not None:
             self._noise = [np.random.default_rng([seed, NOISE_STREAM, i]) for i in range(self.num_envs)]
         states, info = self._arms.reset(seed=seed, options=options)
@@ -124,7 +114,7 @@ class ImperfectArms(VectorWrapper):
         self._seen.append(states)
         return self._observed(states)
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """As the arms', with the noisy states; ``info["state"]`` (N, dx) holds the true ones."""
         given = np.concatenate([self._on_the_way, self._arms.checked(np.asarray(actions)[:, None])], axis=1)
         states, reward, terminated, truncated, info = self._arms.step(given[:, 0])
@@ -139,7 +129,23 @@ class ImperfectArms(VectorWrapper):
         return states + self.sigma * self.scale * drawn
 
 
+def imperfect_arm(env_id: str, noise: float, delay: int, render_mode: str | None = None) -> ActionDelay:
+    """One arm behind both wrappers, as Gymnasium makes it."""
+    arm = gymnasium.make(env_id, disable_env_checker=True, render_mode=render_mode).unwrapped
+    return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
+
+
+def imperfect_arms(
+    num_envs: int, env_id: str, noise: float, delay: int, *,
+    max_episode_steps: int = 100, render_mode: str | None = None,
+) -> ImperfectArms:  # fmt: skip
+    """N arms with both, as Gymnasium makes them."""
+    arms = gymnasium.make_vec(env_id, num_envs=num_envs, max_episode_steps=max_episode_steps, render_mode=render_mode)
+    return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
+
+
 def _half_range(env_id: str) -> np.ndarray:
-    if task_of(env_id) == "obstacle":  # it does not move, and nobody measures how fast
-        return np.array([*HALF_RANGE[:8], 0.0, 0.0])
-    return np.array(HALF_RANGE[: 10 if has_block(env_id) else 6])
+    scale = np.array(HALF_RANGE[: EnvSpec.parse(env_id).state_dim])
+    if EnvSpec.parse(env_id).task == "obstacle":  # it does not move, and nobody measures how fast
+        scale[8:] = 0.0
+    return scale

@@ -1,12 +1,7 @@
-"""How alike planned and training torques are, and what it costs to keep them alike (section 5.3.5, figure 10).
-
-The paper shows one example each; here is what can be counted: roughness, spectrum, and whether a classifier that never
-saw them tells planned torques from training ones. 0.5 of its AUC means that it cannot, 1 that it never errs.
+"""Action statistics: roughness, spectrum and novelty of torques, and samples of the action prior (section 5.3.5).
 
 Letters in shapes: B plans or episodes, T steps, F frequencies, q traits.
 """
-
-from __future__ import annotations
 
 import numpy as np
 import torch
@@ -36,18 +31,15 @@ def spectrum(actions: Tensor, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
     return torch.fft.rfftfreq(steps, dt).numpy()[1:], power.numpy()[1:]
 
 
-# The prior on its own ------------------------------------------------------------------------------------------------
-
-
 @torch.no_grad()
-def drawn(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
+def sample_actions(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
     """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0)."""
     z = torch.randn(n, -(-horizon // prior.segment_len), prior.latent_dim, generator=generator)
     return prior.plan(_rest(prior, n), z)[:, :horizon]
 
 
 @torch.no_grad()
-def told_again(prior: ActionPrior, actions: Tensor) -> Tensor:
+def reconstruct(prior: ActionPrior, actions: Tensor) -> Tensor:
     """Torques (B, T, du) encoded segment by segment and decoded from the mean codes, T a multiple of H."""
     segments = actions.unflatten(1, (-1, prior.segment_len))  # (B, K, H, du)
     codes, _ = prior.encode(segments.flatten(0, 1))
@@ -58,11 +50,8 @@ def _rest(prior: ActionPrior, n: int) -> Tensor:
     return prior.std.new_zeros(n, prior.past_len, len(prior.std))
 
 
-# Actions -------------------------------------------------------------------------------------------------------------
-
-
 def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
-    """How abrupt torques (B, T, du) are (claims C12, C51, C52), one number per plan: (B,) each.
+    """Roughness of torques (B, T, du) (claims C12, C51, C52), one number per plan: (B,) each.
 
     ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power. ``fast``: share of power
     above 5 Hz. ``autocorrelation``: of successive torques. Without any torque all are zero.
@@ -81,7 +70,7 @@ def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
 
 
 def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
-    """Distance (B,) of plans (B, T, du) from the training torques (N, T', du): how far off the data a plan ventures.
+    """Distance (B,) of plans (B, T, du) from the training torques (N, T', du).
 
     The root mean square difference between each segment of a plan and the nearest of all segments of the data, in
     standard deviations of the data's torques, averaged over the plan. Held-out torques give the value to compare with.

@@ -3,8 +3,6 @@
 Letters in shapes: S samples, N windows of test episodes, T steps, E first touches.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -13,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, closest_gap
-from tsmlib.envs.spec import has_block
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.exploitation import NEAR
 from tsmlib.evaluation.futures import HORIZON, SampledFutures
 from tsmlib.models.base import rollout
@@ -21,13 +19,11 @@ from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
 from tsmlib.trajectory import Trajectories, windows
 
-# Contact -------------------------------------------------------------------------------------------------------------
-
 
 def contact_steps(states: np.ndarray, env: str, *, gap: float = 0.002) -> Tensor:
     """(N, T + 1, dx) -> (N, T) bool: the arm is within ``gap`` metres of the block before or after the step.
 
-    Within 2 mm lie 99 % of the steps in which the arm speeds the object up. ``cut`` brings them in the order of scores.
+    Within 2 mm lie 99 % of the steps in which the arm speeds the object up.
     """
     near = torch.from_numpy(closest_gap(states, env) < gap)
     return near[:, 1:] | near[:, :-1]
@@ -68,9 +64,6 @@ def windows_before_contact(
     return SampledFutures(test.env, window, torch.stack(drawn)), episodes
 
 
-# What happens? -------------------------------------------------------------------------------------------------------
-
-
 def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
     """Where contacts begin: event -> truth (N, T) and samples (S, N, T), bool.
 
@@ -91,7 +84,7 @@ def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 def recall(truth: Tensor, samples: Tensor, steps: range) -> dict[str, float]:
-    """How well events are foretold that begin at ``steps`` ahead: truth (N, T) and samples (S, N, T) bool.
+    """Recall and precision of events that begin at ``steps`` ahead: truth (N, T) and samples (S, N, T) bool.
 
     ``recall``: share of events that a sample has too, up to WITHIN steps early or late, mean over samples;
     ``majority``: share that at least half of the samples have; ``precision``: share of the samples' events that are
@@ -99,13 +92,13 @@ def recall(truth: Tensor, samples: Tensor, steps: range) -> dict[str, float]:
     """
     at = torch.zeros(truth.shape[1], dtype=torch.bool)
     at[list(steps)] = True
-    true, foretold, n = truth & at, samples & at, int((truth & at).sum())
-    found, right = _around(samples) & true, _around(truth) & foretold
+    true, predicted, n = truth & at, samples & at, int((truth & at).sum())
+    found, right = _around(samples) & true, _around(truth) & predicted
     return {
         "n": n,
         "recall": float(found.sum() / (n * len(samples))) if n else math.nan,
         "majority": float(((_around(samples).float().mean(0) >= 0.5) & true).sum() / n) if n else math.nan,
-        "precision": float(right.sum() / foretold.sum()) if foretold.any() else math.nan,
+        "precision": float(right.sum() / predicted.sum()) if predicted.any() else math.nan,
     }
 
 
@@ -178,7 +171,7 @@ def deflections(seen: SampledFutures) -> Deflections:
 def touched(seen: SampledFutures) -> Tensor:
     """(N, T) bool: the arm touches the obstacle or object before or after the step; never where there is none."""
     future = seen.window.future.states
-    if not has_block(seen.env):
+    if not EnvSpec.parse(seen.env).has_block:
         return torch.zeros(future.shape[:2], dtype=torch.bool)
     states = torch.cat([seen.window.past.states[:, -1:], future], dim=1)
     return contact_steps(states.numpy(), seen.env)

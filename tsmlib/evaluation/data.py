@@ -1,10 +1,9 @@
-"""Statistics of collected data: workspace coverage and autocorrelation of velocities (section 5.1)."""
-
-from __future__ import annotations
+"""Statistics of collected data: workspace coverage, autocorrelation of velocities, contacts (section 5.1)."""
 
 import numpy as np
 
-# What data cover ------------------------------------------------------------------------------------------------------
+from tsmlib.envs.geometry import ELBOW_LIMIT, closest_gap
+from tsmlib.envs.spec import EnvSpec
 
 
 def cells_visited(points: np.ndarray, *, inner: float, outer: float, cells: int = 20) -> float:
@@ -30,3 +29,15 @@ def autocorrelation(series: np.ndarray, lag: int) -> np.ndarray:
     sides = (np.asarray(side, np.float64).reshape(-1, series.shape[2]) for side in (series[:, :-lag], series[:, lag:]))
     before, after = (side - side.mean(0) for side in sides)
     return (before * after).mean(0) / np.sqrt(np.square(before).mean(0) * np.square(after).mean(0))
+
+
+def shares(states: np.ndarray, env: str) -> dict[str, float]:
+    """Shares of ``states`` (N, T + 1, dx): of steps at the elbow's stop, of episodes with contact and with a push."""
+    spec = EnvSpec.parse(env)
+    found = {"limit_share": (np.abs(states[:, 1:, 1]) > ELBOW_LIMIT - 0.02).mean()}
+    if spec.has_block:
+        found["contact_share"] = (closest_gap(states, env).min(1) < 0.001).mean()
+    if spec.task == "push":
+        way = np.linalg.norm(states[..., 6:8] - states[:, :1, 6:8], axis=-1)
+        found["moved_share"] = (way.max(1) > 0.005).mean()
+    return {metric: float(share) for metric, share in found.items()}

@@ -1,11 +1,10 @@
-"""What noise of the sensors and delay of the actions do (section 5.3.3), beyond the scores of 03_predict.
+"""Errors to the clean state behind noisy sensors, of models and of filters (section 5.3.3).
 
-Errors to the clean state count in the units in which the noise does, data scaled to [-1, 1] (``envs.base.HALF_RANGE``),
-so that the raw observation's error is the noise's sigma. Angles are compared on the circle.
+Errors count in the units in which the noise does, data scaled to [-1, 1] (``envs.geometry.HALF_RANGE``), so that the
+raw observation's error is the noise's sigma. Angles are compared on the circle.
 
 Against a model stands an extended Kalman filter that is told more than any model here: clean states to fit its
-dynamics on, the arm's kinematics, and the noise. Its process noise is tuned on validation episodes. An exponential
-filter, tuned in the same way, is what an engineer would try first.
+dynamics on, the arm's kinematics, and the noise; and an exponential filter. Both are tuned on validation episodes.
 
 Letters in shapes: N episodes, T steps, K steps predicted, dx = 6 state size of the plain arm, du action size.
 """
@@ -24,9 +23,6 @@ from tsmlib.trajectory import Trajectories
 
 STARTS = range(10, 100, 10)  # of the segments that are predicted from the noisy past
 PARTS = {"angles": slice(0, 2), "velocities": slice(2, 4), "fingertip": slice(4, 6)}
-
-
-# Errors to the clean state -------------------------------------------------------------------------------------------
 
 
 def errors(predicted: np.ndarray, clean: np.ndarray) -> np.ndarray:
@@ -117,7 +113,7 @@ class KalmanFilter:
         return np.concatenate([x, actions, np.ones((len(x), 1))], 1) @ self.transition
 
     def means(self, noisy: Trajectories) -> np.ndarray:
-        """What it takes each present state for, given all observations until then: (N, T + 1, 4)."""
+        """Estimates (N, T + 1, 4) of each present state, given all observations until then."""
         noise = np.diag(np.square(self.sigma * np.array(HALF_RANGE[:6])))
         x, covariance = noisy.states[:, 0, :4].astype(np.float64), np.tile(noise[:4, :4], (len(noisy), 1, 1))
         found = [x]

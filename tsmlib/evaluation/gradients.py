@@ -1,16 +1,14 @@
-"""Gradients of the return: whether they are true (claim C07), and how strong their signal is (claim C13, section 4.2).
+"""Gradients of the return: their errors (claim C07) and their signal to noise (claim C13, section 4.2).
 
 Letters in shapes: B starts, S model samples, K segments, T horizon, dz and du size of code and action.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
@@ -25,7 +23,7 @@ ROUNDING = 1e-6  # relative: a deviation below it is that of float32
 
 
 def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *, step: float = 1e-6) -> list[float]:
-    """How far derivatives by autograd are from central differences, relative to the former, one number per variable.
+    """Errors of derivatives by autograd against central differences, relative to the former, one number per variable.
 
     value: a function of no arguments that gives a number; variables: leaves of type float64 that it reads, as they are
     again afterwards. Each is moved along its gradient plus a random direction. ValueError where the number does not
@@ -48,13 +46,14 @@ def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *,
     return found
 
 
-def of_return(task: Task, model: Any, prior: ActionPrior, *, seed: int = 0) -> dict[str, float]:
+def of_return(task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0) -> dict[str, float]:
     """The largest of ``relative_errors`` of the expected return of ``task`` through model, prior and reward, by what
     it is a function of: random codes, random torques, the weights of the model, the weights of the prior.
 
     Of copies in float64, with two model samples. Weights that play no part, those of the encoders, are left out.
     """
-    net, prior = deepcopy(model).double().requires_grad_(), deepcopy(prior).double().requires_grad_()
+    net: Any = deepcopy(model).double().requires_grad_()
+    prior = deepcopy(prior).double().requires_grad_()
     past = Segment(*(part.double() for part in task.past(net.past_len)))
     predict = model_predictor(net, past, samples=2, seed=seed)
     draw = torch.Generator().manual_seed(seed)
@@ -73,7 +72,7 @@ def of_return(task: Task, model: Any, prior: ActionPrior, *, seed: int = 0) -> d
     return errors(LatentActions(prior, task.horizon), weights) | errors(DirectActions(task.horizon), {})
 
 
-def _playing(net: Any) -> list[Tensor]:
+def _playing(net: nn.Module) -> list[Tensor]:
     """The weights that a prediction depends on."""
     return [p for key, p in net.named_parameters() if not key.startswith("encoder")]
 
@@ -82,8 +81,7 @@ def signal(task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int
     """Signal to noise of the gradient that a planner follows: |mean| / standard deviation over ``samples`` samples of
     the model, for each variable; of these the geometric mean, at one random point of ``space`` per start: (B,).
 
-    Random codes are from N(0, I), random torques like the training data's. A deviation within rounding of the mean
-    counts as that, so that there is an end to the ratio where the model ignores its codes.
+    A deviation within rounding of the mean counts as that: the ratio ends where a model ignores its codes.
     """
     points = space.scale * space.noise(1, len(task), torch.Generator().manual_seed(seed))
     past, gradients = task.past(model.past_len), []

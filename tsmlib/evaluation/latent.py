@@ -1,18 +1,10 @@
-"""What the codes of a segment model do: whether they are used, where, and what one of them means (section 5.3.4).
-
-    is the code used?        KL(Q(Z | X+) || N(0, I)) per segment, active units; what each dimension moves
-    what does it express?    spread of sampled futures: how large, when, and whether it tells the error
-    what happens?            when the arm touches the object, when that hits a wall, where it goes then (figure 9)
-    what is one code?        one future; codes in between are futures in between
+"""Latent codes of a segment model (section 5.3.4).
 
 At test time codes are drawn from N(0, I), and from the encoder where the future is known. Deviations and errors are in
-units of the training data's deviation (the feature space of ``evaluation.prediction``). The paper gives no number for
-any of it.
+units of the training data's deviation (the feature space of ``evaluation.prediction``).
 
 Letters in shapes: S samples, N windows of test episodes, T steps, H segment length, dz code size.
 """
-
-from __future__ import annotations
 
 import math
 
@@ -20,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.evaluation import prediction
+from tsmlib.evaluation import prediction, scoring
 from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
@@ -30,9 +22,6 @@ from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
 
 ACTIVE = 0.01  # variance of a unit's posterior mean above which it counts as active (Burda et al., 2016)
-
-
-# Is the code used? ---------------------------------------------------------------------------------------------------
 
 
 def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
@@ -46,11 +35,11 @@ def active_units(mean: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def importance(model: TSM, window: Window, generator: torch.Generator) -> Tensor:
-    """How far each dimension of the code moves the next segment, (dz,), in deviations of the data.
+def total_effects(model: TSM, window: Window, generator: torch.Generator) -> Tensor:
+    """Total effect of each dimension of the code on the next segment, (dz,), in deviations of the data.
 
-    The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, the total effect of z_i, mean over features, steps and
-    windows. Says what the decoder does with a code however it was trained; the encoder has no part in it.
+    The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, mean over features, steps and windows. Says what
+    the decoder does with a code however it was trained; the encoder has no part in it.
     """
     past, actions = window.past, window.future.actions[:, : model.segment_len]
     z, again = (standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2))
@@ -83,14 +72,11 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
     return errors
 
 
-# What does it express? -----------------------------------------------------------------------------------------------
-
-
 def deviations(seen: SampledFutures, features: Features) -> tuple[Tensor, Tensor]:
     """Variance of the samples, and squared error of their mean: (N, T) each, mean over the features that change."""
     samples = prediction.scored(features, seen.samples)
     error = samples.mean(0) - prediction.scored(features, seen.window.future.states)
-    return prediction.spread(samples).mean(-1), error.square().mean(-1)
+    return scoring.spread(samples).mean(-1), error.square().mean(-1)
 
 
 def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
@@ -108,13 +94,11 @@ def by_spread(variance: Tensor, squared: Tensor, *, groups: int = 10) -> tuple[n
     """Spread and error (groups,) of windows sorted by their spread and cut into equal groups, smallest first."""
     spread, error = variance.mean(1), squared.mean(1)
     parts = [part for part in spread.argsort().tensor_split(groups) if len(part)]
-    return tuple(np.array([math.sqrt(x[part].mean()) for part in parts]) for x in (spread, error))  # type: ignore
+    by_group = ([math.sqrt(x[part].mean()) for part in parts] for x in (spread, error))
+    return np.array(next(by_group)), np.array(next(by_group))
 
 
-# What is one code? ---------------------------------------------------------------------------------------------------
-
-
-def between(first: Tensor, second: Tensor, n: int) -> Tensor:
+def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
     """n codes from ``first`` to ``second`` (..., dz) along cos(a) first + sin(a) second: (n, ..., dz).
 
     If both are drawn from N(0, I), so is every code in between, which is not true of a straight line.
@@ -127,9 +111,16 @@ def between(first: Tensor, second: Tensor, n: int) -> Tensor:
     return codes
 
 
+def window_at(seen: SampledFutures, features: Features, quantile: float) -> Window:
+    """The window (N = 1) at a quantile of the spread of samples."""
+    spread = deviations(seen, features)[0].mean(1)
+    i = int(spread.argsort()[int(quantile * len(spread))])
+    return Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
+
+
 @torch.no_grad()
-def futures(model: TSM, window: Window, codes: Tensor, steps: int) -> Tensor:
-    """What each code (n, dz) makes of one window: states (n, T, dx). One code, then the mode (z = 0) in later segments.
+def decode_codes(model: TSM, window: Window, codes: Tensor, steps: int) -> Tensor:
+    """Futures of codes (n, dz) for one window: states (n, T, dx). One code, then the mode (z = 0) in later segments.
 
     window: N = 1. steps: T, at most as long as its future.
     """

@@ -1,75 +1,71 @@
 """Figures of the action prior: torques of data and plans (figure 10 of the paper), spectra, and what codes decode to.
 
-Reached through ``tsmlib.figures``, where labels are explained.
-
 Letters in shapes: B targets, T steps, F frequencies, n codes on a walk.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from tsmlib.figures.axes import finite
-from tsmlib.figures.style import COLOURS, WIDTH, colour, joint_legend, legend, panels, shaped, styled, torques
+from tsmlib.figures import style
+from tsmlib.figures.checks import finite, shaped
+from tsmlib.figures.method import Method
+from tsmlib.figures.style import WIDTH, Props, entry, legend, panels, styled, tint
 
 WALK = mpl.colormaps["viridis"]
 
 
 @styled
-def figure10(plans: Mapping[str, np.ndarray], dt: float, changes: Mapping[str, float], label: str = "tsm") -> Figure:
-    """Torques over time (paper, figure 10): title -> (T, 2) in [-1, 1], four to a row, all on one scale.
+def figure10(plans: Mapping[Method, np.ndarray], dt: float, changes: Mapping[Method, float]) -> Figure:
+    """Torques over time (paper, figure 10): method -> (T, 2) in [-1, 1], four to a row, all on one scale.
 
-    changes: title -> mean change of torque from step to step of all plans of that kind, as a share of the data's. A
-    title that begins with ``data`` or ``prior`` is drawn in their colour, all others in that of ``label``.
+    changes: method -> mean change of torque from step to step of all its plans, as a share of the data's.
     """
-    plans = {title: shaped(title, actions, "T 2") for title, actions in plans.items()}
+    plans = {method: shaped(method.label, actions, "T 2") for method, actions in plans.items()}
     figure, axes = panels(len(plans), 4, 1.25, sharex=True, sharey=True)
     limit = max(float(np.abs(actions).max()) for actions in plans.values())
-    for ax, (title, actions) in zip(axes, plans.items(), strict=True):
-        first = title.split()[0].rstrip(",")
-        torques(ax, actions, dt, COLOURS[first] if first in ("data", "prior") else colour(label), limit=limit)
-        ax.set_title(title, fontsize=7)
-        ax.annotate(f"change {changes[title]:.2f} of the data's", (0.98, 0.02), xycoords="axes fraction", ha="right",
-                    fontsize=6.5, color="#555555")  # fmt: skip
-    figure.supxlabel("time (s)", fontsize=7)
-    figure.supylabel("torque (share of full)", fontsize=7)
-    joint_legend(figure)
+    for ax, (method, actions) in zip(axes, plans.items(), strict=True):
+        style.torques(ax, actions, dt, method.look.colour, limit=limit)
+        ax.set_title(method.label, fontsize=7)
+        style.note(ax, f"change {changes[method]:.2f} of the data's", 0.98, 0.02)
+    style.torque_labels(figure)
+    style.joint_legend(figure)
     return figure
 
 
 @styled
-def spectra(
-    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], looks: Mapping[str, tuple[str, str]]
-) -> Figure:  # fmt: skip
-    """How fast torques change: title -> name -> frequencies (F,) in Hz and power density (F,).
+def spectra(curves: Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]) -> Figure:
+    """Spectra of torques: title -> method -> frequencies (F,) in Hz and power density (F,).
 
-    looks: name -> a word of ``style.COLOURS`` for its colour, and a line style.
+    Direct plans are dashed, those by Adam pale; the data lie broad behind all others.
     """
-    figure, grid = plt.subplots(
-        1, len(curves), figsize=(min(WIDTH, 3.4 * len(curves)), 2.2), sharey=True, squeeze=False
-    )
-    for ax, (title, rows) in zip(grid[0], curves.items(), strict=True):
-        for word, (frequency, power) in rows.items():
-            look = _line(*looks[word])
-            ax.plot(finite(f"{title}, {word}", frequency, "F"), finite(f"{title}, {word}", power, "F"),
-                    **look)  # fmt: skip
+    figure, axes = panels(len(curves), len(curves), 2.2, width=min(WIDTH, 3.4 * len(curves)), head=0, sharey=True)
+    for ax, (title, rows) in zip(axes, curves.items(), strict=True):
+        for method, (frequency, power) in rows.items():
+            word = f"{title}, {method.label}"
+            ax.plot(finite(word, frequency, "F"), finite(word, power, "F"), **_line(method))
         ax.set(yscale="log", title=title, xlabel="frequency (Hz)")
-    grid[0, 0].set_ylabel("power of the torques (1/Hz)")
-    names = dict.fromkeys(word for rows in curves.values() for word in rows)
-    legend(figure, [Line2D([], [], **_line(*looks[word]), label=word) for word in names], columns=4)
+    axes[0].set_ylabel("power of the torques (1/Hz)")
+    drawn = dict.fromkeys(method for rows in curves.values() for method in rows)
+    legend(figure, [entry(method.label, **_line(method)) for method in drawn], columns=4)
     return figure
+
+
+def _line(method: Method) -> Props:
+    if method.model == "data":
+        return {"color": method.look.colour, "lw": 2.2, "alpha": 0.5}
+    shade = tint(method.look.colour, 0.6 if method.planner.startswith("adam") else 1)
+    return {"color": shade, "ls": style.DASHED if method.search_space == "direct" else "-", "lw": 1.1}
 
 
 @styled
 def prior_walks(walks: np.ndarray, dt: float) -> Figure:
-    """Torques that codes decode to: walks (m, n, T, 2), each from one code (dark) to another (light), from rest.
+    """Torques decoded from codes: walks (m, n, T, 2), each from one code (dark) to another (light), from rest.
 
     Shoulder above, elbow below.
     """
@@ -83,38 +79,29 @@ def prior_walks(walks: np.ndarray, dt: float) -> Figure:
                 ax.plot(seconds, way, color=shade, lw=0.9)
             ax.axhline(0, color="#DDDDDD", lw=0.5, zorder=0)
             ax.set_xlim(0, seconds[-1])
-    for ax, word in zip(grid[:, 0], ("shoulder", "elbow"), strict=True):
+    for ax, word in zip(grid[:, 0], style.JOINTS, strict=True):
         ax.set_ylabel(word)
-    figure.supxlabel("time (s)", fontsize=7)
-    figure.supylabel("torque (share of full)", fontsize=7)
+    style.torque_labels(figure)
     return figure
 
 
 @styled
 def cost_of_prior(values: Mapping[str, Mapping[str, np.ndarray]], labels: Mapping[str, str]) -> Figure:
-    """What each target loses by searching over codes: title -> {"lost", "distance", "peak"}: (B,).
+    """Return lost by the latent search space, target by target: title -> {"lost", "distance", "peak"}: (B,).
 
-    labels: "distance" and "peak" -> what stands below the axis. Red where codes lose, blue where they gain.
+    labels: "distance" and "peak" -> what stands below the axis. Red where the latent space loses, blue where it gains.
     """
     columns = tuple(labels)
-    count = len(values) * len(columns)
-    figure, grid = plt.subplots(1, count, figsize=(WIDTH, 1.9), squeeze=False)
-    places = iter(grid[0])
+    figure, axes = panels(len(values) * len(columns), len(values) * len(columns), 1.9, head=0)
+    places = iter(axes)
     for title, found in values.items():
         lost = finite(f"{title}: lost", found["lost"], "B")
         for word in columns:
             ax = next(places)
             at = finite(f"{title}: {word}", found[word], str(len(lost)))
             ax.axhline(0, color="#999999", lw=0.7, zorder=1)
-            shades = np.where(lost > 0, COLOURS["multistep"], COLOURS["tsm"])
-            ax.scatter(at, lost, s=8, c=shades, linewidths=0, zorder=2)
+            ax.scatter(at, lost, s=8, c=np.where(lost > 0, style.RED, style.BLUE), linewidths=0, zorder=2)
             ax.set(title=title if word == columns[0] else "", xlabel=labels[word])
             ax.locator_params(nbins=5)
-    grid[0, 0].set_ylabel("return lost by codes (m)")
+    axes[0].set_ylabel("return lost in latent space (m)")
     return figure
-
-
-def _line(main: str, dashes: str) -> dict[str, Any]:
-    """How a spectrum is drawn: the data broad and pale, behind all others."""
-    broad = main == "data"
-    return {"color": COLOURS[main], "ls": dashes, "lw": 2.2 if broad else 1.1, "alpha": 0.5 if broad else 1.0}

@@ -1,4 +1,4 @@
-"""What the figures of predictions share: the look of a model, axes that a diverged model does not squeeze, and marks.
+"""Axes, lines and marks of figures of methods; a diverged model does not squeeze the others.
 
 Nothing is cut off in silence: an axis ends before what lies far from the rest, an arrow points to it, and its value
 stands in words below the panel.
@@ -15,43 +15,45 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-from numpy.typing import ArrayLike
 
-from tsmlib.figures.style import COLOURS, colour, legend, name, shaped, tint, words
+from tsmlib.figures.method import Method
+from tsmlib.figures.style import DASHED, Props, entry, legend, tint
 from tsmlib.statistics import interval
 
-Values = Mapping[str, Mapping[str, np.ndarray]]  # panel or environment -> label -> array
-
-MARKERS = {"tsm": "o", "tsm+energy": "D", "tsm+energy+direct": "*", "tsm+teacher": "p", "onestep": "s",
-           "multistep": "^", "lstm": "v", "ensemble": "P", "ensemble+mse": "X"}  # fmt: skip
-DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
+REFERENCES = {"oracle": "-", "zero": "--", "random": ":"}  # models drawn as lines: none of them could gain or lose
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def looks(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Label -> how its line is drawn, in the order of COLOURS; a second label of a model is open and dashed."""
-    order, drawn = list(COLOURS), dict.fromkeys(COLOURS, 0)
-    found: dict[str, dict[str, Any]] = {}
-    for label in sorted(dict.fromkeys(labels), key=lambda label: order.index(words(label)[0])):
-        model, main = words(label)[0], colour(label)
-        again = drawn[model]
-        found[label] = {"color": main, "mfc": "white" if again % 2 else main, "marker": MARKERS.get(model, "o"),
-                        "ls": DASHES[again % 3], "ms": 3, "mew": 0.7}  # fmt: skip
-        drawn[model] += 1
+def looks(*panels: Mapping[str, Collection[Method]]) -> dict[Method, Props]:
+    """How the line of each method in some panels is drawn, in the order in which they come.
+
+    A second method of the same model is open and dashed.
+    """
+    found: dict[Method, Props] = {}
+    for method in (method for given in panels for methods in given.values() for method in methods):
+        again, main = sum(other.model == method.model for other in found), method.look.colour
+        if method not in found:
+            found[method] = {"color": main, "mfc": "white" if again % 2 else main, "marker": method.look.marker,
+                             "ls": ("-", DASHED, (0, (1, 1)))[again % 3], "ms": 3, "mew": 0.7}  # fmt: skip
     if not found:
-        raise ValueError("no panel holds a model: nothing to draw")
+        raise ValueError("no panel holds a method: nothing to draw")
     return found
 
 
-def finite(field: str, values: ArrayLike, shape: str) -> np.ndarray:
-    """``shaped``, and every value is a number."""
-    array = shaped(field, values, shape)
-    if bad := int(np.sum(~np.isfinite(array))):
-        raise ValueError(
-            f"{field}: {bad} of {array.size} values are not finite; a mean over them means nothing. "
-            "Count such rollouts as worst before they are drawn"
-        )
-    return array
+def entries(look_of: Mapping[Method, Props], **more: Any) -> list[Line2D]:
+    """The lines of a legend."""
+    return [entry(method.label, **{**look, **more}) for method, look in look_of.items()]
+
+
+def references(values: Mapping[Method, float]) -> dict[Method, float]:
+    """The references among some methods, of several of one model the best."""
+    best = {method.model: method for method in sorted(values, key=lambda method: values[method])}
+    return {best[model]: values[best[model]] for model in REFERENCES if model in best}
+
+
+def reference_look(method: Method) -> Props:
+    """How the line of a reference is drawn."""
+    return {"color": method.look.colour, "ls": REFERENCES[method.model], "lw": 1}
 
 
 def spell(value: float) -> str:
@@ -64,24 +66,9 @@ def spell(value: float) -> str:
     return text.replace("-", "−")
 
 
-def checked_panels(values: Values, shape: str) -> dict[str, dict[str, np.ndarray]]:
-    """Checked panels: title -> label -> array of ``shape``."""
-    return {title: {label: finite(f"{title}, {label}", array, shape) for label, array in rows.items()}
-            for title, rows in values.items()}  # fmt: skip
-
-
-def per_panel(word: str, given: str | Mapping[str, str], titles: Collection[str]) -> Mapping[str, str]:
-    """One text per panel, from one for all or a mapping."""
-    texts = dict.fromkeys(titles, given) if isinstance(given, str) else given
-    if missing := [title for title in titles if title not in texts]:
-        raise ValueError(f"{word} names {', '.join(texts)}; panel '{missing[0]}' is missing")
-    return texts
-
-
-def known(word: str, given: Iterable[str], titles: Collection[str]) -> None:
-    """Raise unless ``given`` names panels that are there."""
-    if unknown := [title for title in given if title not in titles]:
-        raise ValueError(f"{word} names a panel '{unknown[0]}'; there are {', '.join(titles)}")
+def dimension(word: str) -> str:
+    """A state dimension in words: ``joint0_vel`` -> ``joint0 velocity``."""
+    return word.replace("_", " ").replace(" vel", " velocity")
 
 
 def limits(points: np.ndarray, bars: np.ndarray, also: Sequence[float] = (), log: bool = False) -> tuple[float, float]:
@@ -118,23 +105,54 @@ def arrow(ax: Axes, along: str, at: float, side: int, main: str) -> None:
     ax.plot(*((edge, at) if along == "x" else (at, edge)), marker, color=main, ms=3.5, mew=0, clip_on=False, zorder=6)
 
 
-def mark(ax: Axes, along: str, at: float, seeds: np.ndarray, look: Mapping[str, Any], aside: float) -> list[str]:
+def band(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and half the 95 % interval, (T,) each, of lines (k, T)."""
+    mean, half = np.array([interval(values) for values in lines.T]).T
+    return mean, half
+
+
+def curve(ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, look: Props, shift: float = 0) -> None:
+    """A line and its band; shift: a share of the way from one marker to the next, so that those of lines part."""
+    every, low = max(1, len(at) // 5), ax.get_ylim()[0]
+    ax.plot(at, mean, **look, zorder=3, markevery=(int(shift * every), every))
+    if half.any():
+        lower = np.maximum(mean - half, low / 10) if ax.get_yscale() == "log" else mean - half
+        ax.fill_between(at, lower, mean + half, color=look["color"], alpha=0.11, lw=0, zorder=2)
+
+
+def outside(ax: Axes, at: np.ndarray, mean: np.ndarray, method: Method) -> list[str]:
+    """Arrows where a line leaves its panel, and its furthest values in words."""
+    low, high = ax.get_ylim()
+    notes = []
+    for side, gone in ((-1, mean < low), (1, mean > high)):
+        if gone.any():
+            arrow(ax, "y", at[gone.argmax()], side, method.look.colour)
+            notes.append(f"{method.label} to {spell(side * (side * mean).max())}")
+    return notes
+
+
+def mark(ax: Axes, along: str, at: float, seeds: np.ndarray, look: Props, aside: float) -> list[str]:
     """Mean and 95 % interval at ``at``, every seed as a dot ``aside`` of it; in words if some of it lies outside."""
     mean, half = interval(seeds)
     low, high = ax.get_xlim() if along == "x" else ax.get_ylim()
 
-    def plot(values: Sequence[float] | np.ndarray, at: float, *args: Any, **more: Any) -> None:
+    def plot(values: Sequence[float] | np.ndarray, at: float, marker: str = "", **more: Any) -> None:
         across = np.full(len(values), at)
-        ax.plot(*((values, across) if along == "x" else (across, values)), *args, **more)
+        ax.plot(*((values, across) if along == "x" else (across, values)), marker, **more)
 
     if half:
-        plot([mean - half, mean + half], at, color=look["color"], lw=1.1, zorder=2, solid_capstyle="butt")
+        plot([mean - half, mean + half], at, "-", color=look["color"], lw=1.1, zorder=2, solid_capstyle="butt")
         plot(seeds, at + aside, "o", color=tint(look["color"], 0.7), ms=1.6, mew=0, zorder=3)
     plot([mean], at, **{**look, "ls": "", "ms": 4.2}, zorder=3.5)
     out = {-1: min(seeds.min(), mean - half) < low, 1: max(seeds.max(), mean + half) > high}
     for side in (side for side, beyond in out.items() if beyond):
         arrow(ax, along, at, side, look["color"])
     return [spell(mean) + (f" ± {spell(half)}" if half else "")] if any(out.values()) else []
+
+
+def wrapped(text: str, inches: float) -> str:
+    """``text`` over as many lines as a width asks for."""
+    return textwrap.fill(text, max(8, int(inches / 0.068)), break_on_hyphens=False)
 
 
 def foot(ax: Axes, label: str, notes: Sequence[str], inches: float) -> None:
@@ -145,19 +163,14 @@ def foot(ax: Axes, label: str, notes: Sequence[str], inches: float) -> None:
     ax.set_xlabel("\n".join(lines))
 
 
-def finish(figure: Figure, grid: np.ndarray, entries: Sequence[Line2D] = (), columns: int = 1) -> Figure:
+def finish(figure: Figure, grid: Iterable[Iterable[Axes]], handles: Sequence[Line2D] = (), columns: int = 1) -> Figure:
     """The figure with its legend, and as much higher as the legend and the words below its panels take."""
     lines = sum(max(ax.get_xlabel().count("\n") for ax in row) for row in grid)
-    rows = -(-len(entries) // columns)
-    figure.set_figheight(figure.get_figheight() + 0.115 * lines + (0.14 * rows + 0.1 if entries else 0))
-    if entries:
-        legend(figure, entries, columns=columns)
+    rows = -(-len(handles) // columns)
+    figure.set_figheight(figure.get_figheight() + 0.115 * lines + (0.14 * rows + 0.1 if handles else 0))
+    if handles:
+        legend(figure, handles, columns=columns)
     return figure
-
-
-def handles(look_of: Mapping[str, Mapping[str, Any]], **more: Any) -> list[Line2D]:
-    """The entries of a legend."""
-    return [Line2D([], [], **{**look, **more}, label=name(label)) for label, look in look_of.items()]
 
 
 def ends(rows: Iterable[np.ndarray]) -> np.ndarray:

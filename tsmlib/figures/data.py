@@ -2,66 +2,44 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from tsmlib.figures.style import (
-    COLOURS,
-    _spell,
-    colour,
-    joint_legend,
-    legend,
-    name,
-    panels,
-    shaped,
-    styled,
-    tint,
-    torques,
-)
-
-
-def _log_axis(ax: Axes, low: float, high: float) -> None:
-    """A logarithmic y axis with plain numbers, and enough of them when it spans less than two decades."""
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+from tsmlib.figures import style
+from tsmlib.figures.axes import dimension, log_axis
+from tsmlib.figures.checks import shaped
+from tsmlib.figures.method import Method
+from tsmlib.figures.style import DARK, entry, legend, panels, styled, tint
 
 
 @styled
-def figure4(images: Mapping[str, np.ndarray]) -> Figure:
-    """The six environments (paper, figure 4): MuJoCo above, pymunk below.
-
-    images: environment id -> picture (H, W, 3) uint8, three of each simulator, in the order they are to stand.
-    """
-    simulators = {"MuJoCo": [i for i in images if "pymunk" not in i.lower()],
-                  "pymunk": [i for i in images if "pymunk" in i.lower()]}  # fmt: skip
-    if any(len(ids) != 3 for ids in simulators.values()):
-        raise ValueError(
-            f"figure 4 shows three MuJoCo and three pymunk environments, got {', '.join(images) or 'none'}"
-        )
-    for env, image in images.items():
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"picture of {env} is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
-    figure, axes = plt.subplots(2, 3, figsize=(5.2, 3.55), layout="compressed")
-    for top, row, (simulator, ids) in zip((True, False), axes, simulators.items(), strict=True):
-        for ax, env in zip(row, ids, strict=True):
-            ax.imshow(images[env], interpolation="antialiased")
-            ax.set(xticks=(), yticks=())
-            ax.spines[:].set(visible=True, color="#BBBBBB")
-            if top:
-                ax.set_title(re.sub(r"^tsm/|-v\d+$|Reacher(?=[A-Z])", "", env))
-        row[0].set_ylabel(simulator, fontsize=7.5)
+def figure4(images: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """The environments (paper, figure 4), a row per simulator: simulator -> environment -> picture (H, W, 3) uint8."""
+    if len({len(row) for row in images.values()}) != 1 or not all(images.values()):
+        found = ", ".join(f"{len(row)} of {simulator}" for simulator, row in images.items())
+        raise ValueError(f"figure 4 shows equally many environments of each simulator, got {found or 'none'}")
+    for simulator, row in images.items():
+        for env, image in row.items():
+            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+                raise ValueError(
+                    f"picture of {simulator}, {env} is {image.dtype} {image.shape}, expected uint8 (H, W, 3)"
+                )
+    down, across = len(images), len(next(iter(images.values())))
+    figure, grid = plt.subplots(
+        down, across, figsize=(0.1 + 1.7 * across, 0.15 + 1.7 * down), layout="compressed", squeeze=False
+    )
+    for i, (axes, (simulator, row)) in enumerate(zip(grid, images.items(), strict=True)):
+        for ax, (env, image) in zip(axes, row.items(), strict=True):
+            ax.imshow(image, interpolation="antialiased")
+            style.scene(ax)
+            ax.set_title("" if i else env)
+        axes[0].set_ylabel(simulator, fontsize=7.5)
     return figure
 
 
@@ -71,32 +49,30 @@ def torque_gallery(actions: np.ndarray, dt: float) -> Figure:
     actions = shaped("actions", actions, "n T 2")[:8]
     figure, axes = panels(len(actions), 4, 0.95, sharex=True, sharey=True)
     for ax, episode in zip(axes, actions, strict=True):
-        torques(ax, episode, dt, COLOURS["data"], limit=float(np.abs(actions).max()) or 1.0)
-    figure.supxlabel("time (s)", fontsize=7)
-    figure.supylabel("torque (share of full)", fontsize=7)
-    joint_legend(figure)
+        style.torques(ax, episode, dt, DARK, limit=float(np.abs(actions).max()) or 1.0)
+    style.torque_labels(figure)
+    style.joint_legend(figure)
     return figure
 
 
 @styled
 def state_histograms(states: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
-    """What values the data hold: one histogram per state dimension of ``states`` (..., dx)."""
-    flat = np.asarray(states, float).reshape(-1, np.shape(states)[-1])
-    shaped("states", flat, f"n {len(names)}")
+    """Distribution of the data: one histogram per state dimension of ``states`` (..., dx)."""
+    flat = shaped("states", np.asarray(states, float).reshape(-1, np.shape(states)[-1]), f"n {len(names)}")
     if len(units) != len(names):
         raise ValueError(f"{len(names)} names and {len(units)} units, expected one of each per state dimension")
     figure, axes = panels(len(names), 5 if len(names) > 6 else 3, 1.05)
     for ax, values, word, unit in zip(axes, flat.T, names, units, strict=True):
-        ax.hist(values, bins=int(np.clip(len(values) ** 0.5, 10, 60)), color=COLOURS["data"], alpha=0.75, linewidth=0)
-        ax.set(xlabel=f"{_spell(word)} ({unit})", yticks=(), ylim=(0, None))
-        ax.spines["left"].set_visible(False)
+        ax.hist(values, bins=int(np.clip(len(values) ** 0.5, 10, 60)), color=DARK, alpha=0.75, linewidth=0)
+        ax.set(xlabel=f"{dimension(word)} ({unit})", yticks=(), ylim=(0, None))
+        style.rows_only(ax)
         ax.locator_params(axis="x", nbins=5)
     return figure
 
 
 @styled
 def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
-    """Where the fingertip has been: ``tip`` (..., 2) in m, with the circle of radius ``reach`` (m) it cannot leave."""
+    """Visits of the fingertip: ``tip`` (..., 2) in m, with the circle of radius ``reach`` (m) that it cannot leave."""
     flat = shaped("tip", np.asarray(tip, float).reshape(-1, np.shape(tip)[-1]), "n 2")
     figure, ax = plt.subplots(figsize=(3.3, 2.8))
     edge = 1.08 * (reach or np.abs(flat).max())
@@ -104,8 +80,8 @@ def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
     bins = ax.hexbin(*flat.T, gridsize=60, mincnt=1, norm=LogNorm(), cmap=shades, linewidths=0.1, edgecolors="face",
                      extent=(-edge, edge, -edge, edge))  # fmt: skip
     if reach:
-        ax.add_patch(Circle((0, 0), reach, fill=False, ec=COLOURS["data"], lw=0.7, ls="--"))
-    ax.plot(0, 0, "+", color=COLOURS["oracle"], ms=5, mew=0.8)
+        ax.add_patch(Circle((0, 0), reach, fill=False, ec=DARK, lw=0.7, ls="--"))
+    ax.plot(0, 0, "+", color="black", ms=5, mew=0.8)
     ax.set(xlabel="tip x (m)", ylabel="tip y (m)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
     bar = figure.colorbar(bins, ax=ax, label="states per cell", shrink=0.8, aspect=25)
     bar.outline.set_visible(False)
@@ -113,32 +89,31 @@ def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
 
 
 @styled
-def loss_curves(curves: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Training and validation loss, one panel per model.
+def loss_curves(curves: Mapping[Method, Mapping[str, np.ndarray]]) -> Figure:
+    """Training and validation loss, one panel per method.
 
-    curves: label -> {"seconds" or "step": (n,), "train": (n,), "validation": (n,)}; NaN where nothing was
-    measured. ``vars(curve)`` of what ``train.fit`` returned is one.
+    curves: method -> {"seconds" or "step": (n,), "train": (n,), "validation": (n,)}; NaN where nothing was measured.
+    ``vars(curve)`` of what ``training.fit`` returned is one.
     """
     figure, axes = panels(len(curves), 4, 1.35)
-    for ax, (label, curve) in zip(axes, curves.items(), strict=True):
-        along = next((word for word in ("seconds", "step") if word in curve), None)
+    for ax, (method, given) in zip(axes, curves.items(), strict=True):
+        along = next((word for word in ("seconds", "step") if word in given), None)
         if along is None:
-            raise ValueError(f"loss curve of '{label}' has {', '.join(curve)}, expected 'seconds' or 'step' among them")
-        x, main = shaped(f"{label}: {along}", curve[along], "n"), colour(label)
-        losses = {key: shaped(f"{label}: {key}", curve[key], str(len(x))) for key in ("train", "validation")}
-        for key, values in losses.items():
-            seen = np.isfinite(values)
-            shade, width = (tint(main), 0.8) if key == "train" else (main, 1.3)
-            ax.plot(x[seen], values[seen], color=shade, lw=width)
-        if np.isfinite(losses["validation"]).any():
-            best = int(np.nanargmin(losses["validation"]))
-            ax.plot(x[best], losses["validation"][best], "o", color=main, mec="white", mew=0.6, ms=4.5)
-        if all(np.nanmin(values) > 0 for values in losses.values()):
-            _log_axis(ax, min(np.nanmin(v) for v in losses.values()), max(np.nanmax(v) for v in losses.values()))
-        ax.set(title=name(label), xlabel="training time (s)" if along == "seconds" else "training steps")
+            raise ValueError(
+                f"loss curve of '{method.label}' has {', '.join(given)}, expected 'seconds' or 'step' among them"
+            )
+        x, main = shaped(f"{method.label}: {along}", given[along], "n"), method.look.colour
+        train, held = (shaped(f"{method.label}: {key}", given[key], str(len(x))) for key in ("train", "validation"))
+        for values, shade, width in ((train, tint(main), 0.8), (held, main, 1.3)):
+            ax.plot(x[np.isfinite(values)], values[np.isfinite(values)], color=shade, lw=width)
+        if np.isfinite(held).any():
+            best = int(np.nanargmin(held))
+            ax.plot(x[best], held[best], "o", color=main, mec="white", mew=0.6, ms=4.5)
+        both = np.concatenate([train, held])
+        if np.nanmin(both) > 0:
+            log_axis(ax, float(np.nanmin(both)), float(np.nanmax(both)))
+        ax.set(title=method.label, xlabel="training time (s)" if along == "seconds" else "training steps")
     axes[0].set_ylabel("loss")
-    dark = COLOURS["data"]
-    legend(figure, [Line2D([], [], color=tint(dark), lw=0.8, label="training"),
-                     Line2D([], [], color=dark, lw=1.3, label="validation"),
-                     Line2D([], [], color=dark, ls="", marker="o", mec="white", ms=4.5, label="kept")])  # fmt: skip
+    legend(figure, [entry("training", color=tint(DARK), lw=0.8), entry("validation", color=DARK, lw=1.3),
+                    entry("kept", color=DARK, ls="", marker="o", mec="white", ms=4.5)])  # fmt: skip
     return figure

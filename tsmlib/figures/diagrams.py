@@ -46,17 +46,24 @@ def _route(ax: Axes, points: Sequence[Point], colour: str = INK, dashed: bool = 
     _arrow(ax, points[-2], points[-1], colour, dashed)
 
 
+def _text(
+    ax: Axes, x: float, y: float, text: str, colour: str | None = None, size: float = 9, ha: str = "center", *,
+    va: str = "center_baseline", **more: Any,
+) -> None:  # fmt: skip
+    ax.text(x, y, text, color=colour, fontsize=size, ha=ha, va=va, **more)
+
+
 def _box(ax: Axes, x: float, y: float, width: float, height: float, text: str, colour: str = INK) -> None:
     """A rounded box around (x, y) with its text."""
     ax.add_patch(FancyBboxPatch((x - width / 2, y - height / 2), width, height,
                                 boxstyle="round,pad=0,rounding_size=0.06", fc="white", ec=colour, lw=0.9,
                                 zorder=5))  # fmt: skip
-    ax.text(x, y, text, ha="center", va="center_baseline", fontsize=9, zorder=6)
+    _text(ax, x, y, text, zorder=6)
 
 
 def _disc(ax: Axes, x: float, y: float, text: str, colour: str, radius: float = 0.15) -> None:
     ax.add_patch(Circle((x, y), radius, fc=tint(colour, 0.12), ec=colour, lw=0.9, zorder=5))
-    ax.text(x, y - 0.005, text, ha="center", va="center_baseline", fontsize=9, zorder=6)
+    _text(ax, x, y - 0.005, text, zorder=6)
 
 
 def _wave(phase: float, n: int = 120) -> np.ndarray:
@@ -73,12 +80,9 @@ def _film(ax: Axes, x: float, y: float, width: float, height: float, colour: str
     for phase in phases:
         wave = 0.42 * height * _wave(phase) + y
         along = np.linspace(x - 0.46 * width, x + 0.46 * width, len(wave))
-        if steps:
-            ax.step(
-                along[:: len(wave) // steps], wave[:: len(wave) // steps], where="mid", color=colour, lw=0.9, zorder=6
-            )
-        else:
-            ax.plot(along, wave, color=colour, lw=0.9, zorder=6)
+        every = len(wave) // steps if steps else 1
+        ax.plot(along[::every], wave[::every], color=colour, lw=0.9, zorder=6,
+                drawstyle="steps-mid" if steps else "default")  # fmt: skip
 
 
 @styled
@@ -115,15 +119,15 @@ def figure1() -> Figure:
     _arrow(ax, (left - 0.1, axis), (right + 0.22, axis))
     for x, text in ((left, "$t-H$"), (now, "$t$"), (right, "$t+H$")):
         ax.plot([x, x], [axis - 0.035, axis + 0.035], color=INK, lw=0.7)
-        ax.text(x, axis - 0.09, text, ha="center", va="top", fontsize=8)
-    ax.text(right + 0.26, axis, "time", va="center_baseline", fontsize=7)
+        _text(ax, x, axis - 0.09, text, None, 8, va="top")
+    _text(ax, right + 0.26, axis, "time", None, 7, "left")
     for x0, y, text, colour in (
         (left, 2.46, "past states $X^-$", PAST), (now, 2.46, "possible future states $X^+$", FUTURE),
         (left, 1.26, "past actions $U^-$", PAST), (now, 1.26, "planned actions $U^+$", ACTION),
     ):  # fmt: skip
-        ax.text(x0 + (now - left) / 2, y - 0.02, text, ha="center", va="center_baseline", fontsize=8, color=colour)
-    ax.text(left - 0.14, states, "$x$", ha="right", va="center", fontsize=10)
-    ax.text(left - 0.14, torques, "$u$", ha="right", va="center", fontsize=10)
+        _text(ax, x0 + (now - left) / 2, y - 0.02, text, colour, 8)
+    _text(ax, left - 0.14, states, "$x$", None, 10, "right", va="center")
+    _text(ax, left - 0.14, torques, "$u$", None, 10, "right", va="center")
     return figure
 
 
@@ -154,66 +158,75 @@ def figure2() -> Figure:
     """
     figure, ax = _canvas(7.0, 3.5)
     ax.set_ylim(0.22, 3.72)
-    H, first, pitch = 10, 2.55, 0.2
-    columns = first + pitch * np.arange(2 * H)
+    H, x, out, top = 10, 0.95, 3.2, 3.58
+    columns = 2.55 + 0.2 * np.arange(2 * H)
     rows = np.array([0.98, 1.33, 1.66, 1.99, 2.32, 2.65])
-    x_row, u_row, out = 0.86, 0.62, 3.2
+    _decoder(ax, columns, rows, out)
+    _encoder(ax, x, out)
 
-    for c, x in enumerate(columns):  # inputs: state above action
+    bus, code = 2.12, 1.02  # the code enters every layer
+    ax.plot([x + 0.15, bus, bus], [code, code, rows[-1]], color=PAST, lw=0.8)
+    for y in rows[1:]:
+        _arrow(ax, (bus, y), (columns[0] - 0.08, y), PAST)
+    _text(ax, bus, rows[-1] + 0.13, "$V_k^\\top z$", PAST, 8)
+
+    middle = (columns[H] + columns[-1]) / 2  # the two terms of the loss
+    _text(ax, columns[H] - 0.14, out, "$\\hat{X}^+$", FUTURE, 9, "right")
+    _route(ax, [((x + middle) / 2, top), (x, top), (x, out + 0.22)])
+    _route(ax, [((x + middle) / 2, top), (middle, top), (middle, out + 0.085)])
+    _text(ax, (x + middle) / 2, top, "$\\ell_2$ loss", None, 8, backgroundcolor="white", zorder=6)
+    ax.plot([x + 0.36, x + 0.5], [1.65, 1.65], color=INK, lw=0.8)
+    ax.text(x + 0.54, 1.65, "KL from\n$\\mathcal{N}(0,I)$", va="center", fontsize=7, linespacing=1.3)
+    return figure
+
+
+def _decoder(ax: Axes, columns: np.ndarray, rows: np.ndarray, out: float) -> None:
+    """The tree of layers at ``rows`` above its inputs, states above actions, and below its outputs at ``out``."""
+    H, x_row, u_row = len(columns) // 2, 0.86, 0.62
+    for c, x in enumerate(columns):
         for y, known, planned in ((x_row, c <= H, FUTURE), (u_row, c < H, ACTION)):
             colour = PAST if known else planned
-            look: dict[str, Any] = (
-                {"fc": tint(colour, 0.3), "ec": colour} if c else {"fc": "white", "ec": "#BBBBBB", "ls": ":"}
-            )
-            ax.add_patch(Rectangle((x - 0.075, y - 0.085), 0.15, 0.17, lw=0.6, zorder=5, **look))
+            face, edge, line = (tint(colour, 0.3), colour, "-") if c else ("white", "#BBBBBB", ":")
+            _cell(ax, x, y, face, edge, line)
     _tree(ax, columns, rows)
     for x in columns[H:]:
         ax.plot([x, x], [rows[-1], out - 0.085], color="#E2E2E2" if x < columns[-1] else INK, lw=0.7, zorder=2)
-        ax.add_patch(Rectangle((x - 0.075, out - 0.085), 0.15, 0.17, fc=tint(FUTURE, 0.3), ec=FUTURE, lw=0.6, zorder=5))
-    edge = columns[-1] + 0.12
+        _cell(ax, x, out, tint(FUTURE, 0.3), FUTURE)
+    right = columns[-1] + 0.12
     for layer, gap in enumerate(DILATIONS, start=1):
-        ax.text(edge, rows[layer] - 0.165, f"dilation {gap}", va="center_baseline", fontsize=6.5, color=GREY)
-    _route(ax, [(columns[-2], out + 0.085), (columns[-2], out + 0.2), (edge + 0.48, out + 0.2), (edge + 0.48, x_row),
+        _text(ax, right, rows[layer] - 0.165, f"dilation {gap}", GREY, 6.5, "left")
+    _route(ax, [(columns[-2], out + 0.085), (columns[-2], out + 0.2), (right + 0.48, out + 0.2), (right + 0.48, x_row),
                 (columns[-1] + 0.085, x_row)], FUTURE, dashed=True)  # fmt: skip
-    ax.text(edge + 0.42, out + 0.26, "fed back", ha="right", va="baseline", fontsize=6.5, color=FUTURE)
-    for lo, hi, y, text, colour in ((1, H - 1, u_row, "$U^-$", PAST), (H, 2 * H - 1, u_row, "$U^+$", ACTION)):
-        ax.plot([columns[lo] - 0.07, columns[hi] + 0.07], [y - 0.15] * 2, color=colour, lw=0.8)
-        ax.text((columns[lo] + columns[hi]) / 2, y - 0.2, text, ha="center", va="top", fontsize=9, color=colour)
-    ax.text(first - 0.14, x_row, "$X^-$", ha="right", va="center_baseline", fontsize=9, color=PAST)
-    ax.text(columns[0] - 0.07, 2.97, "decoder  $P^{(x)}(X^+\\mid X^-,U^-,U^+,Z)$", va="center_baseline", fontsize=8.5)
+    _text(ax, right + 0.42, out + 0.26, "fed back", FUTURE, 6.5, "right", va="baseline")
+    for lo, hi, text, colour in ((1, H - 1, "$U^-$", PAST), (H, 2 * H - 1, "$U^+$", ACTION)):
+        ax.plot([columns[lo] - 0.07, columns[hi] + 0.07], [u_row - 0.15] * 2, color=colour, lw=0.8)
+        _text(ax, (columns[lo] + columns[hi]) / 2, u_row - 0.2, text, colour, 9, va="top")
+    _text(ax, columns[0] - 0.14, x_row, "$X^-$", PAST, 9, "right")
+    _text(ax, columns[0] - 0.07, 2.97, "decoder  $P^{(x)}(X^+\\mid X^-,U^-,U^+,Z)$", None, 8.5, "left")
 
-    x, code = 0.95, 1.02  # the encoder's column, from X+ down to z
+
+def _cell(ax: Axes, x: float, y: float, face: str | tuple[float, ...], edge: str, ls: str = "-") -> None:
+    ax.add_patch(Rectangle((x - 0.075, y - 0.085), 0.15, 0.17, lw=0.6, fc=face, ec=edge, ls=ls, zorder=5))
+
+
+def _encoder(ax: Axes, x: float, out: float) -> None:
+    """The encoder's column at x, from the future at ``out`` down to the code."""
+    code = 1.02
     _film(ax, x, out, 1.1, 0.44, FUTURE, (0.3, 2.2))
-    ax.text(x - 0.62, out, "$X^+$", ha="right", va="center_baseline", fontsize=9, color=FUTURE)
-    ax.add_patch(
-        Polygon([(x - 0.55, 2.68), (x + 0.55, 2.68), (x + 0.3, 2.1), (x - 0.3, 2.1)], fc="white", ec=INK, lw=0.9)
-    )
+    _text(ax, x - 0.62, out, "$X^+$", FUTURE, 9, "right")
+    funnel = [(x - 0.55, 2.68), (x + 0.55, 2.68), (x + 0.3, 2.1), (x - 0.3, 2.1)]
+    ax.add_patch(Polygon(funnel, fc="white", ec=INK, lw=0.9))
     for y, half in ((2.53, 0.455), (2.25, 0.335)):
         ax.plot([x - half - 0.03, x + half + 0.03], [y, y], color="#D8D8D8", lw=0.7)
-    ax.text(x, 2.39, "$Q^{(x)}(Z\\mid X^+)$", ha="center", va="center_baseline", fontsize=8.5)
-    ax.text(x - 0.5, 2.3, "encoder", ha="right", va="center_baseline", fontsize=7)
+    _text(ax, x, 2.39, "$Q^{(x)}(Z\\mid X^+)$", None, 8.5)
+    _text(ax, x - 0.5, 2.3, "encoder", None, 7, "right")
     _arrow(ax, (x, out - 0.22), (x, 2.68))
     for dx, text in ((-0.2, "$\\mu_Z$"), (0.2, "$\\sigma_Z$")):
         _arrow(ax, (x + dx * 0.9, 2.1), (x + dx, 1.8))
         _disc(ax, x + dx, 1.65, text, PAST)
         _arrow(ax, (x + dx * 0.75, 1.515), (x + 0.35 * dx, code + 0.135))
     _disc(ax, x, code, "$z$", PAST)
-    ax.text(x, code - 0.25, "$z=\\mu_Z+\\sigma_Z\\,\\varepsilon$", ha="center", va="center_baseline", fontsize=8)
-    bus = 2.12
-    ax.plot([x + 0.15, bus, bus], [code, code, rows[-1]], color=PAST, lw=0.8)
-    for y in rows[1:]:
-        _arrow(ax, (bus, y), (columns[0] - 0.08, y), PAST)
-    ax.text(bus, rows[-1] + 0.13, "$V_k^\\top z$", ha="center", va="center_baseline", fontsize=8, color=PAST)
-
-    middle, top = (columns[H] + columns[-1]) / 2, 3.58  # the two terms of the loss
-    ax.text(columns[H] - 0.14, out, "$\\hat{X}^+$", ha="right", va="center_baseline", fontsize=9, color=FUTURE)
-    _route(ax, [((x + middle) / 2, top), (x, top), (x, out + 0.22)])
-    _route(ax, [((x + middle) / 2, top), (middle, top), (middle, out + 0.085)])
-    ax.text((x + middle) / 2, top, "$\\ell_2$ loss", ha="center", va="center_baseline", fontsize=8,
-            backgroundcolor="white", zorder=6)  # fmt: skip
-    ax.plot([x + 0.36, x + 0.5], [1.65, 1.65], color=INK, lw=0.8)
-    ax.text(x + 0.54, 1.65, "KL from\n$\\mathcal{N}(0,I)$", va="center", fontsize=7, linespacing=1.3)
-    return figure
+    _text(ax, x, code - 0.25, "$z=\\mu_Z+\\sigma_Z\\,\\varepsilon$", None, 8)
 
 
 @styled
@@ -232,7 +245,7 @@ def figure3() -> Figure:
         _film(ax, x, x_y, 0.78, 0.32, FUTURE, (1.0 + 1.3 * i, 2.7 + 0.9 * i))
         _box(ax, x, r_y, 0.9, 0.29, f"$r(X_{k},U_{k})$")
         for y, text, colour in ((u_y, f"$U_{k}$", ACTION), (x_y, f"$X_{k}$", FUTURE)):
-            ax.text(x - 0.44, y + 0.02, text, ha="right", va="center_baseline", fontsize=9, color=colour)
+            _text(ax, x - 0.44, y + 0.02, text, colour, 9, "right")
         edges = [(z_y + 0.17, prior_y - 0.15), (prior_y + 0.15, u_y - 0.16), (u_y + 0.16, model_y - 0.15),
                  (model_y + 0.15, x_y - 0.16), (x_y + 0.16, r_y - 0.145)]  # fmt: skip
         for n, (low, high) in enumerate(edges):
@@ -243,20 +256,17 @@ def figure3() -> Figure:
         _arrow(ax, (x, r_y + 0.145), (end, sum_y - 0.16))
         _arrow(ax, (end + 0.16, sum_y - 0.16), (x + 0.16, r_y + 0.145), PAST, dashed=True)
     _box(ax, middle, sum_y, 1.75, 0.32, "$\\mathbf{E}\\;[\\;\\Sigma_k\\,r(X_k,U_k)\\;]$")
-    ax.text(middle - 0.94, sum_y, "maximise", ha="right", va="center_baseline", fontsize=7.5)
+    _text(ax, middle - 0.94, sum_y, "maximise", None, 7.5, "right")
 
-    for y, following, start in (
-        (u_y, prior_y, "$U_0=0$"),
-        (x_y, model_y, "$x_0$"),
-    ):  # from segment to segment
-        ax.text(0.52, following, start, ha="right", va="center_baseline", fontsize=9)
+    for y, following, start in ((u_y, prior_y, "$U_0=0$"), (x_y, model_y, "$x_0$")):  # from segment to segment
+        _text(ax, 0.52, following, start, None, 9, "right")
         _arrow(ax, (0.57, following), (centres[0] - 0.31, following))
         bend = centres[0] + 0.6
         _route(ax, [(centres[0] + 0.39, y), (bend, y), (bend, following), (centres[1] - 0.31, following)])
         bend = centres[1] + 0.6
         _route(ax, [(centres[1] + 0.39, y), (bend, y), (bend, following), (bend + 0.2, following)])
-        ax.text(bend + 0.34, following, "\N{MIDLINE HORIZONTAL ELLIPSIS}", ha="center", va="center", fontsize=9)
+        _text(ax, bend + 0.34, following, "\N{MIDLINE HORIZONTAL ELLIPSIS}", va="center")
         _arrow(ax, (bend + 0.46, following), (centres[2] - 0.31, following))
     _arrow(ax, (0.62, 0.22), (0.24, 0.22), PAST, dashed=True)
-    ax.text(0.43, 0.3, "gradient", ha="center", va="bottom", fontsize=6.5, color=PAST)
+    _text(ax, 0.43, 0.3, "gradient", PAST, 6.5, va="bottom")
     return figure

@@ -1,156 +1,138 @@
-"""Figures of learned policies: what they earn along their learning, and what that has cost.
+"""Figures of learned policies: returns along their learning, and the cost of it (figures 7 and 8 of the paper).
 
-The paper's figure 7 and what surrounds it. Reached through ``tsmlib.figures``, where labels are explained; a policy is
-named by its model and what it acts through (``"tsm codes"``, ``"lstm actions"``), a model-free one by its algorithm.
-Letters in shapes: k copies or seeds, R records along a curve.
+Letters in shapes: k policies or seeds, R records along a curve.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from tsmlib.figures.axes import arrow, finish, finite, foot, known, limits, looks, spell
-from tsmlib.figures.planning import REFERENCES
-from tsmlib.figures.style import COLOURS, WIDTH, name, styled, words
-from tsmlib.statistics import interval
+from tsmlib.figures import axes
+from tsmlib.figures.checks import finite, known
+from tsmlib.figures.method import Method
+from tsmlib.figures.style import DASHED, GRID, WIDTH, Props, entry, styled
 
 Curves = dict[str, np.ndarray]
-LearningCurves = Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]  # task -> label -> Curves
+LearningCurves = Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]]  # task -> method -> Curves
+References = Mapping[str, Mapping[Method, float]]  # task -> method -> return
 AXES = {"iterations": "optimiser iterations", "samples": "environment steps, the data set's counted",
         "seconds": "seconds, training of the model counted"}  # fmt: skip
+PREDICTED: Props = {"ls": DASHED, "lw": 0.7}
 
 
 @styled
 def figure7(
-    curves: LearningCurves, references: Mapping[str, Mapping[str, float]] | None = None,
-    against: Sequence[str] = ("iterations", "samples", "seconds"),
-) -> Figure:  # fmt: skip
+    curves: LearningCurves, references: References | None = None, against: Sequence[str] = tuple(AXES)
+) -> Figure:
     """Learning curves of policies (paper, figure 7): a column for each task, a row for each quantity of ``against``.
 
-    curves: task -> label -> {"return_true": (k, R)}, mean undiscounted return over the task's targets, and of
-    {"iterations", "samples", "seconds": (R,)} what is known of it, "return_predicted": (k, R) what the model promised.
-    A label is drawn in the rows that it has numbers for. references: task -> label -> return, drawn as lines; labels
-    start with oracle, zero or random.
+    curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets, and of
+    {"iterations", "samples", "seconds": (R,)} what is known of it, "return_predicted": (k, R) of the model. A method is
+    drawn in the rows that it has numbers for. references: task -> oracle, zero or random torques -> return, drawn as
+    lines.
 
-    Lines are means, bands their 95 % t intervals over the k. Against iterations, dashes show the promise. A policy
-    whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of it.
-    Seconds are on a logarithmic axis from 1 s.
+    Lines are means, bands their 95 % t intervals over the k. Against iterations, dashes show the predicted return. A
+    policy whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of
+    it. Seconds are on a logarithmic axis from 1 s.
     """
-    return draw_policies(curves, references or {}, against)
+    return _draw(curves, references or {}, against)
 
 
-def draw_policies(
-    curves: LearningCurves, references: Mapping[str, Mapping[str, float]], against: Sequence[str], sharey: bool = False
-) -> Figure:
+@styled
+def figure8(curves: LearningCurves, references: Mapping[Method, float] | None = None) -> Figure:
+    """Learning curves of policies with noise and with delay beside the clean arm (paper, figure 8), one scale for all.
+
+    curves: condition -> method -> {"return_true": (k, R), "iterations": (R,)}; references: zero or random torques ->
+    return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals.
+    """
+    return _draw(curves, dict.fromkeys(curves, references or {}), ("iterations",), sharey=True)
+
+
+def _draw(curves: LearningCurves, references: References, against: Sequence[str], sharey: bool = False) -> Figure:
     """``figure7``; sharey: one scale of returns for all columns."""
     known("against", against, list(AXES))
     known("references", references, list(curves))
-    checked = {task: {label: _checked(f"{task}, {label}", given) for label, given in rows.items()}
+    checked = {task: {method: _checked(f"{task}, {method.label}", given) for method, given in rows.items()}
                for task, rows in curves.items()}  # fmt: skip
-    look_of = {label: _look(label, look) for label, look in looks(
-        label for rows in checked.values() for label in rows).items()}  # fmt: skip
+    look_of = {method: _look(method, look) for method, look in axes.looks(checked).items()}
+    levels = {task: axes.references(references.get(task, {})) for task in checked}
+    size = (WIDTH if len(checked) > 1 else 3.8, 1.75 * len(against) + 0.1)
     figure, grid = plt.subplots(
-        len(against), len(checked), figsize=(WIDTH if len(checked) > 1 else 3.8, 1.75 * len(against) + 0.1),
-        squeeze=False, sharey=True if sharey else "col",
-    )  # fmt: skip
-    if sharey:
-        means = np.concatenate([row["return_true"].mean(0) for rows in checked.values() for row in rows.values()])
-        floors = [level for own in references.values() for level in own.values()]
-        low, high = limits(means, means, also=floors)
-        if floors:  # what falls far below doing nothing would squeeze the rest
-            low = max(low, min(floors) - 0.35 * (high - min(floors)))
-        shared = low, high
-    banded = promised = False
+        len(against), len(checked), figsize=size, squeeze=False, sharey=True if sharey else "col"
+    )
     for column, (task, rows) in zip(grid.T, checked.items(), strict=True):
-        levels = references.get(task, {})
-        ends = [mean + sign * half for row in rows.values() for mean, half in [_band(row["return_true"])]
-                for sign in (-1, 1)]  # fmt: skip
-        means = np.concatenate([row["return_true"].mean(0) for row in rows.values()])
-        low, high = shared if sharey else limits(means, np.concatenate(ends), also=list(levels.values()))
-        column[0].set_ylim(low, high)
-        for ax, word in zip(column, against, strict=True):
-            _levels(ax, levels)
-            drawn = {label: rows[label] for label in look_of if word in rows.get(label, {})}
-            far = _scale(ax, word, [row[word] for row in drawn.values()])
-            notes = []
-            for i, (label, row) in enumerate(drawn.items()):
-                look, at, (mean, half) = look_of[label], row[word], _band(row["return_true"])
-                if word == "seconds":
-                    at, mean, half = (part[at >= 1] for part in (at, mean, half))
-                if word == "samples" and np.ptp(at) == 0:
-                    ax.plot([at[-1], far], [mean[-1]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
-                    ax.errorbar(at[-1], mean[-1], half[-1], elinewidth=0.9, **{**look, "ls": ""}, zorder=4)
-                    at, mean, half = at[-1:], mean[-1:], half[-1:]
-                else:
-                    every = max(1, len(at) // 6)
-                    ax.plot(at, mean, **look, zorder=3, markevery=((i * every) // len(drawn), every))
-                    ax.fill_between(at, mean - half, mean + half, color=look["color"], alpha=0.11, lw=0, zorder=2)
-                banded |= bool(half.any())
-                if word == "iterations" and "return_predicted" in row:
-                    promised = True
-                    ax.plot(
-                        at, row["return_predicted"].mean(0), color=look["color"], ls=(0, (3, 1.5)), lw=0.7, zorder=2.5
-                    )
-                for side, gone in ((-1, mean < low), (1, mean > high)):
-                    if gone.any():
-                        arrow(ax, "y", at[gone.argmax()], side, look["color"])
-                        notes.append(f"{name(label)} to {spell(side * (side * mean).max())}")
-            ax.grid(axis="y", color="#EEEEEE", lw=0.6)
-            foot(ax, AXES[word], notes, WIDTH / len(checked) - 0.5)
+        column[0].set_ylim(_limits(checked if sharey else {task: rows}, levels, floored=sharey))
         column[0].set_title(task.capitalize())
-    for axes in grid:
-        axes[0].set_ylabel("true return")
-    entries = [Line2D([], [], **look, label=name(label)) for label, look in look_of.items()]
-    used = {words(label)[0] for levels in references.values() for label in levels}
-    entries += [
-        Line2D([], [], color=COLOURS[r], ls=REFERENCES[r], lw=1, label=name(r)) for r in REFERENCES if r in used
-    ]
-    if promised:
-        entries.append(Line2D([], [], color="#777777", ls=(0, (3, 1.5)), lw=0.7, label="what the model promised"))
-    if banded:
-        entries.append(Line2D([], [], color="#DDDDDD", lw=5, solid_capstyle="butt", label="95 % interval"))
-    return finish(figure, grid, entries, 4 if len(checked) > 1 else 2)
+        for ax, word in zip(column, against, strict=True):
+            for method, level in levels[task].items():
+                ax.axhline(level, **axes.reference_look(method), zorder=1)
+            drawn = {method: rows[method] for method in look_of if word in rows.get(method, {})}
+            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.5)
+    for row in grid:
+        row[0].set_ylabel("executed return")
+    every = [row for rows in checked.values() for row in rows.values()]
+    used = dict.fromkeys(method for own in levels.values() for method in own)
+    handles = axes.entries(look_of)
+    handles += [entry(method.look.name, **axes.reference_look(method)) for method in used]
+    if "iterations" in against and any({"return_predicted", "iterations"} <= row.keys() for row in every):
+        handles.append(entry("predicted return", color="#777777", **PREDICTED))
+    if any(len(row["return_true"]) > 1 for row in every):
+        handles.append(entry("95 % interval", color="#DDDDDD", lw=5, solid_capstyle="butt"))
+    return axes.finish(figure, grid, handles, 4 if len(checked) > 1 else 2)
+
+
+def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, floored: bool) -> tuple[float, float]:
+    """The range of returns of some tasks; floored: what falls far below doing nothing may lie outside."""
+    bands = [axes.band(row["return_true"]) for rows in checked.values() for row in rows.values()]
+    means = np.concatenate([mean for mean, _ in bands])
+    ends = means if floored else np.concatenate([mean + sign * half for mean, half in bands for sign in (-1, 1)])
+    floors = [level for task in checked for level in levels[task].values()]
+    low, high = axes.limits(means, ends, also=floors)
+    return max(low, min(floors) - 0.35 * (high - min(floors))) if floored and floors else low, high
+
+
+def _panel(ax: Axes, word: str, drawn: Mapping[Method, Curves], look_of: Mapping[Method, Props], inches: float) -> None:
+    """Curves against one quantity, a key of AXES."""
+    far, notes = _scale(ax, word, [row[word] for row in drawn.values()]), []
+    for i, (method, row) in enumerate(drawn.items()):
+        look, at, (mean, half) = look_of[method], row[word], axes.band(row["return_true"])
+        if word == "seconds":
+            at, mean, half = (part[at >= 1] for part in (at, mean, half))
+        if word == "samples" and np.ptp(at) == 0:
+            at, mean, half = at[-1:], mean[-1:], half[-1:]
+            ax.plot([at[0], far], [mean[0]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
+            ax.errorbar(at, mean, half, elinewidth=0.9, **{**look, "ls": ""}, zorder=4)
+        else:
+            axes.curve(ax, at, mean, half, look, shift=i / len(drawn))
+        if word == "iterations" and "return_predicted" in row:
+            ax.plot(at, row["return_predicted"].mean(0), color=look["color"], **PREDICTED, zorder=2.5)
+        notes += axes.outside(ax, at, mean, method)
+    ax.grid(axis="y", color=GRID, lw=0.6)
+    axes.foot(ax, AXES[word], notes, inches)
 
 
 def _checked(field: str, given: Mapping[str, np.ndarray]) -> Curves:
-    """Curves of one label whose parts fit each other."""
+    """Curves of one method whose parts fit each other."""
     true = finite(f"{field}, return_true", given["return_true"], "k R")
-    row = {"return_true": true}
-    if "return_predicted" in given:
-        row["return_predicted"] = finite(f"{field}, return_predicted", given["return_predicted"],
-                                         f"{true.shape[0]} {true.shape[1]}")  # fmt: skip
-    for word in AXES:
-        if word in given:
-            row[word] = finite(f"{field}, {word}", given[word], str(true.shape[1]))
-            if (np.diff(row[word]) < 0).any():
-                raise ValueError(f"{field}: {word} go backwards; records must be in the order of learning")
-    return row
+    shapes = {"return_predicted": f"{true.shape[0]} {true.shape[1]}"} | dict.fromkeys(AXES, f"{true.shape[1]}")
+    row = {word: finite(f"{field}, {word}", given[word], shape) for word, shape in shapes.items() if word in given}
+    for word in AXES.keys() & row.keys():
+        if (np.diff(row[word]) < 0).any():
+            raise ValueError(f"{field}: {word} go backwards; records must be in the order of learning")
+    return {"return_true": true, **row}
 
 
-def _look(label: str, look: Mapping[str, Any]) -> dict[str, Any]:
+def _look(method: Method, look: Props) -> Props:
     """Filled and thick where the policy acts through the action prior, open where it gives torques itself."""
-    actions = "actions" in words(label)[1].split()
-    return {
-        **look,
-        "ls": "-",
-        "ms": 5 if look["marker"] == "*" else 3.2,
-        "lw": 0.9 if actions else 1.3,
-        "mfc": "white" if actions else look["color"],
-    }
-
-
-def _band(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and half its 95 % interval (R,) of lines (k, R)."""
-    mean, half = np.array([interval(values) for values in lines.T]).T
-    return mean, half
+    direct = method.search_space == "direct"
+    return {**look, "ls": "-", "ms": 5 if look["marker"] == "*" else 3.2, "lw": 0.9 if direct else 1.3,
+            "mfc": "white" if direct else look["color"]}  # fmt: skip
 
 
 def _scale(ax: Axes, word: str, at: Sequence[np.ndarray]) -> float:
@@ -168,11 +150,3 @@ def _scale(ax: Axes, word: str, at: Sequence[np.ndarray]) -> float:
         ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     return far
-
-
-def _levels(ax: Axes, levels: Mapping[str, float]) -> None:
-    """Reference lines, of several oracles the better one."""
-    for reference, dashes in REFERENCES.items():
-        values = [value for label, value in levels.items() if words(label)[0] == reference]
-        if values:
-            ax.axhline(max(values), color=COLOURS[reference], ls=dashes, lw=1, zorder=1)

@@ -9,17 +9,18 @@ Planning over its codes explores only actions like those the dynamics model was 
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from tsmlib.models.config import Configured
 from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Window
 
 
-class ActionPrior(nn.Module):
+class ActionPrior(Configured):
     """Prior over the action segments of one data set. Actions are bounded to [-1, 1] by a squash on the way out.
 
     beta: weight of the KL divergence against the summed squared error in units of the training actions' deviation.
@@ -34,24 +35,16 @@ class ActionPrior(nn.Module):
         segment_len: int = 10,  # H, section 5.1
         latent_dim: int = 8,  # section 5.1
         channels: int = 32,
-        dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
+        dilations: Sequence[int] = (1, 2, 4, 8, 4),
         beta: float = 0.03,
     ) -> None:
         super().__init__()
-        self._config = dict(
-            action_dim=action_dim, segment_len=segment_len, latent_dim=latent_dim, channels=channels,
-            dilations=list(dilations), beta=beta,
-        )  # fmt: skip
         self.segment_len = self.past_len = segment_len
         self.latent_dim = latent_dim
         self.beta = beta
         self.encoder = Encoder(action_dim, segment_len, latent_dim)
-        self.decoder = CausalDecoder(action_dim, action_dim, latent_dim, channels=channels, dilations=tuple(dilations))
+        self.decoder = CausalDecoder(action_dim, action_dim, latent_dim, channels=channels, dilations=dilations)
         self.register_buffer("std", torch.ones(action_dim))
-
-    def config(self) -> dict[str, Any]:
-        """The constructor's arguments, as they travel with the weights."""
-        return dict(self._config)
 
     def fit_scale(self, actions: Tensor) -> ActionPrior:
         """Take the scale of training actions (N, T, du)."""
@@ -80,12 +73,6 @@ class ActionPrior(nn.Module):
         """The first action of ``decode`` alone, by which a segment policy acts: (B, L, du), (B, dz) -> (B, du)."""
         step = self.decoder.last(past_actions / self.std, z)
         return (past_actions[:, -1] + self.std * step).clamp(-1, 1)
-
-    def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
-        """P(U+ | U-, z) with the true actions as inputs, all positions at once: (B, H, du)."""
-        past, future, n = window.past.actions, window.future.actions, window.future.actions.shape[1]
-        before = torch.cat([past, future[:, :-1]], dim=1)
-        return (before[:, -n:] + self.std * self.decoder(before / self.std, z, n)).clamp(-1, 1)
 
     def plan(self, past_actions: Tensor, z: Tensor) -> Tensor:
         """Chain segments (Eq. 3): past actions (B, L, du) and codes (B, K, dz) -> actions (B, K H, du)."""

@@ -1,90 +1,155 @@
-"""What a dynamics model is, and how segments are chained into horizons.
+"""Dynamics models, and segments chained into horizons.
 
-A dynamics model maps a past segment and planned actions to future states. A one-step model is a segment model with
-H = 1. Everything else in the package (plan, learn a policy, score, draw) is written once against this.
+A one-step model is a segment model with H = 1. Planners, policies and scores are written once against this.
 """
 
-from __future__ import annotations
-
+import inspect
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from tsmlib.models.features import Features
 from tsmlib.models.layers import on_device_of
 from tsmlib.sampling import Noise
+from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Window
 
 Step = Callable[[Tensor], Tensor]  # an action (B, du) -> the state (B, dx) that it leads to
 
 
 class DynamicsModel(Protocol):
-    """P(X+ | X-, U-, U+) over segments of up to ``segment_len`` steps, given ``past_len`` steps of past."""
+    """P(X+ | X-, U-, U+) over segments of up to ``segment_len`` steps, given ``past_len`` steps of past (section 3).
+
+    stochastic: whether a generator makes a difference. features: statistics of the training data, in whose units
+    losses and scores are. ``begin`` is the one primitive; all else that predicts is a function of it, below.
+    """
 
     segment_len: int
     past_len: int
+    stochastic: bool
+    features: Features
 
-    def loss(self, window: Window, generator: Noise) -> Tensor:
-        """What training minimises: a scalar for one batch of windows."""
+    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
+        """Read ``past`` (B, L, .) and predict one action at a time, for up to H actions.
+
+        No generator: the mode; with one: a sample. What is drawn for a segment (a code, a member) is drawn here.
+        """
         ...
+
+    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+        """Objective of the training: a scalar for one batch of windows (A.1 for TSM, section 5.2 for baselines)."""
+        ...
+
+    def config(self) -> dict[str, Json]:
+        """The constructor's arguments, as they travel with the weights."""
+        ...
+
+
+@runtime_checkable
+class SegmentModel(Protocol):
+    """The least that a model of one's own needs: (past, actions (B, K <= H, du)) -> states (B, K, dx).
+
+    ``predict_segment`` may take a ``generator`` to draw samples from; without an attribute ``past_len`` the past has H
+    steps. A DynamicsModel has it too where whole segments are faster than steps.
+    """
+
+    segment_len: int
+
+    @property
+    def predict_segment(self) -> Callable[..., Tensor]: ...
+
+
+Model = DynamicsModel | SegmentModel
+
+
+class Adapted:
+    """A SegmentModel as a DynamicsModel, to roll out: its steps are segments of one action with noise of their own."""
+
+    def __init__(self, model: SegmentModel) -> None:
+        self.model, self.segment_len = model, model.segment_len
+        self.samples = "generator" in inspect.signature(model.predict_segment).parameters
+        self.past_len: int = getattr(model, "past_len", model.segment_len)
+        self.stochastic: bool = getattr(model, "stochastic", self.samples)
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-        """Future states (B, K, dx) under ``actions`` (B, K <= H, du). No generator: the mode; with one: a sample."""
-        ...
+        noise = {"generator": generator} if self.samples else {}
+        return self.model.predict_segment(past, actions, **noise)
+
+    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
+        """Segments of one action, each after the last ``past_len`` steps."""
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal past
+            past = past.last(self.past_len)
+            states = self.predict_segment(past, u[:, None], generator=generator)
+            past = past.then(Segment(states, u[:, None]))
+            return states[:, 0]
+
+        return step
 
 
-def rollout(model: DynamicsModel, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-    """Chain segments over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
+def as_dynamics(model: Model) -> DynamicsModel:
+    """The model itself, or adapted where it has no ``begin`` of its own."""
+    return cast(DynamicsModel, model if hasattr(model, "begin") else Adapted(model))
+
+
+def predict_segment(model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    """States (B, K, dx) under ``actions`` (B, K <= H, du). No generator: the mode; with one: a sample."""
+    model = as_dynamics(model)
+    if isinstance(model, SegmentModel):
+        return model.predict_segment(past, actions, generator=generator)
+    step = model.begin(past, generator=generator)
+    return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
+
+
+def rollout(model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    """Segments chained over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
 
     Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps. What
     is given may be on another device than the model; the states are where the actions are.
     """
-    _require_past(model, past)
+    past_len = _past_len(model, past)
     home, (*known, actions) = actions.device, on_device_of(model, *past, actions)
     past, predicted = Segment(*known), []
     for segment_actions in actions.split(model.segment_len, dim=1):
-        states = model.predict_segment(past.last(model.past_len), segment_actions, generator=generator)
+        past = past.last(past_len)
+        states = predict_segment(model, past, segment_actions, generator=generator)
         predicted.append(states)
-        past = past.last(model.past_len).then(Segment(states, segment_actions))
+        past = past.then(Segment(states, segment_actions))
     return torch.cat(predicted, dim=1).to(home)
 
 
-def stepper(model: DynamicsModel, past: Segment, *, generator: Noise | None = None) -> Step:
-    """Roll out one action at a time, each chosen after the state before it was seen, as a policy acts (section 4.3).
+def stepper(model: Model, past: Segment, *, generator: Noise | None = None) -> Step:
+    """A rollout one action at a time, each chosen after the state before it was seen, as a policy acts (section 4.3).
 
     The states are those of ``rollout`` under the actions that were taken: a code, or a member of an ensemble, is held
     for a segment of H steps, with activations and hidden states carried from step to step; then a new segment begins on
-    the last steps. A model that cannot do this (it has no ``stepper`` of its own) predicts segments of one action, each
-    on the last ``past_len`` steps and with noise of its own. The two agree where H = 1.
+    the last steps. Of a model that cannot step, see ``Adapted``, they are the same where H = 1.
     """
-    _require_past(model, past)
-    begin = getattr(model, "stepper", None)
-    states, actions = (deque(part.unbind(1), maxlen=model.past_len) for part in past)
-    running, taken = None, 0
+    recent, adapted = [deque(part.unbind(1), maxlen=_past_len(model, past)) for part in past], as_dynamics(model)
+    taken, running = 0, None
 
     def step(u: Tensor) -> Tensor:
         nonlocal running, taken
-        if begin is None or taken % model.segment_len == 0:
-            recent = Segment(torch.stack(tuple(states), dim=1), torch.stack(tuple(actions), dim=1))
-            if begin is not None:
-                running = begin(recent, generator=generator)
-        if running is not None:
-            x = running(u)
-        else:
-            x = model.predict_segment(recent, u[:, None], generator=generator)[:, 0]
-        states.append(x)
-        actions.append(u)
-        taken += 1
+        if running is None or taken % model.segment_len == 0:
+            running = adapted.begin(Segment(*(torch.stack(tuple(part), dim=1) for part in recent)), generator=generator)
+        x, taken = running(u), taken + 1
+        for part, latest in zip(recent, (x, u), strict=True):
+            part.append(latest)
         return x
 
     return step
 
 
-def _require_past(model: DynamicsModel, past: Segment) -> None:
-    if past.states.shape[1] < model.past_len:
+def _past_len(model: Model, past: Segment) -> int:
+    """Steps of past that ``model`` reads; ValueError where there are fewer."""
+    needed, found = as_dynamics(model).past_len, past.states.shape[1]
+    if found < needed:
         raise ValueError(
-            f"the past holds {past.states.shape[1]} steps, {type(model).__name__} needs {model.past_len}; "
+            f"the past holds {found} steps, {type(model).__name__} needs {needed}; "
             "at the start of an episode use tsmlib.trajectory.initial_past"
         )
+    return needed

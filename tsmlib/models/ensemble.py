@@ -3,22 +3,20 @@
 x_{t+1} ~ N(mean_m, variance_m)(x_t, u_t), member m drawn once per rollout
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tsmlib.models.base import Step
+from tsmlib.models.config import Configured
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class Ensemble(nn.Module):
+class Ensemble(Configured):
     """PETS: networks that differ in their first weights and in the order of their data, each stating a Gaussian.
 
     gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the
@@ -41,10 +39,6 @@ class Ensemble(nn.Module):
         segment_len: int = 100,  # the length of an episode
     ) -> None:
         super().__init__()
-        self._config = dict(
-            state_dim=state_dim, action_dim=action_dim, angles=list(angles), gaussian=gaussian, members=members,
-            hidden=hidden, layers=layers, segment_len=segment_len,
-        )  # fmt: skip
         self.gaussian, self.members, self.segment_len = gaussian, members, segment_len
         self.features = Features(state_dim, tuple(angles))
         widths = [self.features.dim + action_dim, *[hidden] * layers, state_dim * (2 if gaussian else 1)]
@@ -57,75 +51,54 @@ class Ensemble(nn.Module):
             self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
             self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
 
-    def config(self) -> dict[str, Any]:
-        """The constructor's arguments, as they travel with the weights."""
-        return dict(self._config)
-
-    def increments(self, x: Tensor, u: Tensor, members: slice = slice(None)) -> tuple[Tensor, Tensor | None]:
+    def increments(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
         """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``."""
         s = torch.cat([self.features(x), u], dim=-1)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            s = torch.baddbmm(bias[members], F.silu(s) if i else s, weight[members])
+            s = torch.baddbmm(bias, F.silu(s) if i else s, weight)
         if not self.gaussian:
             return s, None
         mean, log_variance = s.chunk(2, dim=-1)
         log_variance = self.log_variance_max - F.softplus(self.log_variance_max - log_variance)
         return mean, self.log_variance_min + F.softplus(log_variance - self.log_variance_min)
 
+    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
+        """Go on from the last state. No generator: every step takes the mean of all members.
+
+        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which that member states.
+        """
+        return self._begin(past, self.segment_len, generator)
+
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-        """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx).
+        """The states (B, K, dx) that ``begin`` steps through, with noise drawn for as many steps as there are."""
+        step = self._begin(past, actions.shape[1], generator)
+        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
 
-        No generator: every step takes the mean of all members. With one: each row keeps a member of its own, and in
-        the Gaussian form adds the noise which that member states.
-        """
+    def _begin(self, past: Segment, steps: int, generator: Noise | None) -> Step:
+        """Rows are sorted into one block per member, of equal size, so that a step is one batched product."""
+        x, rows, taken = past.states[:, -1], len(past.states), 0
         if generator is None:
-            x, states = past.states[:, -1], []
-            for u in actions.unbind(1):
-                mean, _ = self.increments(x.expand(self.members, -1, -1), u.expand(self.members, -1, -1))
-                x = x + self.features.step_std * mean.mean(0)
-                states.append(x)
-            return torch.stack(states, dim=1)
-        (rows, steps, _), dx = actions.shape, past.states.shape[2]
-        member = self._drawn(past, generator)
-        noise = standard_normal((rows, steps if self.gaussian else 0, dx), generator, actions)
-        predicted = actions.new_empty(rows, steps, dx)
-        for m in range(self.members):
-            mine = (member == m).nonzero()[:, 0]
-            own = self._by_member(m, past.states[mine, -1], actions[mine], noise[mine])
-            predicted = predicted.index_put((mine,), own)
-        return predicted
-
-    def stepper(self, past: Segment, *, generator: Noise | None = None) -> Callable[[Tensor], Tensor]:
-        """``predict_segment`` one action at a time, each row with the same member throughout; see ``dynamics.stepper``.
-
-        Rows are sorted into one block per member, filled up to equal size, so that a step is one batched product.
-        """
-        x, rows = past.states[:, -1], len(past.states)
-        if generator is None:
-            every = torch.arange(rows, device=x.device).expand(self.members, -1)
-            place, noise = every.flatten(), None
+            place, noise = torch.arange(rows, device=x.device).repeat(self.members), None
         else:
-            member = self._drawn(past, generator)
-            shape = (rows, self.segment_len if self.gaussian else 0, x.shape[1])
-            noise = standard_normal(shape, generator, x)
+            uniform = torch.special.ndtr(standard_normal((rows,), generator, x))
+            member = (self.members * uniform).long().clamp(max=self.members - 1)  # of each row
+            noise = standard_normal((rows, steps if self.gaussian else 0, x.shape[1]), generator, x)
             counts = member.bincount(minlength=self.members)
             order, block = member.argsort(stable=True), int(counts.max())
             rank = torch.arange(rows, device=x.device) - (counts.cumsum(0) - counts)[member[order]]
             slot = torch.empty_like(member).index_copy(0, order, member[order] * block + rank)  # of each row
-            place = torch.zeros(self.members * block, dtype=torch.long, device=x.device).index_copy(
-                0, slot[order], order
-            )
-        taken = 0
+            place = torch.zeros(self.members * block, dtype=torch.long, device=x.device)
+            place = place.index_copy(0, slot[order], order)
 
         def step(u: Tensor) -> Tensor:
             nonlocal x, taken
             blocks = (part.index_select(0, place).unflatten(0, (self.members, -1)) for part in (x, u))
             mean, log_variance = self.increments(*blocks)  # (M, block, dx)
-            if generator is None:
+            if noise is None:
                 change = mean.mean(0)
             else:
                 change = mean.flatten(0, 1).index_select(0, slot)
-                if log_variance is not None and noise is not None:
+                if log_variance is not None:
                     stated = (0.5 * log_variance.flatten(0, 1).index_select(0, slot)).exp()
                     change = change + stated * noise[:, taken]
             x, taken = x + self.features.step_std * change, taken + 1
@@ -136,7 +109,7 @@ class Ensemble(nn.Module):
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
         """Mean over members of the negative log-likelihood, or squared error, of one-step increments.
 
-        The tuples of the batch are dealt out at random, so that a step costs as much as it would for one network.
+        The tuples of the batch are dealt out to the members at random.
         """
         future, scale = window.future, self.features.step_std
         tuples = [part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)]
@@ -151,19 +124,3 @@ class Ensemble(nn.Module):
         log_variance = log_variance[..., moving]
         likelihood = 0.5 * (error * (-log_variance).exp() + log_variance).sum(-1).mean()
         return likelihood + 0.01 * (self.log_variance_max - self.log_variance_min)[moving].sum()
-
-    def _drawn(self, past: Segment, generator: Noise) -> Tensor:
-        """The member that each row keeps, uniform over all of them: (B,)."""
-        uniform = torch.special.ndtr(standard_normal((len(past.states),), generator, past.states))
-        return (self.members * uniform).long().clamp(max=self.members - 1)
-
-    def _by_member(self, m: int, x: Tensor, actions: Tensor, noise: Tensor) -> Tensor:
-        states = []
-        for k, u in enumerate(actions.unbind(1)):
-            mean, log_variance = self.increments(x[None], u[None], slice(m, m + 1))
-            change = mean[0]
-            if log_variance is not None:
-                change = change + (0.5 * log_variance[0]).exp() * noise[:, k]
-            x = x + self.features.step_std * change
-            states.append(x)
-        return torch.stack(states, dim=1)

@@ -1,35 +1,51 @@
-"""Building blocks of the segment models: gated causal layers (Eq. 1), a convolutional encoder, features. No physics.
+"""Layers of the segment models and policies: gated causal convolutions (Eq. 1), a convolutional encoder.
 
-Letters in shapes: B batch, P positions in time, C channels, dz latent size.
+Letters in shapes: B batch, M models side by side, P positions in time, C channels, dz latent size.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
-from typing import Any
+from typing import TypedDict
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tsmlib.models.config import Configured
 from tsmlib.sampling import Noise, standard_normal
 
-BLOCK = 1024  # rows that are decoded at once on a processor
+BLOCK = 1024  # rows that are decoded at once on a CPU
 
 
-def on_device_of(model: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+def on_device_of(model: object, *tensors: Tensor) -> tuple[Tensor, ...]:
     """``tensors`` on the device of the model's weights; as they are where it has none."""
     weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
     return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
 
 
 def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """``compute`` of so few rows at a time that what lies between its steps stays in a processor's cache."""
+    """``compute`` of so few rows at a time that what lies between its steps stays in a CPU's cache."""
     if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
         return compute(*rows)
     return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
+
+
+class BatchedLinear(nn.Module):
+    """M linear layers side by side: (M, B, in) -> (M, B, out). Drawn as torch draws one linear layer."""
+
+    def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__()
+        bound = inputs**-0.5
+
+        def drawn(*shape: int) -> nn.Parameter:
+            return nn.Parameter(torch.stack([torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]))
+
+        self.weight = drawn(inputs, outputs)  # (M, in, out)
+        self.bias = drawn(1, outputs)  # (M, 1, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
 
 
 class GatedLayer(nn.Module):
@@ -37,15 +53,14 @@ class GatedLayer(nn.Module):
 
         h = tanh(W_f * s + V_f z) . sigmoid(W_g * s + V_g z)
 
-    The convolution has two taps, s_{t-d} and s_t. Written as one matrix product over both, the same function serves
-    all positions at once (B, P, C) and a single position (B, C), which is what keeps the two decoding paths equal.
+    As one matrix product over the two taps, s_{t-d} and s_t, the same function serves all positions (B, P, C), one
+    (B, C) and one of M models (M, B, C). taps: W_f and W_g, 2 C -> 2 C; out: 1x1, residual and skip, C -> 2 C.
     """
 
-    def __init__(self, channels: int, *, residual: bool = True, skip: bool = True) -> None:
+    def __init__(self, taps: nn.Module, out: nn.Module, *, residual: bool = True, skip: bool = True) -> None:
         super().__init__()
         self.residual, self.skip = residual, skip  # without them only for an ablation (section 3.1)
-        self.taps = nn.Linear(2 * channels, 2 * channels)  # W_f and W_g
-        self.out = nn.Linear(channels, 2 * channels)  # 1x1: residual and skip
+        self.taps, self.out = taps, out
 
     def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
@@ -54,10 +69,30 @@ class GatedLayer(nn.Module):
         return now + residual if self.residual else residual, skip if self.skip else torch.zeros_like(skip)
 
 
-Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (B, C), oldest first
+Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (..., C), oldest first
 
 
-class CausalDecoder(nn.Module):
+def advance(inlet: nn.Module, layers: nn.ModuleList, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
+    """One position: inputs (..., input_dim), V z of all layers -> sum of the skips (..., C). Moves ``cache`` on."""
+    s, skips = inlet(inputs), []
+    for layer, code, window in zip(layers, codes.chunk(len(layers), dim=-1), cache, strict=True):
+        window.append(s)
+        s, skip = layer(window.pop(0), s, code)
+        skips.append(skip)
+    return reduce(torch.add, skips)
+
+
+class DecoderOptions(TypedDict, total=False):
+    """Options of a ``CausalDecoder`` that a model passes on."""
+
+    channels: int
+    head_channels: int
+    state_skip: int
+    dilations: Sequence[int]
+    plain: bool
+
+
+class CausalDecoder(Configured):
     """P(output | inputs up to now, z): a stack of gated layers whose output at a position sees no later position.
 
     ``forward`` decodes all positions at once; ``begin`` and ``step`` decode one by one with cached activations, for
@@ -72,23 +107,26 @@ class CausalDecoder(nn.Module):
         *,
         channels: int = 32,
         head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
-        direct_channels: int = 0,  # two 1x1 layers that see the inputs beside the stack's output, in its place; 0: none
-        dilations: tuple[int, ...] = (1, 2, 4, 8, 4),
+        state_skip: int = 0,  # width of two 1x1 layers that see the inputs beside the stack's output instead; 0: none
+        dilations: Sequence[int] = (1, 2, 4, 8, 4),
         plain: bool = False,  # neither residual nor skip connections: the last layer's output alone
     ) -> None:
         super().__init__()
         self.inlet = nn.Linear(input_dim, channels)
-        self.dilations = dilations
+        self.dilations = tuple(dilations)
         self.layers = nn.ModuleList(
-            GatedLayer(channels, residual=not plain, skip=not plain or last)
+            GatedLayer(
+                nn.Linear(2 * channels, 2 * channels), nn.Linear(channels, 2 * channels),
+                residual=not plain, skip=not plain or last,
+            )
             for last in [*[False] * (len(dilations) - 1), True]
-        )
+        )  # fmt: skip
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
-        self.direct = bool(direct_channels)
-        if direct_channels:
-            widths = [channels + input_dim, direct_channels, direct_channels]
+        self.state_skip = state_skip
+        if state_skip:
+            widths = [channels + input_dim, state_skip, state_skip]
             inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
-            self.head = nn.Sequential(*inner, nn.Linear(direct_channels, output_dim))
+            self.head = nn.Sequential(*inner, nn.Linear(state_skip, output_dim))
         else:
             head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
             self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
@@ -131,16 +169,10 @@ class CausalDecoder(nn.Module):
 
     def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
         """One position: (B, input_dim) and ``self.codes(z)`` -> (B, output_dim). Moves ``cache`` one position on."""
-        s = self.inlet(inputs)  # (B, C)
-        total: Any = None
-        for layer, code, window in zip(self.layers, codes.chunk(len(self.layers), dim=-1), cache, strict=True):
-            window.append(s)
-            s, skip = layer(window.pop(0), s, code)
-            total = skip if total is None else total + skip
-        return self._out(total, inputs)
+        return self._out(advance(self.inlet, self.layers, inputs, codes, cache), inputs)
 
     def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
-        return self.head(torch.cat([total, inputs], dim=-1) if self.direct else total)
+        return self.head(torch.cat([total, inputs], dim=-1) if self.state_skip else total)
 
     def _parallel(self, inputs: Tensor, z: Tensor, n: int) -> tuple[list[Tensor], list[Tensor]]:
         """Each layer's inputs, as far as the outputs at the last ``n`` positions see them, and its skips there.
@@ -168,12 +200,8 @@ class Encoder(nn.Module):
 
     def __init__(self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32) -> None:
         super().__init__()
-        self.convolutions = nn.Sequential(
-            nn.Conv1d(input_dim, channels, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv1d(channels, channels, 3, padding=1),
-            nn.ReLU(),
-        )
+        first, second = (nn.Conv1d(size, channels, 3, padding=1) for size in (input_dim, channels))
+        self.convolutions = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
         self.project = nn.Linear(channels * segment_len, 2 * latent_dim)
 
     def forward(self, segment: Tensor) -> tuple[Tensor, Tensor]:

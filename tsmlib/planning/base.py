@@ -38,8 +38,8 @@ class Plan:
     """The best actions found for each of B targets.
 
     actions (B, T, du); parameters (B, *shape) they decode from; states (S, B, T, dx) predicted for them;
-    predicted (B,): expected undiscounted return; curve (iterations + 1, B): predicted return of the best so far, from
-    the start on; seconds; trace (iterations + 1, B, *shape): the parameters of the best so far, see ``stopped``.
+    predicted_return (B,): expected and undiscounted; curve (iterations + 1, B): predicted return of the best so far,
+    from the start on; seconds; trace (iterations + 1, B, *shape): the parameters of the best so far, see ``plan_at``.
     """
 
     actions: Tensor

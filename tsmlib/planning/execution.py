@@ -1,12 +1,10 @@
-"""A task posed, planned for and executed: what a plan promised and what the arm then did (section 5.3.2, figure 6).
+"""Execution of plans in the true simulator: predicted and executed return (section 5.3.2, figure 6).
 
 Open loop as in the paper (``execute``), or planning again every few steps from what the arm really did (``mpc``).
 """
 
-from __future__ import annotations
-
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gymnasium
 import numpy as np
@@ -19,7 +17,7 @@ from tsmlib import rewards
 from tsmlib.collection import Controller, collect, open_loop
 from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.models.base import DynamicsModel
-from tsmlib.planning.base import Plan, Planner, SearchSpace
+from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.planners import reevaluate
 from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.tasks import Task
@@ -33,9 +31,9 @@ SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be re
 class Trial:
     """Actions executed in the true simulator.
 
-    actions (B, T, du); states (B, T + 1, dx) from the start on; true (B,): undiscounted return executed;
-    final_distance (B,): metres; plan: where the actions came from, with the predicted return, if from a plan;
-    observed (B, T + 1, dx): what the sensors said, where they are noisy.
+    actions (B, T, du); states (B, T + 1, dx) from the start on; executed_return (B,): undiscounted; final_distance
+    (B,): metres; plan: where the actions came from, with the predicted return, if from a plan; observed
+    (B, T + 1, dx): what the sensors said, where they are noisy.
     """
 
     actions: Tensor
@@ -84,63 +82,84 @@ def mpc(
     """Closed loop (model predictive control): plan to the end of the episode, execute ``every`` steps, observe, repeat.
 
     model: what plans are made through, from the true observed past; None is the true simulator. space: of the whole
-    episode. planner: for example ``partial(cem, iterations=4)``; from the second plan on it starts from what is left
-    of the plan before. Over codes, plans begin with a new segment each time; where ``every`` is no multiple of H, what
-    is left of a plan is encoded anew and only nearly the same. plan: the first one, if it is already there, so that
-    closed and open loop begin alike. samples: of the model that a plan is made with; promises come from 32 others.
+    episode. planner: ``partial(cem, iterations=4)`` for example; later plans start from what is left of the one before
+    (``SearchSpace.after``). plan: the first one, if it is already there, so that closed and open loop begin alike.
+    samples: of the model that a plan is made with; its predicted return comes from 32 others.
 
-    Of the trial's plan, ``predicted`` is the first promise, ``curve`` (plans, B) every plan's promise for the whole
-    episode, what was earned until then included, and ``states`` (1, B, T, dx) of every plan the part that was executed.
+    Of the trial's plan, ``predicted_return`` is the first plan's, ``curve`` (plans, B) every plan's for the whole
+    episode, the return executed until then included, and ``states`` (1, B, T, dx) the part of every predicted rollout
+    that was executed.
     """
     if every < 1:
         raise ValueError(f"every is {every}, expected a positive number of steps")
-    began, horizon = time.perf_counter(), task.horizon
-    past_len = 1 if model is None else model.past_len
-    done = 0
-    start: Tensor | int = len(task)
-    dreamt: list[Tensor] = []
-    promises: list[Tensor] = []
-    bar = tqdm(total=-(-horizon // every), desc=progress, disable=not progress)
-
-    def controller(past: Segment) -> Tensor:
-        """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
-        nonlocal done, space, start
-        so_far = Segment(*(part[:, part.shape[1] - done :] for part in past))
-        total = _whole_episode(task.reward, so_far)
-        recent = past.last(past_len)
-        if model is None:
-            predict = judge = simulator_predictor(task.env, recent.states[:, -1].numpy())
-        else:
-            predict = model_predictor(model, recent, samples=samples, seed=seed + 2 * done)
-            judge = model_predictor(model, recent, samples=32, seed=seed + 2 * done + 1)
-        made = plan if plan is not None and not done else planner(predict, total, space, start)
-        promised = reevaluate(made, judge, total)
-        promises.append(promised.predicted_return)
-        dreamt.append(promised.states[:1, :, :every])
-        steps = min(every, horizon - done)
-        if done + steps < horizon:
-            space, left = space.after(made.parameters, steps)
-            start = left[None]
-        done += steps
-        bar.update()
-        return made.actions[:, :steps]
-
+    began, horizon, past_len = time.perf_counter(), task.horizon, 1 if model is None else model.past_len
+    planning = _Replanning(task, model, planner, every, samples, seed, space, start=len(task), plan=plan)
     env = gymnasium.make_vec(task.env, num_envs=len(task))
-    seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
+    with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
+
+        def controller(past: Segment) -> Tensor:
+            actions = planning(past)
+            bar.update()
+            return actions
+
+        seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
     env.close()
-    bar.close()
-    actions = torch.from_numpy(seen.actions)
+    actions, returns = torch.from_numpy(seen.actions), torch.stack(planning.returns)
     made = Plan(
-        actions=actions, parameters=actions, states=torch.cat(dreamt, 2), predicted_return=promises[0],
-        curve=torch.stack(promises), seconds=time.perf_counter() - began,
+        actions=actions, parameters=actions, states=torch.cat(planning.rollouts, 2), predicted_return=returns[0],
+        curve=returns, seconds=time.perf_counter() - began,
     )  # fmt: skip
     return _measured(task, env, seen.states, actions, made)
+
+
+@dataclass
+class _Replanning:
+    """The controller that plans to the end of the episode each time it is asked, and keeps what was predicted."""
+
+    task: Task
+    model: DynamicsModel | None
+    planner: Planner
+    every: int
+    samples: int
+    seed: int
+    space: SearchSpace  # of the rest of the episode, as are start and plan
+    start: Tensor | int
+    plan: Plan | None
+    done: int = 0  # steps
+    rollouts: list[Tensor] = field(default_factory=list)  # (1, B, every, dx) of each plan
+    returns: list[Tensor] = field(default_factory=list)  # (B,) of each plan
+
+    def __call__(self, past: Segment) -> Tensor:
+        """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
+        reward = _whole_episode(self.task.reward, Segment(*(part[:, part.shape[1] - self.done :] for part in past)))
+        predict, judge = self._predictors(past)
+        plan, self.plan = self.plan or self.planner(predict, reward, self.space, self.start), None
+        judged = reevaluate(plan, judge, reward)
+        self.returns.append(judged.predicted_return)
+        self.rollouts.append(judged.states[:1, :, : self.every])
+        steps = min(self.every, self.task.horizon - self.done)
+        self.done += steps
+        if self.done < self.task.horizon:
+            self.space, left = self.space.after(plan.parameters, steps)
+            self.start = left[None]
+        return plan.actions[:, :steps]
+
+    def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
+        """What a plan is made with, and what it is judged by."""
+        if self.model is None:
+            simulator = simulator_predictor(self.task.env, past.states[:, -1].numpy())
+            return simulator, simulator
+        recent, seed = past.last(self.model.past_len), self.seed + 2 * self.done
+        return (
+            model_predictor(self.model, recent, samples=self.samples, seed=seed),
+            model_predictor(self.model, recent, samples=32, seed=seed + 1),
+        )
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
     """``reward`` of an episode that began with ``so_far`` (B, t, .), as a function of the rest of it.
 
-    The first step of the rest is given what was earned before, so that returns are those of the whole episode.
+    The first step of the rest is given the return executed before, so that returns are those of the whole episode.
     """
 
     def total(states: Tensor, actions: Tensor) -> Tensor:
@@ -148,8 +167,8 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
         rest = (states, actions)
         before = (part.expand(*new.shape[:-2], -1, -1) for part, new in zip(so_far, rest, strict=True))
         per_step = rewarded(reward, *(torch.cat(pair, -2) for pair in zip(before, rest, strict=True)))
-        earned = per_step[..., :done].sum(-1, keepdim=True)
-        return torch.cat([per_step[..., done : done + 1] + earned, per_step[..., done + 1 :]], -1)
+        executed = per_step[..., :done].sum(-1, keepdim=True)
+        return torch.cat([per_step[..., done : done + 1] + executed, per_step[..., done + 1 :]], -1)
 
     return total
 

@@ -2,10 +2,8 @@
 
     max over p of E[ sum_t r(x_t, u_t) ],   u = space.decode(p),   x ~ predict(u)
 
-What is optimised over is a ``SearchSpace``: DirectActions (Eq. 2) or LatentActions (Eq. 3). What predicts is a function
-from actions to states: ``model_predictor`` or ``simulator_predictor``. A ``Planner`` is ``adam``, as the paper plans,
-which needs a differentiable prediction, or ``cem`` or ``mppi``, which sample and take any prediction, so that the
-oracle is the same planner with the true simulator as its model. All three have one signature.
+The paper's ``adam`` needs a differentiable prediction; ``cem`` and ``mppi`` sample and take any, so that the oracle is
+the same planner with the true simulator as its model. All three have one signature, that of ``base.Planner``.
 
 Letters in shapes: B targets planned at once, C candidates for each, S model samples, T horizon, K segments.
 """
@@ -24,7 +22,7 @@ from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.rewards import Reward, rewarded
 
 
-@torch.enable_grad()  # see train.fit
+@torch.enable_grad()  # see training.fit
 def adam(
     predict: Predictor,
     reward: Reward,
@@ -42,18 +40,16 @@ def adam(
     """
     if iterations < 0:
         raise ValueError(f"iterations is {iterations}, expected 0 or more")
-    began = time.perf_counter()
-    start = _parameters(start, space)
-    parameters = start.clone().requires_grad_()
+    search = _Search(predict, reward, space, start)
+    parameters = search.start.clone().requires_grad_()
     optimizer = torch.optim.Adam([parameters], lr=lr)
-    best = _Best(start)
     for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
         actions = space.decode(parameters)
         states = predict(actions)
         returns = expected_return(states, actions, reward)
         if not iteration:
             _check_gradient(states, returns)
-        best.update(parameters.detach(), returns.detach())
+        search.update(parameters.detach(), returns.detach())
         optimizer.zero_grad()
         (-returns.sum()).backward()
         assert parameters.grad is not None
@@ -65,9 +61,8 @@ def adam(
             )
         parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
         optimizer.step()
-    with torch.no_grad():
-        best.update(parameters.detach(), evaluate(predict, reward, space, parameters))
-    return best.plan(predict, reward, space, time.perf_counter() - began)
+    search.update(parameters.detach(), search.returns_of(parameters))
+    return search.plan()
 
 
 def _check_gradient(states: Tensor, returns: Tensor) -> None:
@@ -112,7 +107,7 @@ def cem(
         elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
         return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
 
-    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+    return _sample(_Search(predict, reward, space, start), refit, candidates, iterations, seed, progress)
 
 
 def mppi(
@@ -145,46 +140,30 @@ def mppi(
         weights = ((returns - returns.max(0).values) / (temperature * spread)).softmax(0)
         return (_like(weights, parameters) * parameters).sum(0), shrink * deviation
 
-    return _sample(predict, reward, space, start, refit, candidates, iterations, seed, progress)
+    return _sample(_Search(predict, reward, space, start), refit, candidates, iterations, seed, progress)
 
 
 Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 @torch.no_grad()
-def _sample(
-    predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, refit: Refit,
-    candidates: int, iterations: int, seed: int, progress: str,
-) -> Plan:  # fmt: skip
+def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, seed: int, progress: str) -> Plan:
     """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
-    began = time.perf_counter()
-    generator = torch.Generator().manual_seed(seed)
-    start = _parameters(start, space)
-    best = _Best(start)
-    best.update(start, evaluate(predict, reward, space, start))
-    mean = best.parameters
+    generator, space = torch.Generator().manual_seed(seed), search.space
+    search.update(search.start, search.returns_of(search.start))
+    mean = search.parameters
     deviation = torch.full_like(mean, space.scale)
     for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
         parameters = mean + deviation * space.noise(candidates, len(mean), generator)
         if iteration:
-            parameters[0] = best.parameters
-        returns = evaluate(predict, reward, space, parameters)
+            parameters[0] = search.parameters
+        returns = search.returns_of(parameters)
         finite = torch.isfinite(returns)  # a candidate on which the model diverges is as bad as the worst
         worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
         returns = returns.where(finite, worst)
         mean, deviation = refit(parameters, returns, mean, deviation)
-        both = torch.cat([returns, evaluate(predict, reward, space, mean[None])])
-        best.update(torch.cat([parameters, mean[None]]), both)
-    return best.plan(predict, reward, space, time.perf_counter() - began)
-
-
-def _parameters(start: Tensor | int, space: SearchSpace) -> Tensor:
-    """``start`` as parameters (C, B, *shape)."""
-    if isinstance(start, int):
-        return torch.zeros(1, start, *space.shape)
-    if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
-        raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
-    return start
+        search.update(torch.cat([parameters, mean[None]]), torch.cat([returns, search.returns_of(mean[None])]))
+    return search.plan()
 
 
 def _like(values: Tensor, parameters: Tensor) -> Tensor:
@@ -194,20 +173,16 @@ def _like(values: Tensor, parameters: Tensor) -> Tensor:
 
 @torch.no_grad()
 def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
-    """The same plan with ``predicted`` and ``states`` from fresh samples.
-
-    A planner picks what does best under the few samples that it plans with; what the model promises is the
-    expectation, and needs samples that had no part in the choice.
-    """
+    """The same plan with its predicted return and states from fresh samples, which had no part in the choice."""
     states = predict(plan.actions[None])
     return replace(plan, states=states[:, 0], predicted_return=expected_return(states, plan.actions[None], reward)[0])
 
 
 @torch.no_grad()
 def plan_at(plan: Plan, iteration: int, predict: Predictor, reward: Reward, space: SearchSpace) -> Plan:
-    """The plan as it was after ``iteration`` steps of its planner (0: its start), to see what more of them earned.
+    """The plan as it was after ``iteration`` steps of its planner (0: its start).
 
-    ``predicted`` and ``states`` come from ``predict``: as in ``reevaluate``, give it samples of its own.
+    Its predicted return and states come from ``predict``: as in ``reevaluate``, give it samples of its own.
     """
     if plan.trace is None or not 0 <= iteration < len(plan.trace):
         steps = "kept no trace" if plan.trace is None else f"took {len(plan.trace) - 1} iterations"
@@ -265,14 +240,23 @@ def evaluate(predict: Predictor, reward: Reward, space: SearchSpace, parameters:
     return torch.cat(returns)
 
 
-class _Best:
-    """Per target, the parameters with the highest predicted return so far."""
+class _Search:
+    """One run of a planner: per target, the parameters with the highest predicted return so far."""
 
-    def __init__(self, start: Tensor) -> None:
+    def __init__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int) -> None:
+        if isinstance(start, int):
+            start = torch.zeros(1, start, *space.shape)
+        if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
+            raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
+        self.predict, self.reward, self.space, self.start = predict, reward, space, start
+        self.began = time.perf_counter()
         self.parameters = start[0].clone()
         self.returns = start.new_full((start.shape[1],), -torch.inf)
         self.curve: list[Tensor] = []
         self.trace: list[Tensor] = []
+
+    def returns_of(self, parameters: Tensor) -> Tensor:
+        return evaluate(self.predict, self.reward, self.space, parameters)
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:
         value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)
@@ -284,21 +268,17 @@ class _Best:
             )
         better = value > self.returns
         chosen = parameters[index, torch.arange(len(index))]
-        self.parameters = torch.where(better.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, self.parameters)
+        self.parameters = torch.where(_like(better[None], chosen[None])[0], chosen, self.parameters)
         self.returns = torch.where(better, value, self.returns)
         self.curve.append(self.returns)
         self.trace.append(self.parameters)
 
     @torch.no_grad()
-    def plan(self, predict: Predictor, reward: Reward, space: SearchSpace, seconds: float) -> Plan:
-        actions = space.decode(self.parameters[None])
-        states = predict(actions)
+    def plan(self) -> Plan:
+        actions = self.space.decode(self.parameters[None])
+        states = self.predict(actions)
         return Plan(
-            actions=actions[0],
-            parameters=self.parameters,
-            states=states[:, 0],
-            predicted_return=expected_return(states, actions, reward)[0],
-            curve=torch.stack(self.curve),
-            seconds=seconds,
-            trace=torch.stack(self.trace),
-        )
+            actions=actions[0], parameters=self.parameters, states=states[:, 0],
+            predicted_return=expected_return(states, actions, self.reward)[0], curve=torch.stack(self.curve),
+            seconds=time.perf_counter() - self.began, trace=torch.stack(self.trace),
+        )  # fmt: skip

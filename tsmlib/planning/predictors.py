@@ -1,7 +1,5 @@
 """Predictors: candidate actions to states, through a model or through the true simulator."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 
 import gymnasium
@@ -10,13 +8,13 @@ import torch
 from torch import Tensor
 
 from tsmlib.collection import collect, open_loop
-from tsmlib.models.base import DynamicsModel, rollout
+from tsmlib.models.base import Model, rollout
 from tsmlib.planning.base import Predictor
 from tsmlib.sampling import SharedNoise
 from tsmlib.trajectory import Segment
 
 
-def model_predictor(model: DynamicsModel, past: Segment, *, samples: int = 1, seed: int = 0) -> Predictor:
+def model_predictor(model: Model, past: Segment, *, samples: int = 1, seed: int = 0) -> Predictor:
     """Predict by rolling out ``model`` from ``past`` (B, L, .), with the same noise for every candidate and call.
 
     samples: S model samples per candidate; 0 rolls out the mode (z = 0) instead.

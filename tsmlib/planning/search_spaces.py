@@ -62,10 +62,8 @@ class LatentActions:
         and its codes are those that the prior's encoder gives them: nearly the same actions."""
         prior, left = self.prior, self.horizon - steps
         actions = self._whole(parameters[None])[0]  # (B, K H, du)
-        past = torch.cat([self._before(len(actions)).to(actions.device), actions[:, :steps]], dim=1)[
-            :, -prior.past_len :
-        ]
-        space = LatentActions(prior, left, past=past, whole=False)
+        past = torch.cat([self._before(len(actions)).to(actions.device), actions[:, :steps]], dim=1)
+        space = LatentActions(prior, left, past=past[:, -prior.past_len :], whole=False)
         done, within = divmod(steps, prior.segment_len)
         if not within:
             return space, parameters[:, done:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 from tsmlib import rewards
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_RADIUS, LINK_LENGTHS, WALL
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 
@@ -21,34 +23,40 @@ TOLERANCE = 0.03  # metres: a trial that ends within it is a success
 class Task:
     """B instances of one task in one environment. start (B, dx), target (B, 2) in metres, horizon in steps.
 
-    own: a reward of one's own, for a task of any other name; see ``with_reward``. ValueError where a target is out of
-    reach, or the reward is not one number per step; FloatingPointError where it is NaN.
+    reward_for: targets -> reward; position: what has to arrive, fingertip or object; tolerance: metres, of a success.
+    ``standard`` gives the paper's, ``with_reward`` one of one's own. ValueError where a target is out of reach, or the
+    reward is not one number per step; FloatingPointError where it is NaN.
     """
 
-    name: str  # reach or push; with a reward of one's own, any word
+    name: str
     env: str
     start: np.ndarray
     target: Tensor
+    reward_for: Callable[[Tensor], Reward]
+    position: slice
     horizon: int = 50
-    own: Reward | None = None
+    tolerance: float = TOLERANCE
+
+    @classmethod
+    def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
+        """The paper's task of an environment: to push the object to the target, or to reach it where there is none."""
+        if EnvSpec.parse(env).task == "push":
+            return cls("push", env, start, target, rewards.push, rewards.BLOCK)
+        return cls("reach", env, start, target, rewards.reach, rewards.TIP)
 
     def __post_init__(self) -> None:
-        if self.own is None and self.name not in ("reach", "push"):
-            raise ValueError(
-                f"task is {self.name!r}, expected 'reach' or 'push'; any other task needs a reward of its own"
-            )
-        if self.name == "push" and self.start.shape[1] < 10:
+        if self.position.stop > self.start.shape[1]:
             raise ValueError(f"there is nothing to push in {self.env}; its task is 'reach'")
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
         if self.target.shape != (len(self), 2):
             raise ValueError(f"target is {tuple(self.target.shape)}, expected ({len(self)}, 2): one per start")
         self._check_reach()
-        if self.own is not None:  # standing still, in the shape in which planners ask
-            states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
-            found = rewarded(self.own, states, states.new_zeros(1, len(self), self.horizon, 2))
-            if not torch.isfinite(found).all():
-                raise ValueError(f"the reward of task {self.name!r} is infinite for an arm that stands still")
+        # Standing still, in the shape in which planners ask.
+        states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
+        found = rewarded(self.reward, states, states.new_zeros(1, len(self), self.horizon, 2))
+        if not torch.isfinite(found).all():
+            raise ValueError(f"the reward of task {self.name!r} is infinite for an arm that stands still")
 
     def __len__(self) -> int:
         return len(self.start)
@@ -56,29 +64,24 @@ class Task:
     @property
     def reward(self) -> Reward:
         """The task's reward, one target per instance."""
-        if self.own is not None:
-            return self.own
-        return (rewards.reach if self.name == "reach" else rewards.push)(self.target)
+        return self.reward_for(self.target)
 
     @property
-    def position(self) -> slice:
-        """What has to arrive: the object if the task is to push, else the fingertip."""
-        return rewards.BLOCK if self.name == "push" else rewards.TIP
+    def is_standard(self) -> bool:
+        """Whether the reward is the paper's."""
+        return self.reward_for in (rewards.reach, rewards.push)
 
     def with_reward(
         self, name: str, reward: Reward, *, target: Tensor | None = None, horizon: int | None = None
     ) -> Task:
-        """A task of one's own from these starts.
+        """A task of one's own from these starts, in which the same has to arrive.
 
         reward: any torch function of states (..., B, T, dx) and actions (..., B, T, du) that gives one number per
         step, (..., B, T), differentiable if it is to be planned for with Adam. It always sees the whole episode, so
         that it may depend on the time. target (2,) or (B, 2): where it should end, for final_distance and pictures.
         """
-        if target is not None:
-            target = target.float().expand(len(self), 2)
-        return Task(
-            name, self.env, self.start, self.target if target is None else target, horizon or self.horizon, reward
-        )
+        goal = self.target if target is None else target.float().expand(len(self), 2)
+        return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=horizon or self.horizon)
 
     def _check_reach(self) -> None:
         if self.position == rewards.TIP:

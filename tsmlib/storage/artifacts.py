@@ -1,20 +1,16 @@
-"""Artefacts on disk: datasets, models, checkpoints, tables, JSON. Nothing else in tsmlib writes or reads them.
+"""Artefacts on disk: named arrays with a header, trajectories and models, one safetensors file each.
 
-An artefact is one safetensors file that any safetensors reader opens. Its metadata holds one entry, ``tsmlib``, a JSON
-text whose first field is the SHA-256 of the whole file, taken with that field filled with zeros. So a single rename
-publishes data, manifest and checksum together, and a flipped bit, a cut or an appended byte anywhere in the file is
-found when it is loaded. Tables and JSON are listed in a manifest, or in the ``status.json`` of the run that made them.
-Nothing is pickled, and nothing found in a file is executed.
-
-Files are written beside their final name, flushed to the disk and renamed: a reader meets the old file or the new one.
+The metadata of the file holds one entry, ``tsmlib``: a JSON text whose first field is the SHA-256 of the whole file,
+taken with that field filled with zeros. So a single rename publishes data, header and checksum together, any
+safetensors reader opens the file, and a flipped bit, a cut or an appended byte is found when it is loaded. Nothing is
+pickled, and nothing found in a file is executed.
 """
 
-from __future__ import annotations
-
 import hashlib
+import itertools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -23,23 +19,24 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from tsmlib.storage.files import PathLike, StoreError, _again, _dumps, _loads, _other, _read, write_bytes
+from tsmlib.storage.files import Json, PathLike, StoreError, dumps, loads, read_bytes, remedy, write_bytes
 from tsmlib.storage.provenance import provenance
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
-LARGEST = 10_000  # number, or length of a list, among a model's arguments: what Python makes of them takes memory too
+LARGEST = 10_000  # size among a model's arguments, length of a list of them, and parameters of a model
 
 _ZEROS = "0" * 64
 _MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
+_OTHER = "Name another file, or delete it and make one that fits."
 
 
 class Model(Protocol):
-    """What ``save_model`` needs: the constructor's keyword arguments as plain JSON values, and the weights."""
+    """The constructor's keyword arguments as plain JSON values, and the weights."""
 
-    def config(self) -> dict[str, Any]: ...
+    def config(self) -> Mapping[str, Json]: ...
 
     def state_dict(self) -> Mapping[str, Tensor]: ...
 
@@ -50,7 +47,7 @@ M = TypeVar("M", bound=torch.nn.Module)
 # Arrays with a header ------------------------------------------------------------------------------------------------
 
 
-def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: str, header: Mapping[str, Any]) -> None:
+def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: str, header: Mapping[str, Json]) -> None:
     """Write named arrays and a JSON ``header`` to ``path`` (``*.safetensors``), replacing what was there in one step.
 
     kind: one word that ``load`` must ask for. header: plain JSON values; ``{"inputs": {path: sha256}}`` in it, paths
@@ -62,7 +59,7 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
         raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'.")
     arrays = {name: _owned(value) for name, value in tensors.items()}
     _require_finite(path, arrays, "Nothing was written: check what computed them.")
-    about = _dumps(
+    about = dumps(
         path, {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind, "header": dict(header), "provenance": provenance()}
     )
     data = safetensors.torch.save(arrays, metadata={"tsmlib": about})
@@ -71,24 +68,19 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
     write_bytes(path, data[:at] + digest + data[at + len(digest) :])
 
 
-def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The arrays and the header that ``save`` wrote. Every byte is checked first.
+def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Json]]:
+    """Arrays and header as ``save`` wrote them. Every byte is checked first.
 
     Raises StoreError if the file is missing, damaged, of another kind, or holds a value that is not finite.
     """
     tensors, about = _load(Path(path), kind)
-    _require_finite(Path(path), tensors, _again(Path(path), kind))
+    _require_finite(Path(path), tensors, remedy(Path(path)))
     return tensors, about["header"]
 
 
-def read_header(path: PathLike) -> dict[str, Any]:
+def read_header(path: PathLike) -> dict[str, Json]:
     """The header alone, of an artefact of any kind. The whole file is checked all the same."""
     return _read_checked(Path(path))[1]["header"]
-
-
-def read_provenance(path: PathLike) -> dict[str, Any]:
-    """What made an artefact, see ``provenance``; empty for files of format 1. The whole file is checked."""
-    return _read_checked(Path(path))[1].get("provenance", {})
 
 
 def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -97,40 +89,38 @@ def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         return dict(sorted(safetensors.torch.load(data).items())), about  # they come in any order
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path} is not a valid safetensors file: {error}. {_again(path, kind)}") from error
+        raise StoreError(f"{path} is not a valid safetensors file: {error}. {remedy(path)}") from error
 
 
 def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str, Any]]:
     """The bytes of an artefact whose checksum holds, and what its ``tsmlib`` entry says."""
-    data = _read(path, kind)
+    data = read_bytes(path)
     header_end = 8 + int.from_bytes(data[:8], "little")
     at = data.find(_MARK, 8, header_end) + len(_MARK)
     if len(data) < 8 or header_end > len(data) or at < len(_MARK):
         raise StoreError(
             f"{path} is damaged, or was not written by tsmlib: {len(data)} bytes found, and no tsmlib checksum in the "
-            f"header. {_again(path, kind)}"
+            f"header. {remedy(path)}"
         )
-    view, end = memoryview(data), at + len(_ZEROS)
-    stated = data[at:end].decode("latin-1")
-    digest = hashlib.sha256(view[:at])
-    digest.update(_ZEROS.encode())
-    digest.update(view[end:])
-    if digest.hexdigest() != stated:
+    stated = data[at : at + len(_ZEROS)].decode("latin-1")
+    found = hashlib.sha256(data[:at] + _ZEROS.encode() + data[at + len(_ZEROS) :]).hexdigest()
+    if found != stated:
         raise StoreError(
-            f"{path} is damaged: its {len(data)} bytes have SHA-256 {digest.hexdigest()[:12]}..., expected "
-            f"{stated[:12]!a}.... {_again(path, kind)}"
+            f"{path} is damaged: its {len(data)} bytes have SHA-256 {found[:12]}..., expected {stated[:12]!a}.... "
+            f"{remedy(path)}"
         )
     try:
-        about = _loads(_loads(data[8:header_end])["__metadata__"]["tsmlib"])
-        schema, found, _ = about["schema"], about["kind"], {**about["header"]}
+        entry: Any = loads(data[8:header_end])
+        about: Any = loads(entry["__metadata__"]["tsmlib"])
+        schema, holds, _ = about["schema"], about["kind"], {**about["header"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {_again(path, kind)}") from error
+        raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {remedy(path)}") from error
     if type(schema) is not int or not 1 <= schema <= SCHEMA:
         raise StoreError(
             f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
         )
-    if kind is not None and found != kind:
-        raise StoreError(f"{path} holds {found!r:.80}, expected '{kind}'. {_other(path, kind)}")
+    if kind is not None and holds != kind:
+        raise StoreError(f"{path} holds {holds!r:.80}, expected '{kind}'. {_OTHER}")
     return data, about
 
 
@@ -141,34 +131,32 @@ def _owned(value: Tensor | np.ndarray) -> Tensor:
     return value.detach().cpu().clone(memory_format=torch.contiguous_format)
 
 
-def _require_finite(path: Path, tensors: Mapping[str, Tensor], remedy: str) -> None:
+def _require_finite(path: Path, tensors: Mapping[str, Tensor], advice: str) -> None:
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             bad = torch.nonzero(~torch.isfinite(tensor))
             index = tuple(bad[0].tolist())
             raise StoreError(
                 f"{len(bad)} value(s) of '{name}' for {path} are not finite, the first at index {index}: "
-                f"{tensor[index].item()}. {remedy}"
+                f"{tensor[index].item()}. {advice}"
             )
 
 
-# Trajectories and models ---------------------------------------------------------------------------------------------
+# Trajectories --------------------------------------------------------------------------------------------------------
 
 
-def save_trajectories(path: PathLike, trajectories: Trajectories, header: Mapping[str, Any] | None = None) -> None:
+def save_trajectories(path: PathLike, trajectories: Trajectories, header: Mapping[str, Json] | None = None) -> None:
     """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, fingerprint, ...)."""
     t = trajectories
-    fields = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
+    fields: dict[str, Json] = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
     arrays = {"states": t.states.astype(np.float32), "actions": t.actions.astype(np.float32)}
     save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": fields})
 
 
-def load_trajectories(
-    path: PathLike, *, env: str | None = None, expect: Mapping[str, Any] | None = None
-) -> Trajectories:
-    """Read what ``save_trajectories`` wrote; with ``env`` or ``expect``, a fingerprint, refuse data of anything else.
+def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = None) -> Trajectories:
+    """Trajectories as ``save_trajectories`` wrote them, of ``expect``, a fingerprint, where that is given.
 
-    Raises StoreError naming episode, step and field of a value that is not finite.
+    Raises StoreError naming episode, step and field of a value that is not finite, or both sides of what differs.
     """
     path = Path(path)
     tensors, about = _load(path, "trajectories")
@@ -183,102 +171,97 @@ def load_trajectories(
             raise TypeError(f"expected texts as env, names and units and a dt above 0, found {fields!r:.200}")
         if not all(type(index) is int and 0 <= index < size for index in fields["angles"]):
             raise TypeError(f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions")
-        found = Trajectories(
-            states=tensors["states"].numpy(),
-            actions=tensors["actions"].numpy(),
-            env=fields["env"],
-            dt=fields["dt"],
-            names=tuple(fields["names"]),
-            units=tuple(fields["units"]),
-            angles=tuple(fields["angles"]),
-        )
+        arrays = (tensors["states"].numpy(), tensors["actions"].numpy())
+        meaning = (tuple(fields[name]) for name in ("names", "units", "angles"))
+        found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning)
         fingerprint = {**about["header"].get("fingerprint", {}), **fields}
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
-        raise StoreError(f"{path} holds no usable trajectories: {error}. {_again(path, 'trajectories')}") from error
-    if env is not None and found.env != env:
-        raise StoreError(f"{path} holds trajectories of {found.env}, expected {env}. {_other(path, 'trajectories')}")
-    if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other(path, 'trajectories')}")
+        raise StoreError(f"{path} holds no usable trajectories: {error}. {remedy(path)}") from error
+    _require_fit(path, fingerprint, expect, about["schema"])
     return found
 
 
-def save_model(path: PathLike, model: Model, header: Mapping[str, Any] | None = None) -> None:
+# Models --------------------------------------------------------------------------------------------------------------
+
+
+def save_model(path: PathLike, model: Model, header: Mapping[str, Json] | None = None) -> None:
     """Write the weights of ``model`` with its class name and constructor arguments.
 
     header["fingerprint"]: what the model fits (env, dt, names, ...), compared field by field by ``load_model``.
     The length H of its segments joins it there.
     """
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
-    if hasattr(model, "segment_len"):
-        about["fingerprint"] = {"segment_len": model.segment_len, **about.get("fingerprint", {})}
+    stated = about.get("fingerprint", {})
+    if hasattr(model, "segment_len") and isinstance(stated, Mapping):
+        about["fingerprint"] = {"segment_len": model.segment_len, **stated}
     save(path, model.state_dict(), kind="model", header=about)
 
 
-def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Any] | None = None) -> M:
-    """Build ``cls(**config)`` from the file and load its weights, strictly.
+def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | None = None) -> M:
+    """``cls(**config)`` from the file, with its weights, strictly.
 
     expect: fields that the file's fingerprint must hold with these values. Raises StoreError naming both sides of
     every field that differs, and for a file of another class or with weights of other shapes or types.
     """
     path = Path(path)
     tensors, about = _load(path, "model")
-    _require_finite(path, tensors, _again(path, "model"))
+    _require_finite(path, tensors, remedy(path))
     header = about["header"]
     if header.get("class") != cls.__name__:
-        raise StoreError(
-            f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_other(path, 'model')}"
-        )
+        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_OTHER}")
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
-        _require_sizes(config)
-        limit = LARGEST + sum(tensor.numel() for tensor in tensors.values())
-        with (
-            torch.device("meta"),
-            _AtMost(limit),
-        ):  # a plan of the model, without memory, however large the file says it is
-            planned = layout(cls(**config).state_dict())
+        planned = _planned_layout(cls, config)
         differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
     except Exception as error:  # what the file says goes to a constructor, which may fail in any way
-        raise StoreError(
-            f"{path} does not fit the present {cls.__name__}: {error!r:.500}. {_other(path, 'model')}"
-        ) from error
+        differs = [f"{error!r:.500}"]
     if differs:
-        raise StoreError(
-            f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_other(path, 'model')}"
-        )
-    if differs := differences(fingerprint, expect or {}, only_stated=about["schema"] == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_other(path, 'model')}")
+        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_OTHER}")
+    _require_fit(path, fingerprint, expect, about["schema"])
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
 
 
-class _AtMost(TorchFunctionMode):
-    """So many operations of torch, so that no number of layers in a file keeps a processor busy."""
-
-    def __init__(self, operations: int) -> None:
-        self.operations = operations
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.operations -= 1
-        if self.operations < 0:
-            raise ValueError("it would be much larger than its file")
-        return func(*args, **(kwargs or {}))
-
-
-def _require_sizes(config: Mapping[str, Any]) -> None:
-    """Refuse a model's arguments, from a file, that would take memory before any array is planned."""
+def _planned_layout(cls: type[torch.nn.Module], config: dict[str, Json]) -> dict[str, str]:
+    """Layout of ``cls(**config)``, found without its memory, however large the file says that it is."""
     for name, value in config.items():
-        for item in (value, *value) if isinstance(value, list) else (value,):
-            size = len(item) if isinstance(item, list) else item
-            if isinstance(item, dict):
-                _require_sizes(item)
-            elif isinstance(size, int) and size > LARGEST:
-                raise ValueError(f"{name} is {value!s:.80}, expected sizes of at most {LARGEST}")
+        if max(_sizes(value), default=0) > LARGEST:
+            raise ValueError(f"{name} is {value!s:.80}, expected sizes of at most {LARGEST}")
+    parameters = itertools.count()
+
+    def count(*_: object) -> None:
+        if next(parameters) > LARGEST:
+            raise ValueError("it would be much larger than its file")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        with torch.device("meta"):
+            return layout(cls(**config).state_dict())
+    finally:
+        hook.remove()
 
 
-def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_stated: bool = False) -> list[str]:
-    """What ``expected`` asks for and ``found``, from a file, does not hold, naming both sides.
+def _sizes(value: Json) -> Iterator[int]:
+    """Every integer within a JSON value, and the length of every list."""
+    if isinstance(value, int):
+        yield value
+    elif isinstance(value, list | dict):
+        yield len(value)
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _sizes(item)
+
+
+# Comparison ----------------------------------------------------------------------------------------------------------
+
+
+def _require_fit(path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int) -> None:
+    if differs := differences(found, expect or {}, only_stated=schema == 1):
+        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_OTHER}")
+
+
+def differences(found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False) -> list[str]:
+    """Fields of ``expected`` that ``found``, from a file, does not hold, naming both sides.
 
     only_stated: what ``found`` does not mention is not asked for, except the environment.
     """
@@ -290,7 +273,7 @@ def differences(found: Mapping[str, Any], expected: Mapping[str, Any], *, only_s
     ]
 
 
-def layout(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+def layout(tensors: Mapping[str, Tensor]) -> dict[str, str]:
     """Type and shape of each array, in words."""
     return {
         name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}" for name, tensor in tensors.items()

@@ -1,52 +1,64 @@
 """JSON files, checksums and manifests of what ships or was made by a run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tsmlib.storage import files as files_storage
 from tsmlib.storage.artifacts import read_header
-from tsmlib.storage.files import MANIFEST, STATUS, PathLike, StoreError, _again, _dumps, _loads, _read, write_bytes
+from tsmlib.storage.files import MANIFEST, STATUS, Json, PathLike, StoreError, read_bytes, remedy
 
 
-def write_json(path: PathLike, value: Any) -> None:
+def write_json(path: PathLike, value: Json) -> None:
     """Write plain JSON values, in one step. Raises StoreError for anything that JSON cannot hold, NaN included."""
-    write_bytes(path, (_dumps(Path(path), value, indent=1) + "\n").encode())
+    files_storage.write_bytes(path, _as_written(Path(path), value))
 
 
-def read_json(path: PathLike) -> Any:
-    """Read a JSON file. Checked against the folder's manifest, if any."""
-    try:
-        return _loads(_text(Path(path)))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, StoreError):
-            raise
-        raise StoreError(f"{path} is not valid JSON: {error}. {_again(Path(path))}") from error
-
-
-def read_own_json(path: PathLike) -> Any:
-    """Read a manifest or a status, which must be as ``write_json`` left it, to the byte."""
+def read_own_json(path: PathLike) -> dict[str, Json]:
+    """The object in a manifest or a status, which must be as ``write_json`` left it, to the byte."""
     path = Path(path)
-    data = _read(path)
-    try:
-        value = _loads(data)
-        as_written = data == (_dumps(path, value, indent=1) + "\n").encode()
-    except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path} is damaged: {error}. {_again(path)}") from error
-    if not as_written or not isinstance(value, dict):
-        raise StoreError(f"{path} is damaged: it is not as it was written. {_again(path)}")
+    data = read_bytes(path)
+    value = _parsed(path, data)
+    if not isinstance(value, dict) or data != _as_written(path, value):
+        raise StoreError(f"{path} is damaged: it is not as it was written. {remedy(path)}")
     return value
 
 
-# Manifests and verification ------------------------------------------------------------------------------------------
+def read_text(path: PathLike) -> str:
+    """The text of a file, checked against the folder's manifest, if any."""
+    path = Path(path)
+    data = read_bytes(path)
+    _require_sha256(path, data, _listed(path.resolve()))
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise StoreError(f"{path} is not text: {error}. {remedy(path)}") from error
+
+
+def _as_written(path: Path, value: Json) -> bytes:
+    return (files_storage.dumps(path, value, indent=1) + "\n").encode()
+
+
+def _parsed(path: Path, text: str | bytes) -> Json:
+    try:
+        return files_storage.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged, or no JSON: {error}. {remedy(path)}") from error
 
 
 def sha256(path: PathLike) -> str:
     """SHA-256 of a file's bytes, as 64 hexadecimal digits."""
-    return hashlib.sha256(_read(Path(path))).hexdigest()
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def _require_sha256(path: Path, data: bytes, wanted: str | None) -> None:
+    if wanted is not None and (found := hashlib.sha256(data).hexdigest()) != wanted:
+        raise StoreError(
+            f"{path} is damaged, or was changed after its run was complete: it has SHA-256 {found[:12]}..., expected "
+            f"{wanted[:12]}.... {remedy(path)}"
+        )
 
 
 def write_manifest(folder: PathLike) -> None:
@@ -56,22 +68,22 @@ def write_manifest(folder: PathLike) -> None:
     write_json(folder / MANIFEST, sealed({"files": listing(folder, files)}))
 
 
-def listing(folder: Path, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+def listing(folder: Path, files: Sequence[Path]) -> dict[str, dict[str, Json]]:
     """Size and SHA-256 of each file, by its name relative to ``folder``."""
     return {p.relative_to(folder).as_posix(): {"bytes": p.stat().st_size, "sha256": sha256(p)} for p in files}
 
 
-def sealed(entry: Mapping[str, Any]) -> dict[str, Any]:
+def sealed(entry: Mapping[str, Json]) -> dict[str, Json]:
     """A JSON object with the SHA-256 of its other fields in ``sha256``."""
     return {**entry, "sha256": _seal(entry)}
 
 
-def intact(entry: Any) -> bool:
+def intact(entry: object) -> bool:
     """Whether an object that ``sealed`` made is as it was."""
     return isinstance(entry, dict) and "sha256" in entry and entry["sha256"] == _seal(entry)
 
 
-def _seal(entry: Mapping[str, Any]) -> str:
+def _seal(entry: Mapping[str, Json]) -> str:
     rest = {name: value for name, value in entry.items() if name != "sha256"}
     text = json.dumps(rest["files"] if set(rest) == {"files"} else rest, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -83,47 +95,39 @@ def verify(path: PathLike) -> list[Path]:
     In a folder, every artefact and every file that a manifest or a run's status lists is checked. Inputs that are no
     longer there are passed over. Raises StoreError listing every problem, one a line.
     """
-    path = Path(path)
+    path = Path(path).resolve()
     if not path.exists():
         raise StoreError(
             f"{path} does not exist. Expected an artefact (*.safetensors) or a folder of them: check the name."
+        )
+    if path.is_file() and path.suffix != ".safetensors" and path.name not in (MANIFEST, STATUS) and not _listed(path):
+        raise StoreError(
+            f"{path} carries no checksum, and no {MANIFEST} or {STATUS} above it lists it: nothing to check. "
+            "Name a folder, or an artefact (*.safetensors)."
         )
     problems: dict[str, None] = {}  # in order, each once
     checked: dict[Path, None] = {}
 
     def check(file: Path, wanted: str | None) -> None:
         try:
-            if wanted is not None and (found := sha256(file)) != wanted:
-                raise StoreError(f"{file} has SHA-256 {found[:12]}..., expected {wanted[:12]}.... {_again(file)}")
+            if file.name in (MANIFEST, STATUS):
+                for name, digest in _manifest(file).items():
+                    check(file.parent / name, digest)
+            else:
+                _require_sha256(file, read_bytes(file), wanted)
             if file.suffix == ".safetensors" and file not in checked:
                 checked[file] = None
                 inputs = read_header(file).get("inputs", {})
-                for name, digest in inputs.items():
+                for name, stated in inputs.items() if isinstance(inputs, dict) else ():
                     if (file.parent / name).exists():
-                        check((file.parent / name).resolve(), digest)
+                        check((file.parent / name).resolve(), str(stated))
             checked[file] = None
-        except StoreError as error:
+        except ValueError as error:  # StoreError, or a name that no file can have
             problems[str(error)] = None
 
-    path = path.resolve()
-    found = [path] if path.is_file() else sorted(path.rglob("*"))
-    for file in found:
-        if file.name in (MANIFEST, STATUS):
-            try:
-                for name, digest in _manifest(file).items():
-                    check(file.parent / name, digest)
-                checked[file] = None
-            except StoreError as error:
-                problems[str(error)] = None
-        elif file.suffix == ".safetensors":
+    for file in [path] if path.is_file() else sorted(path.rglob("*")):
+        if file.suffix == ".safetensors" or file.name in (MANIFEST, STATUS) or file == path:
             check(file, _listed(file))
-        elif file == path:
-            if (stated := _listed(file)) is None:
-                raise StoreError(
-                    f"{file} carries no checksum, and no {MANIFEST} or {STATUS} above it lists it: nothing to check. "
-                    "Name a folder, or an artefact (*.safetensors)."
-                )
-            check(file, stated)
     if problems:
         raise StoreError("\n".join(problems))
     return list(checked)
@@ -131,8 +135,8 @@ def verify(path: PathLike) -> list[Path]:
 
 def _manifest(path: Path) -> dict[str, str]:
     """File name -> SHA-256, from a manifest that is itself intact, or from the complete notebooks of a status."""
+    value: dict[str, Any] = read_own_json(path)
     try:
-        value = read_own_json(path)
         if path.name == STATUS:
             entries = [entry for entry in value.values() if "files" in entry and entry["state"] == "complete"]
         else:
@@ -142,13 +146,11 @@ def _manifest(path: Path) -> dict[str, str]:
         digests = {name: str(file["sha256"]) for entry in entries for name, file in entry["files"].items()}
         whole = all(map(intact, entries))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        if isinstance(error, StoreError):
-            raise
-        raise StoreError(f"{path} is not a manifest ({error!r}). {_again(path)}") from error
+        raise StoreError(f"{path} is not a manifest ({error!r}). {remedy(path)}") from error
     if not whole:
-        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {_again(path)}")
+        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {remedy(path)}")
     if any(name.is_absolute() or ".." in name.parts for name in map(Path, digests)):
-        raise StoreError(f"{path} lists files outside its own folder. {_again(path)}")
+        raise StoreError(f"{path} lists files outside its own folder. {remedy(path)}")
     return digests
 
 
@@ -159,17 +161,3 @@ def _listed(path: Path) -> str | None:
             if (folder / name).is_file():
                 return _manifest(folder / name).get(path.relative_to(folder).as_posix())
     return None
-
-
-def _text(path: Path) -> str:
-    data = _read(path)
-    wanted = _listed(path.resolve())
-    if wanted is not None and (found := hashlib.sha256(data).hexdigest()) != wanted:
-        raise StoreError(
-            f"{path} is damaged, or was changed after its run was complete: its SHA-256 is {found[:12]}..., expected "
-            f"{wanted[:12]}.... {_again(path)}"
-        )
-    try:
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise StoreError(f"{path} is not text: {error}. {_again(path)}") from error

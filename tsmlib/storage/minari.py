@@ -1,149 +1,117 @@
-"""Data from elsewhere: a Minari data set (or any HDF5 file laid out like one) becomes ``Trajectories``.
+"""Minari data sets: read as ``Trajectories``, and written from them. Needs ``pip install 'tsmlib[minari]'``.
 
-An HDF5 file from a stranger can point at other files on this machine, and declare terabytes in a kilobyte. So the whole
-file is looked over before any of its data is read, and one thing that is not plain numbers stored in that file itself
-refuses it. h5py is needed for this alone: ``pip install tsmlib[minari]``.
+An HDF5 file from a stranger can point at other files on this machine and declare terabytes in a kilobyte, and Minari
+imports the environment that a data set names where it states no spaces. So before Minari reads, the data set must
+state two flat Box spaces, and its file hold plain numbers only, stored in it.
 """
 
-from __future__ import annotations
-
-import re
+import json
+import warnings
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
-from tsmlib.storage.files import PathLike, StoreError
-from tsmlib.trajectory import Trajectories, TrajectoryError
+from tsmlib.storage.files import PathLike, StoreError, read_bytes
+from tsmlib.trajectory import Trajectories
 
-MAX_OBJECTS = 200_000  # groups and data sets: 20,000 Minari episodes
-MAX_DEPTH = 8
-MAX_RATIO = 20  # declared bytes over stored bytes, of compressed data
-FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32"}  # all in HDF5 itself; others would load a library
+MAX_RATIO = 20  # bytes that a file declares, over its own
 
 
 def load_minari(
     path: PathLike, *, env: str, dt: float, names: tuple[str, ...], units: tuple[str, ...], angles: tuple[int, ...] = ()
 ) -> Trajectories:
-    """The episodes of a Minari data set: its folder, or its ``main_data.hdf5``; all must be equally long.
+    """The episodes of a local Minari data set in folder ``path``, with flat Box spaces and equally long episodes.
 
-    Of an episode, ``observations`` (T + 1, dx) and ``actions`` (T, du) are read; what they mean (env, dt, names, units,
-    angles) is said here, since the file does not. Raises StoreError, before any data is read, for a file with links to
-    other files, external or virtual storage, types other than numbers, filters beyond gzip, shuffle and fletcher32,
-    compressed data without fletcher32, or more declared than stored; and for data that are no trajectories.
+    Of ``observations`` (T + 1, dx) and ``actions`` (T, du), env, dt, names, units and angles say what they mean, since
+    the file does not. Raises StoreError for anything else, before data are read.
     """
-    path = Path(path)
-    file = path / "data" / "main_data.hdf5" if path.is_dir() else path
-    if not file.is_file():
-        raise StoreError(f"{file} is not a file; expected a Minari data set's folder, or its main_data.hdf5.")
+    minari = _minari(path)
+    folder = Path(path) / "data" if (Path(path) / "data").is_dir() else Path(path)
     try:
-        import h5py
+        _require_plain(folder)
+        episodes = [
+            (np.asarray(episode.observations, np.float32), np.asarray(episode.actions, np.float32))
+            for episode in minari.MinariDataset(folder).iterate_episodes()
+        ]
+        if len({actions.shape for _, actions in episodes}) > 1:
+            lengths = sorted(len(actions) for _, actions in episodes)
+            raise ValueError(f"episodes have {lengths[0]} to {lengths[-1]} steps, expected equally many: cut them")
+        states, actions = (np.stack(arrays) for arrays in zip(*episodes, strict=True))
+        return Trajectories(states, actions, env, dt, names, units, angles)
+    except Exception as error:  # what the files say goes through other libraries, which may fail in any way
+        raise StoreError(
+            f"{folder} holds no usable Minari data set: {str(error) or repr(error):.500}. Expected flat Box spaces and "
+            "plain numbers in main_data.hdf5: ask whoever made it for a copy written by Minari itself."
+        ) from error
+
+
+def save_minari(dataset_id: str, trajectories: Trajectories, rewards: np.ndarray | None = None) -> Path:
+    """Write ``trajectories`` as the local Minari data set ``dataset_id`` ("tsm/reacher/random-v0"). Returns its folder.
+
+    rewards: (N, T); zeros where there are none. Minari keeps its data sets in $MINARI_DATASETS_PATH, or ~/.minari.
+    """
+    from gymnasium.spaces import Box
+
+    minari, t = _minari(dataset_id), trajectories
+    buffer = minari.data_collector.EpisodeBuffer
+    given = np.zeros(t.actions.shape[:2]) if rewards is None else rewards
+    last = np.arange(t.horizon) == t.horizon - 1
+    fields = ", ".join(f"{name} ({unit})" for name, unit in zip(t.names, t.units, strict=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of author, licence and evaluation, which data need not have
+        made = minari.create_dataset_from_buffers(
+            dataset_id,
+            [
+                buffer(observations=x, actions=u, rewards=r, terminations=np.zeros_like(last), truncations=last)
+                for x, u, r in zip(t.states, t.actions, given, strict=True)
+            ],
+            observation_space=Box(-np.inf, np.inf, t.states.shape[2:]),
+            action_space=Box(-1, 1, t.actions.shape[2:]),
+            description=f"{t.env}, {t.dt} s per step. Observations: {fields}.",
+        )
+    return Path(made.spec.data_path).parent
+
+
+def _minari(what: PathLike) -> ModuleType:
+    try:
+        import h5py  # noqa: F401
+        import minari
     except ImportError:
-        raise StoreError(f"reading {file} needs h5py: pip install 'tsmlib[minari]'") from None
-    try:
-        with h5py.File(file, "r", locking=False) as root:
-            _Inspection(h5py, file).group(root, "", 0)
-            found = sorted(
-                (int(match[1]), name) for name in root if (match := re.fullmatch(r"episode_(\d{1,9})", name, re.ASCII))
-            )
-            if not found:
-                raise StoreError(f"{file} holds no group episode_0; expected one per episode, as Minari writes them.")
-            episodes = [_episode(h5py, file, root, name) for _, name in found]
-    except (
-        OSError,
-        RuntimeError,
-        KeyError,
-        ValueError,
-        TypeError,
-        AttributeError,
-    ) as error:  # what libhdf5 makes of it
-        if isinstance(error, StoreError):
-            raise
-        raise StoreError(f"{file} is not a whole HDF5 file: {error!r:.200}. Ask for it again.") from error
-    if len({states.shape for states, _ in episodes}) > 1 or len({actions.shape for _, actions in episodes}) > 1:
-        lengths = sorted({len(actions) for _, actions in episodes})
-        raise StoreError(
-            f"{file} holds episodes of {lengths[0]} to {lengths[-1]} steps; expected equally long ones. Cut them to "
-            "one length."
-        )
-    try:
-        return Trajectories(
-            np.stack([states for states, _ in episodes]), np.stack([actions for _, actions in episodes]),
-            env, dt, names, units, angles,
-        )  # fmt: skip
-    except TrajectoryError as error:
-        raise StoreError(f"{file} does not hold what env, names and units say: {error}") from error
+        raise StoreError(f"{what}: Minari data sets need minari and h5py: pip install 'tsmlib[minari]'") from None
+    return minari
 
 
-def _episode(h5py: Any, file: Path, root: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """States (T + 1, dx) and actions (T, du) in float32."""
-    arrays = []
-    for part in ("observations", "actions"):
-        data = root[name].get(part)
-        if not isinstance(data, h5py.Dataset) or len(data.shape) != 2 or data.dtype.kind not in "fi":
-            raise StoreError(
-                f"{file}: {name}/{part} is {data!r:.80}, expected numbers of shape (steps, size). "
-                "Record flat vectors, no dictionaries."
-            )
-        arrays.append(np.asarray(data[()], np.float32))
-    return arrays[0], arrays[1]
+def _require_plain(folder: Path) -> None:
+    """Two flat Box spaces, as many episodes as stated, and numbers within the file itself, no more than it can hold."""
+    import h5py
 
+    metadata = json.loads(read_bytes(folder / "metadata.json"))
+    for word in ("observation_space", "action_space"):
+        space = json.loads(metadata[word])  # infinite bounds and all
+        sizes = {len(space["low"]), len(space["high"])}
+        if space["type"] != "Box" or {(n,) for n in sizes} != {tuple(space["shape"])}:
+            raise ValueError(f"{word} is {metadata[word]:.80}, expected a flat Box")
+        if np.dtype(space["dtype"]).kind not in "fiu":
+            raise ValueError(f"{word} is of type {space['dtype']!r:.80}, expected numbers")
+    file = folder / "main_data.hdf5"
+    left = MAX_RATIO * len(read_bytes(file)) if metadata["data_format"] == "hdf5" else 0
 
-class _Inspection:
-    """Looks at everything in a file, following no link and reading no data; what is out of place refuses it."""
+    def look(name: str, link: object) -> None:
+        nonlocal left
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{name[:80]!a} is a link ({type(link).__name__}), possibly to another file")
+        found = root[name]
+        if isinstance(found, h5py.Dataset):
+            left -= found.nbytes
+            if found.external or found.is_virtual:
+                raise ValueError(f"{name[:80]!a} has its data in other files or arrays")
+            if found.dtype.kind not in "fiub":
+                raise ValueError(f"{name[:80]!a} holds {found.dtype}, not numbers")
+            if left < 0:
+                raise ValueError(f"{name[:80]!a} declares {found.nbytes} bytes, more than the file can hold")
 
-    def __init__(self, h5py: Any, file: Path) -> None:
-        self.h5py, self.file, self.seen = h5py, file, set[int]()
-        self.left = file.stat().st_size  # bytes that may still be claimed
-
-    def group(self, group: Any, name: str, depth: int) -> None:
-        """A group and all below it."""
-        if depth > MAX_DEPTH:
-            self.refuse(name, f"groups are nested more than {MAX_DEPTH} deep")
-        for key in group:
-            inner = f"{name}/{key}"
-            if len(self.seen) > MAX_OBJECTS:
-                self.refuse(inner, f"it holds more than {MAX_OBJECTS} objects")
-            link = group.get(key, getlink=True)
-            if not isinstance(link, self.h5py.HardLink):
-                self.refuse(inner, f"it is a link ({type(link).__name__}), possibly to another file")
-            child = group.get(key)
-            address = self.h5py.h5o.get_info(child.id).addr
-            if address in self.seen:
-                self.refuse(inner, "it is the same object as one before, under another name")
-            self.seen.add(address)
-            match child:
-                case self.h5py.Group() as below:
-                    self.group(below, inner, depth + 1)
-                case self.h5py.Dataset() as data:
-                    self.dataset(data, inner)
-                case other:
-                    self.refuse(inner, f"it is a {type(other).__name__}")
-
-    def dataset(self, data: Any, name: str) -> None:
-        """A data set: plain numbers, in this file, as many as are declared."""
-        plist, where = data.id.get_create_plist(), data.id.get_type()
-        if plist.get_external_count():
-            self.refuse(name, "its data lie in another file")
-        if data.is_virtual:
-            self.refuse(name, "it is a view of other data sets")
-        if where.get_class() not in (self.h5py.h5t.INTEGER, self.h5py.h5t.FLOAT, self.h5py.h5t.ENUM):
-            if name.rpartition("/")[2] == "infos":
-                return  # texts about each step, which Minari adds and nobody here reads
-            self.refuse(name, f"it holds {data.dtype}, not numbers")
-        filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
-        if unknown := [number for number in filters if number not in FILTERS]:
-            self.refuse(name, f"it uses filter {unknown[0]}, expected {', '.join(FILTERS.values())} or none")
-        packed = 1 in filters
-        if packed and 3 not in filters:
-            self.refuse(name, "it is compressed without a checksum (fletcher32)")
-        declared, stored = data.nbytes, data.id.get_storage_size()
-        self.left -= stored
-        if declared > (MAX_RATIO if packed else 1) * stored or self.left < 0:
-            self.refuse(name, f"it declares {declared} bytes and stores {stored}")
-
-    def refuse(self, name: str, found: str) -> None:
-        raise StoreError(
-            f"{self.file}: {name[:80]!a} was not read, because {found}. Expected plain numbers, stored in this file. "
-            "Ask whoever made it for a copy written by Minari itself."
-        )
+    with h5py.File(file, "r", locking=False) as root:
+        root.visititems_links(look)
+        if not len(root) == metadata["total_episodes"] > 0:
+            raise ValueError(f"it holds {len(root)} groups, but states {metadata['total_episodes']!r:.80} episodes")

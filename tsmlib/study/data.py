@@ -1,28 +1,24 @@
 """Data sets at a run's scale, collected where they are missing."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import cast
 
 import gymnasium
 import torch
+from tqdm.auto import tqdm
 
 import tsmlib.envs
 from tsmlib.collection import collect, open_loop, smooth_torques
-from tsmlib.envs.spec import has_block
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.storage import artifacts
+from tsmlib.storage.files import Json
+from tsmlib.study.parallel import precompute
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
 SPLITS = ("train", "validation", "test")
 HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
-
-
-def short(env: str) -> str:
-    """Folder name of an environment: ReacherPush for tsm/ReacherPush-v0, Reacher-delay5 for tsm/Reacher-delay5-v0."""
-    return env.partition("/")[2].removesuffix("-v0")
 
 
 def parse_choice(parameter: str, text: str, known: Sequence[str]) -> list[str]:
@@ -35,16 +31,16 @@ def parse_choice(parameter: str, text: str, known: Sequence[str]) -> list[str]:
 
 def sizes(run: Run, env: str) -> dict[str, int]:
     """Episodes per split: the paper's 500 on the basic arm and 5,000 elsewhere, 200 for validation, 1,000 for test."""
-    full = {"train": 5000 if has_block(env) else 500, "validation": 200, "test": 1000}
+    full = {"train": 5000 if EnvSpec.parse(env).has_block else 500, "validation": 200, "test": 1000}
     return run.pick(smoke={"train": 20, "validation": 8, "test": 8}, laptop=full, paper=full)
 
 
 def dataset(run: Run, env: str, split: str) -> Trajectories:
     """One split of an environment's data, collected at the first call. Training data depend on the run's seed."""
     n = sizes(run, env)[split]
-    path = run.folder(f"data/{short(env)}") / f"{split}.safetensors"
+    path = run.folder(f"data/{EnvSpec.parse(env).name}") / f"{split}.safetensors"
     if path.exists():
-        return artifacts.load_trajectories(path, env=env, expect=fingerprint(env))
+        return artifacts.load_trajectories(path, expect=fingerprint(env))
     if run.seed in HELD_OUT_SEED.values():
         raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
     seed = HELD_OUT_SEED.get(split, run.seed)
@@ -53,6 +49,13 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
         path, data, {"split": split, "seed": seed, "scale": run.scale, "fingerprint": fingerprint(env)}
     )
     return data
+
+
+def datasets(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Trajectories]:
+    """(environment, split) -> its data. At scale paper several are collected at a time."""
+    pairs = list(wanted)
+    precompute(run, [(dataset, *pair) for pair in pairs], progress="data sets")
+    return {pair: dataset(run, *pair) for pair in tqdm(pairs, desc="data sets")}
 
 
 def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajectories:
@@ -64,6 +67,6 @@ def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajector
     return data
 
 
-def fingerprint(env: str) -> dict[str, Any]:
+def fingerprint(env: str) -> dict[str, Json]:
     """What a model of this environment was made for; a file that says otherwise is refused."""
-    return tsmlib.envs.fingerprint(env)
+    return cast("dict[str, Json]", tsmlib.envs.fingerprint(env))

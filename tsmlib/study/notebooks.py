@@ -1,66 +1,67 @@
 """Execution of notebooks, and the status of what they made."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 import signal
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tsmlib.storage.files import alive, only_writer
+from tsmlib.storage.files import STATUS, Json, StoreError, alive, writer_lock
 from tsmlib.study import parameters
-from tsmlib.study.runs import NOTEBOOKS, Run, RunError, resolve
+from tsmlib.study.parameters import Value
+from tsmlib.study.runs import Notebook, Run, RunError, notebooks, resolve
 
-# Execution -----------------------------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Execution:
+    """A notebook to be executed, into the folder of its run, with values of its parameters that were checked."""
+
+    notebook: Notebook
+    run: Run
+    values: Mapping[str, Value]
 
 
-def execute(
-    notebook: Path,
-    *,
-    scale: str = "",
-    seed: int = 0,
-    device: str = "",
-    given: Mapping[str, str] | None = None,
-    progress: bool = True,
-) -> Path:
+def prepare(
+    notebook: Notebook, *, scale: str = "", seed: Value = 0, device: str = "", given: Mapping[str, str] | None = None
+) -> Execution:
+    """Check all that a notebook is executed with, before any file exists. given: parameter -> text, as typed.
+
+    Raises ParameterError for bad parameters.
+    """
+    asked = {"scale": scale, "seed": seed, **parameters.typed(notebook.path, given or {})}
+    values = {name: asked[name] for name in parameters.declared(notebook.path) if name in asked}
+    run = resolve(notebook.stem, device=device, **values)  # type: ignore[arg-type]  # which it checks
+    return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
+
+
+def execute(execution: Execution, *, progress: bool = True) -> Path:
     """Execute a notebook into its run's folder and return the executed copy.
 
-    given: parameter name -> text, as typed on the command line. Everything is checked before any file exists.
-    Raises ParameterError for bad parameters, RunError if another process writes to the same run or the notebook does
-    not reach its end.
+    Raises RunError if another process writes to the same run or the notebook does not reach its end.
     """
-    defaults = parameters.declared(notebook)
-    values = {"scale": scale, "seed": seed, **parameters.typed(notebook, given or {})}
-    values = {name: values[name] for name in defaults if name in values}
-    own = {name: values[name] for name in ("scale", "seed", "run_dir") if name in values}
-    run = resolve(notebook.stem, device=device, **own)
-    if "scale" in values:
-        values["scale"] = run.scale
-    from tsmlib.storage import (
-        files,
-        manifest,  # heavy, and not needed to refuse a parameter
-    )
+    from tsmlib.storage import manifest  # heavy, and not needed to refuse a parameter
     from tsmlib.storage.provenance import provenance
 
+    run, hold = execution.run, contextlib.ExitStack()
     try:
-        hold = contextlib.ExitStack()
-        hold.enter_context(only_writer(run.dir, run.notebook))
-    except files.StoreError as error:
+        hold.enter_context(writer_lock(run.dir, run.notebook))
+    except StoreError as error:
         raise RunError(str(error)) from None
     with hold, _terminable(), _environment("TSM_DEVICE", run.device):
-        began = time.monotonic()
-        before = _stamps(run)
-        status: dict[str, Any] = {"pid": os.getpid(), "started": _now(), "parameters": values}
-        status |= {"scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance()}
+        began, before = time.monotonic(), _stamps(run)
+        status: dict[str, Json] = {
+            "pid": os.getpid(), "started": _now(), "parameters": execution.values, "scale": run.scale,
+            "seed": run.seed, "device": run.device, "provenance": provenance(),
+        }  # fmt: skip
         _note(run, {**status, "state": "running"})
-        ended: dict[str, Any] = {"state": "interrupted", "error": "stopped before its end"}
+        ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
         try:
-            executed = _papermill(notebook, run, values, progress)
+            executed = _papermill(execution, progress)
             made = [path for path, stamp in _stamps(run).items() if before.get(path) != stamp]
             ended = {"state": "complete", "files": manifest.listing(run.dir, sorted(made))}
         except RunError as error:
@@ -72,36 +73,32 @@ def execute(
     return executed
 
 
-def require(run: Run, notebook: str) -> dict[str, Any]:
+def require(run: Run, notebook: str) -> Mapping[str, Json]:
     """The status entry of a notebook of ``run`` that is complete and whose results are as it left them.
 
     Raises RunError naming the state and the command that makes what is missing.
     """
-    from tsmlib.storage import files, manifest
+    from tsmlib.storage import manifest
 
-    command = f"python -m tsmlib run {notebook[3:]} --scale {run.scale} --seed {run.seed}"
-    path = run.dir / files.STATUS
-    entry: Any = (
-        manifest.read_own_json(path).get(notebook, {"state": "not run"}) if path.exists() else {"state": "not run"}
-    )
+    name = next((each.name for each in notebooks().values() if each.stem == notebook), "all")
+    command = f"python -m tsmlib run {name} --scale {run.scale} --seed {run.seed}"
+    entry = _entries(run).get(notebook, {"state": "not run"})
     state = entry.get("state") if isinstance(entry, dict) else "damaged"
     if state == "running" and not alive(entry.get("pid")):
         state = "interrupted: its process is gone"
-    if (
-        state == "complete" and {"files", "sha256"} & set(entry) and not manifest.intact(entry)
-    ):  # older ones have neither
-        state = "damaged"
+    if state == "complete" and {"files", "sha256"} & set(entry) and not manifest.intact(entry):
+        state = "damaged"  # older ones have neither
     if state != "complete":
         what = "Wait for it, or run it again" if state == "running" else "Run it"
         raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. {what}: {command}")
     try:
         changed = [
-            name
-            for name, file in entry.get("files", {}).items()
-            if not (run.dir / name).is_file() or manifest.sha256(run.dir / name) != file["sha256"]
+            file
+            for file, stated in entry.get("files", {}).items()
+            if not (run.dir / file).is_file() or manifest.sha256(run.dir / file) != stated["sha256"]
         ]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        changed = [f"{files.STATUS} ({error!r:.80})"]
+        changed = [f"{STATUS} ({error!r:.80})"]
     if changed:
         raise RunError(f"{run.dir / changed[0]} is not what {notebook} made, or is gone. Run it again: {command}")
     return entry
@@ -113,25 +110,22 @@ def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
     return {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in found}
 
 
-def _papermill(notebook: Path, run: Run, values: dict[str, Any], progress: bool) -> Path:
+def _papermill(execution: Execution, progress: bool) -> Path:
     import papermill
     from nbclient.exceptions import DeadKernelError
     from traitlets.config import Config
 
-    output = run.dir / notebook.name
+    notebook = execution.notebook
+    output = execution.run.dir / notebook.path.name
     unfinished = output.with_name(f".{notebook.stem}.running.ipynb")
     failure, seen = None, ""
     try:
+        options = Config({"KernelManager": {"transport_encryption": "auto"}})  # keeps ipykernel >= 7.3 from warning
+        bar = {"desc": notebook.stem} if progress else False
         executed = papermill.execute_notebook(
-            _literally(notebook),
-            _literally(unfinished),
-            values,
-            kernel_name="python3",
-            language="python",
-            cwd=str(NOTEBOOKS),
-            progress_bar={"desc": notebook.stem} if progress else False,
-            config=Config({"KernelManager": {"transport_encryption": "auto"}}),  # keeps ipykernel >= 7.3 from warning
-        )
+            _literally(notebook.path), _literally(unfinished), dict(execution.values),
+            kernel_name="python3", language="python", cwd=str(notebook.path.parent), progress_bar=bar, config=options,
+        )  # fmt: skip
         code = [cell for cell in executed.cells if cell.cell_type == "code" and cell.source.strip()]
         if any(cell.execution_count is None for cell in code):  # sys.exit(0) in a cell, for one
             failure = "it stopped before its last cell"
@@ -168,22 +162,25 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _note(run: Run, entry: Mapping[str, Any]) -> None:
-    """Write this notebook's entry of status.json. A file that it made again is no longer another's."""
-    from tsmlib.storage import files, manifest
+def _entries(run: Run) -> dict[str, Any]:
+    """status.json: notebook -> what is known of it."""
+    from tsmlib.storage import manifest
 
-    path = run.dir / files.STATUS
-    entries: dict[str, Any] = manifest.read_own_json(path) if path.exists() else {}
-    entries[run.notebook] = manifest.sealed(entry)
+    path = run.dir / STATUS
+    return dict(manifest.read_own_json(path)) if path.exists() else {}
+
+
+def _note(run: Run, entry: Mapping[str, Json]) -> None:
+    """Write this notebook's entry of status.json. A file that it made again is no longer another's."""
+    from tsmlib.storage import manifest
+
+    entries, made = _entries(run), manifest.sealed(entry)
+    entries[run.notebook], own = made, dict[str, Any](made).get("files", {})
     for name, other in entries.items():
-        if (
-            name != run.notebook
-            and manifest.intact(other)
-            and set(other.get("files", {})) & set(entry.get("files", {}))
-        ):
-            rest = {file: stated for file, stated in other["files"].items() if file not in entry["files"]}
+        if name != run.notebook and manifest.intact(other) and set(other.get("files", {})) & set(own):
+            rest = {file: stated for file, stated in other["files"].items() if file not in own}
             entries[name] = manifest.sealed({**other, "files": rest})
-    manifest.write_json(path, entries)
+    manifest.write_json(run.dir / STATUS, entries)
 
 
 @contextlib.contextmanager
@@ -203,7 +200,7 @@ def _environment(name: str, value: str) -> Iterator[None]:
 def _terminable() -> Iterator[None]:
     """SIGTERM ends a run as Ctrl-C does, so that its status is written and its kernel shut down."""
 
-    def interrupt(*_: Any) -> None:
+    def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     try:

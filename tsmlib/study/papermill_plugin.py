@@ -1,12 +1,10 @@
-"""Lets ``papermill notebooks/05_control.ipynb`` work in a terminal: papermill alone insists on an output path.
+"""Plugin of papermill: an output path for ``papermill notebooks/05_control.ipynb``, without which papermill refuses.
 
-papermill imports its entry points before it reads the command line. Exactly that command, typed in a terminal for a
-notebook of this repository, gets the path where ``python -m tsmlib run control`` would put it; anything else, other
-arguments or a pipe included, is left alone. Only the standard library is imported here, papermill loads
-this always; and torch, where TSM_DEVICE names an accelerator that has to be there.
+papermill refuses before it asks any of its engines, translators or handlers of paths. What is left is the command line
+itself, edited when papermill imports its entry points, before it reads it. Exactly that command, typed in a terminal
+for a notebook of this repository, gets the path where ``python -m tsmlib run control`` would put it; anything else,
+other arguments or a pipe included, is left alone. It imports little, since papermill loads this always.
 """
-
-from __future__ import annotations
 
 import os
 import stat

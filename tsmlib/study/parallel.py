@@ -1,9 +1,7 @@
-"""Several things of a run made at the same time, by processes in which torch has one thread.
+"""Parallel processes for models, plans and scores of a run; torch has one thread in each.
 
 Two threads on one small network may stand in each other's way; two networks on a thread each use both cores.
 """
-
-from __future__ import annotations
 
 import multiprocessing
 import os
@@ -24,9 +22,8 @@ from tsmlib.study.runs import Run, RunError
 def precompute(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
     """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
 
-    make: a function of ``study`` that keeps what it makes in the run's folder, such as ``plan``, where the notebook
-    then finds it. Calls must not need each other's results: models first (``precompute_models``), then what uses
-    them. At scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error, or an
+    make: a function that keeps what it makes in the run's folder, such as ``plan``. Calls must not need each other's
+    results. At scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error, or an
     interrupt, ends it when the calls under way have ended; what they made is kept. Raises RunError where a worker died.
     """
     workers = min(cores(), len(calls), 61)  # Windows allows no more
@@ -77,5 +74,5 @@ def _end_with_parent() -> None:
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

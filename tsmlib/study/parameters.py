@@ -1,11 +1,9 @@
-"""The parameters of the notebooks: which there are, of which type, within which range. One schema for every way in.
+"""Parameters of the notebooks: names, types and ranges; one schema for every way in.
 
 ``python -m tsmlib run`` checks the text that was typed, and a notebook's first cell checks the values that arrived
 there (papermill only warns of unknown names, and executes every name as code). Both happen before any file exists.
 A notebook's ``parameters`` cell holds the defaults; a name in it that stands here too obeys the rule here.
 """
-
-from __future__ import annotations
 
 import ast
 import json
@@ -14,17 +12,15 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+from tsmlib.study import zoo
 
 SCALES = ("smoke", "laptop", "paper")
 ENVS = tuple(f"tsm/{arm}-v0" for arm in ("Reacher", "ReacherObstacle", "ReacherPush",
                                          "PymunkReacher", "PymunkObstacle", "PymunkPush"))  # fmt: skip
-MODELS = (
-    *("tsm", "tsm+energy", "tsm+energy+direct", "tsm+teacher", "tsm+direct", "prior"),
-    *("onestep", "multistep", "lstm", "ensemble", "ensemble+mse"),
-    *("tsm+full", "tsm+plain", "tsm+z4", "tsm+z16", "tsm+h1", "tsm+h20"),
-)
 LONGEST = 1000  # characters
+Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
 _RESTORE = "Restore it: git checkout -- notebooks"
 
@@ -73,7 +69,7 @@ SCHEMA: dict[str, Rule] = {
     ),
     "env": _some_of(*ENVS),
     "envs": _some_of(*ENVS),
-    "models": _some_of(*MODELS),
+    "models": _some_of(*zoo.words()),
     "n_targets": _whole(0, 100),
 }  # fmt: skip
 PLAIN = {  # for a parameter without a rule, by the type of its default
@@ -84,42 +80,35 @@ PLAIN = {  # for a parameter without a rule, by the type of its default
 }
 
 
-def check(name: str, value: Any, *, default: Any = None, origin: str = "") -> Any:
-    """``value`` if parameter ``name`` may have it; else ParameterError naming ``origin``, the value and the range."""
+def check(name: str, value: object, *, default: object = None, origin: str = "") -> None:
+    """ParameterError naming ``origin``, the value and the range, unless parameter ``name`` may have this value."""
     rule = SCHEMA.get(name) or PLAIN.get(type(default))
     if rule is None:
         raise ParameterError(f"{origin or name} cannot be given from outside: edit the notebook to change it.")
-    good = type(value) is rule.type
-    if good and rule.type is str:
-        good = len(value) <= LONGEST and value.isprintable()
-    if not good or not rule.allows(value):
+    text = len(value) <= LONGEST and value.isprintable() if isinstance(value, str) else True
+    if type(value) is not rule.type or not text or not rule.allows(value):
         raise ParameterError(f"{origin or name} is {_shown(value)}, expected {rule.words}.")
-    return value
 
 
-def convert(name: str, text: str, *, default: Any = None, origin: str = "") -> Any:
-    """The value of parameter ``name`` from ``text``; ParameterError where it is none or not allowed."""
+def convert(name: str, text: str, *, default: object = None) -> Value:
+    """The value of parameter ``name`` that ``text`` spells; the text itself where it spells none, for ``check``."""
     rule = SCHEMA.get(name) or PLAIN.get(type(default))
-    value: Any = text
-    if rule and rule.type is bool and text.lower() in ("true", "false"):
-        value = text.lower() == "true"
-    elif rule and rule.type is int and re.fullmatch(r"[+-]?[0-9]{1,18}", text, re.ASCII):
-        value = int(text)
-    elif (
-        rule
-        and rule.type is float
-        and re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", text, re.ASCII)
-    ):
-        value = float(text)
-    return check(name, value, default=default, origin=origin)
+    kind = rule.type if rule else str
+    if kind is bool and text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    if kind is int and re.fullmatch(r"[+-]?[0-9]{1,18}", text, re.ASCII):
+        return int(text)
+    if kind is float and re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", text, re.ASCII):
+        return float(text)
+    return text
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     shown = ascii(value)
     return shown if len(shown) <= 80 else f"{shown[:77]}..."
 
 
-def declared(notebook: Path) -> dict[str, Any]:
+def declared(notebook: Path) -> dict[str, object]:
     """Name -> default of every parameter: the literals in the cell tagged ``parameters``."""
     try:
         cells = json.loads(notebook.read_text())["cells"]
@@ -129,7 +118,7 @@ def declared(notebook: Path) -> dict[str, Any]:
         raise ParameterError(f"{notebook} is not a notebook: {error!r:.200}. {_RESTORE}") from error
     if len(sources) != 1:
         raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one. {_RESTORE}")
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     try:
         for statement in ast.parse(sources[0]).body:
             match statement:
@@ -146,13 +135,10 @@ def declared(notebook: Path) -> dict[str, Any]:
     return found
 
 
-def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Any]:
-    """Values for a notebook's parameters from their text. Unknown names are refused."""
+def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Value]:
+    """Values for a notebook's parameters from their text, to be checked. Unknown names are refused."""
     defaults = declared(notebook)
     for name in given:
         if name not in defaults:
             raise ParameterError(f"{notebook.stem} has no parameter {_shown(name)}; it has {', '.join(defaults)}.")
-    return {
-        name: convert(name, text, default=defaults[name], origin=f"{notebook.stem}: {name}")
-        for name, text in given.items()
-    }
+    return {name: convert(name, text, default=defaults[name]) for name, text in given.items()}

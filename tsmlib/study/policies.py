@@ -1,116 +1,186 @@
-"""Policies learned inside trained models."""
-
-from __future__ import annotations
+"""Policies learned inside trained models, kept in the run's folder."""
 
 import shutil
 import time
-from dataclasses import asdict
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, cast
 
 import torch
+from torch import Tensor
 
-from tsmlib import rewards
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.actions import within
-from tsmlib.planning.execution import execute
-from tsmlib.planning.tasks import TOLERANCE, Task
-from tsmlib.policies.learning import episodes_from, imagine, learn_policy
-from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
+from tsmlib.figures.method import SEARCH_SPACES, Method
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import DynamicsModel
+from tsmlib.planning.execution import Trial, execute
+from tsmlib.planning.tasks import Task
+from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, learn_policy
+from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
 from tsmlib.storage import artifacts
-from tsmlib.study.data import dataset, fingerprint, short
-from tsmlib.study.models import load_or_train
+from tsmlib.study.data import dataset, fingerprint, sizes
+from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior, precompute_models
+from tsmlib.study.parallel import precompute
+from tsmlib.study.results.policies import learning_rows
+from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
+from tsmlib.trajectory import Trajectories
 
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration (A.3)
 
 
-def learn(
-    run: Run, task: Task, model: str, prior: str, *, copies: int = 1, iterations: int = 0
-) -> tuple[Any, dict[str, Any]]:
-    """A policy learned inside a trained model, and the header of its file (learning curve, seconds, seed, scale).
+@dataclass(frozen=True)
+class Budget:
+    """How a policy is learned: copies side by side from different seeds, and iterations; 0 means smoke 4, laptop 300,
+    paper 2,200."""
 
-    prior: codes (a SegmentPolicy, acting through the action prior) or actions (a OneStepPolicy). copies: learned side
-    by side from different seeds. iterations: 0 means smoke 4, laptop 300, paper 2,200. Episodes start as those of the
-    training data, so the environment is not asked. What the policy truly earns on ``task`` is measured at ten points
-    along the way, beside what the model promises there (``assess``); neither has a part in learning.
+    copies: int = 1
+    iterations: int = 0
 
-    From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its copies and iterations; else
-    learned now, going on from its checkpoint if it was stopped.
+
+USUAL = Budget()
+
+
+class Learned(NamedTuple):
+    """A learned policy, and the header of its file: learning curve, seconds, seed, scale."""
+
+    policy: Policy
+    header: Header
+
+
+def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learned:
+    """A policy learned inside a trained model.
+
+    method: a model and a search space, latent (a SegmentPolicy, acting through the action prior) or direct (a
+    OneStepPolicy). Episodes start as those of the training data, so the environment is not asked. What the policy
+    truly earns on ``task`` is measured at ten points along the way, beside the return that the model predicts there
+    (``assess``); neither has a part in learning.
+
+    From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its budget; else learned now,
+    going on from its checkpoint if it was stopped.
     """
-    if prior not in ("codes", "actions") or iterations < 0 or copies < 1:
+    if method.search_space not in SEARCH_SPACES or budget.iterations < 0 or budget.copies < 1:
         raise ValueError(
-            f"prior is {prior!r}, iterations {iterations}, copies {copies}; expected codes or actions, 0 (the scale's "
-            "default) or more iterations, and at least one copy"
+            f"search space is {method.search_space!r}, iterations {budget.iterations}, copies {budget.copies}; "
+            f"expected {' or '.join(SEARCH_SPACES)}, 0 (the scale's default) or more iterations, and at least one copy"
         )
-    net, _ = load_or_train(run, task.env, model)
-    nets = {"model": net} | ({"prior": load_or_train(run, task.env, "prior")[0]} if prior == "codes" else {})
-    cls, own = SegmentPolicy if prior == "codes" else OneStepPolicy, _path(run, task, model, prior)
-    shipped = run.shipped / short(task.env) / own.name
-    weights = {word: artifacts.digest(net.state_dict()) for word, net in nets.items()}
+    net = load_or_train(run, task.env, method.model).model
+    prior = load_prior(run, task.env) if method.search_space == "latent" else None
+    weights = {"model": artifacts.digest(net.state_dict())}
+    if prior is not None:
+        weights["prior"] = artifacts.digest(prior.state_dict())
     made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
-    budget = {"copies": copies, "iterations": iterations or run.pick(smoke=4, laptop=300, paper=2200)}
+    budget = replace(budget, iterations=budget.iterations or run.pick(smoke=4, laptop=300, paper=2200))
+    own = _path(run, task, method)
+    shipped = run.shipped / own.parent.name / own.name
+    cls: type[Policy] = OneStepPolicy if prior is None else SegmentPolicy
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
             header = artifacts.read_header(path)
-            if header.get("made_from") == made_from and (path == shipped or header.get("budget") == budget):
-                return artifacts.load_model(path, cls, expect=fingerprint(task.env)), header
-    print(f"{task.env}: no policy learned in {model} through {prior} at scale {run.scale}; learning it now")
+            if header.get("made_from") == made_from and (path == shipped or header.get("budget") == asdict(budget)):
+                return Learned(artifacts.load_model(path, cls, expect=fingerprint(task.env)), header)
+    print(
+        f"{task.env}: no {method.search_space} policy learned in {method.model} at scale {run.scale}; learning it now"
+    )
+    about = {"made_from": made_from, "budget": asdict(budget), "model": method.model,
+             "search_space": method.search_space}  # fmt: skip
+    return _learn(run, task, net, prior, budget, own, about)
+
+
+def learn_all(run: Run, wanted: Iterable[tuple[Task, Method, Budget]]) -> dict[tuple[str, Method], Learned]:
+    """(environment, method) -> the policy. At scale paper several are learned at a time."""
+    asked = list(wanted)
+    words = [(task.env, word) for task, method, _ in asked for word in (method.model, "prior")]
+    precompute_models(run, words)
+    precompute(run, [(learn, *one) for one in asked], progress="policies")
+    return {(task.env, method): learn(run, task, method, budget) for task, method, budget in asked}
+
+
+def _learn(
+    run: Run, task: Task, net: TrainedModel, prior: ActionPrior | None, budget: Budget, path: Path, about: Header
+) -> Learned:
+    """Learn a policy and store it at ``path``. Resumes from the checkpoint beside it."""
     data = dataset(run, task.env, "train")
-    options: dict[str, Any] = dict(angles=data.angles, copies=copies, seed=1000 * run.seed)
-    if prior == "codes":
-        policy: Any = SegmentPolicy(data.states.shape[2], nets["prior"], **options)
-    else:
-        policy = OneStepPolicy(data.states.shape[2], data.actions.shape[2], **options)
-    policy.features.fit(torch.from_numpy(data.states))
-    checkpoint = own.with_name(f"policy-{model}-{prior}.checkpoint")
+    policy, checkpoint = _initialise(run, data, prior, budget), path.with_suffix(".checkpoint")
     curve = learn_policy(
-        policy.to(run.device), net.to(run.device), rewards.reach if task.name == "reach" else rewards.push,
-        episodes_from(torch.from_numpy(data.states[:, 0])), horizon=task.horizon, iterations=budget["iterations"],
-        episodes=EPISODES[run.scale], seed=1000 * run.seed,
-        record_every=max(1, budget["iterations"] // 10), measure=lambda p: assess(p, net, task, seed=run.seed + 1),
-        checkpoint=checkpoint, progress=f"{short(task.env)} policy in {model} through {prior}",
+        policy.to(run.device), net.to(run.device), task.reward_for,
+        episodes_from(torch.from_numpy(data.states[:, 0])),
+        LearningOptions(
+            horizon=task.horizon, iterations=budget.iterations, episodes=EPISODES[run.scale],
+            record_every=max(1, budget.iterations // 10),
+        ),
+        seed=1000 * run.seed, measure=lambda p: assess(p, net, task, seed=run.seed + 1), checkpoint=checkpoint,
+        progress=f"{path.parent.name}: {path.stem}",
     )  # fmt: skip
     header = {
-        "fingerprint": fingerprint(task.env), "made_from": made_from, "budget": budget, "model": model, "prior": prior,
-        "seed": run.seed, "scale": run.scale, "curve": asdict(curve), "seconds": curve.seconds[-1],
-        "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
-        "finished": time.strftime("%Y-%m-%d"),
+        **about, "fingerprint": fingerprint(task.env), "seed": run.seed, "scale": run.scale, "curve": asdict(curve),
+        "seconds": curve.seconds[-1], "torch": torch.__version__, "threads": torch.get_num_threads(),
+        "device": run.device, "finished": time.strftime("%Y-%m-%d"),
     }  # fmt: skip
-    artifacts.save_model(own, policy.cpu(), header)
+    artifacts.save_model(path, policy.cpu(), header)
     shutil.rmtree(checkpoint)
-    return policy, artifacts.read_header(own)
+    return Learned(policy, artifacts.read_header(path))
 
 
-def stored_budget(run: Run, task: Task, model: str, prior: str) -> dict[str, int] | None:
-    """Copies and iterations of the policy that the run's folder holds, for ``learn`` to find it again; else None."""
-    path = _path(run, task, model, prior)
-    return dict(artifacts.read_header(path)["budget"]) if path.exists() else None
+def _initialise(run: Run, data: Trajectories, prior: ActionPrior | None, budget: Budget) -> Policy:
+    """The policy as learning starts."""
+    (dx, du), seed = (data.states.shape[2], data.actions.shape[2]), 1000 * run.seed
+    policy: Policy
+    if prior is None:
+        policy = OneStepPolicy(dx, du, angles=data.angles, copies=budget.copies, seed=seed)
+    else:
+        policy = SegmentPolicy(dx, prior, angles=data.angles, copies=budget.copies, seed=seed)
+    policy.features.fit(torch.from_numpy(data.states))
+    return policy
 
 
-def _path(run: Run, task: Task, model: str, prior: str) -> Path:
-    return run.folder(f"models/{short(task.env)}") / f"policy-{model}-{prior}.safetensors"
+def learned_rows(run: Run, task: Task, method: Method, found: Learned) -> list[Row]:
+    """Rows of a learned policy, with what its model and prior have cost and its steps within the data's torques."""
+    words = [method.model] + ["prior"] * (method.search_space == "latent")
+    seconds = sum(cast("float", load_or_train(run, task.env, word).header["seconds"]) for word in words)
+    return learning_rows(
+        found.header, samples=100 * sizes(run, task.env)["train"], train_seconds=seconds, n=len(task),
+        within_data=within_data(run, task, found.policy).tolist(),
+    )  # fmt: skip
+
+
+def stored_budget(run: Run, task: Task, method: Method) -> Budget | None:
+    """How the policy that the run's folder holds was learned, for ``learn`` to find it again; else None."""
+    path = _path(run, task, method)
+    return Budget(**cast("dict[str, int]", artifacts.read_header(path)["budget"])) if path.exists() else None
+
+
+def _path(run: Run, task: Task, method: Method) -> Path:
+    folder = run.folder(f"models/{EnvSpec.parse(task.env).name}")
+    return folder / f"policy-{method.model}-{method.search_space}.safetensors"
+
+
+def execute_policy(task: Task, policy: Policy) -> Trial:
+    """Every copy of a policy on every target, one copy after the other."""
+    many = task.times(policy.copies)
+    return execute(many, controller(policy, many.target))
 
 
 @torch.no_grad()
-def within_data(run: Run, task: Task, policy: Any) -> torch.Tensor:
+def within_data(run: Run, task: Task, policy: Policy) -> Tensor:
     """Share of the steps that a policy executes on a task whose torques are as the training data's (claim C16): (M,),
-    one per copy. See ``invariants.within``."""
-    many = task.times(policy.copies)
+    one per copy. See ``actions.within``."""
     known = torch.from_numpy(dataset(run, task.env, "train").actions)
-    shares = within(execute(many, controller(policy, many.target)).actions, known)
+    shares = within(execute_policy(task, policy).actions, known)
     return shares.unflatten(0, (policy.copies, -1)).mean(1)
 
 
 @torch.no_grad()
-def assess(policy: Any, model: Any, task: Task, *, seed: int) -> dict[str, torch.Tensor]:
-    """What a policy earns on a task and what the model promises there, without action noise: means, one per copy."""
-    many = task.times(policy.copies)
-    done = execute(many, controller(policy, many.target))
+def assess(policy: Policy, model: DynamicsModel, task: Task, *, seed: int) -> dict[str, Tensor]:
+    """Executed and predicted return of a policy on a task, without action noise: means, one per copy."""
+    many, done = task.times(policy.copies), execute_policy(task, policy)
     start, draw = torch.from_numpy(many.start).float(), torch.Generator().manual_seed(seed)
-    promised = many.reward(*imagine(policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw))
+    seen = imagine(policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw)
     found = {
-        "return_true": done.executed_return, "return_predicted": promised.sum(-1),
+        "return_true": done.executed_return, "return_predicted": many.reward(*seen).sum(-1),
         "final_distance": done.final_distance,
-        "success": (done.final_distance < TOLERANCE).float(),
+        "success": (done.final_distance < task.tolerance).float(),
     }  # fmt: skip
     return {name: values.unflatten(0, (policy.copies, -1)).mean(1) for name, values in found.items()}

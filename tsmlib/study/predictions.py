@@ -1,20 +1,24 @@
 """Scores of trained models on test episodes, kept in the run's folder."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from torch import Tensor
 
-from tsmlib.evaluation import prediction
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation import prediction, scoring
+from tsmlib.models.base import DynamicsModel, predict_segment
 from tsmlib.sampling import Noise
 from tsmlib.storage import artifacts, tables
-from tsmlib.study.data import dataset, short
-from tsmlib.study.models import load_or_train
+from tsmlib.study.data import dataset
+from tsmlib.study.models import load_or_train, precompute_models
 from tsmlib.study.notebooks import require
+from tsmlib.study.parallel import precompute
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.trajectory import Segment
@@ -23,7 +27,7 @@ RESULTS = ROOT / "data" / "results"
 
 
 def scores(run: Run, env: str, model: str, *, segments: bool = False) -> prediction.Scores:
-    """``evaluate.score`` of a trained model on test episodes: open loop, or ``segments`` from the true past.
+    """``prediction.score`` of a trained model on test episodes: open loop, or ``segments`` from the true past.
 
     Smoke 8 episodes and samples, laptop 200 episodes and 16 samples, paper 1,000 and 32. Scores are kept in the run's
     folder and found again as long as weights, data and sizes are the same.
@@ -37,7 +41,7 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> predict
     options: dict[str, Any] = {"horizon": 90}
     if segments:
         options = {"horizon": 10, "starts": list(prediction_results.SEGMENTS)}
-    path = run.folder(f"scores/{short(env)}") / f"{model}{'-segments' * segments}.safetensors"
+    path = run.folder(f"scores/{EnvSpec.parse(env).name}") / f"{model}{'-segments' * segments}.safetensors"
     made_from = {
         "version": prediction.VERSION, "rows": prediction.ROWS, "samples": samples, "seed": run.seed, **options,
         "model": net.config(), "weights": artifacts.digest(net.state_dict()),
@@ -45,10 +49,10 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> predict
            for split, data in (("test", test), ("validation", held_out))},
     }  # fmt: skip
     if not path.exists() or artifacts.read_header(path).get("made_from") != made_from:
-        features = deepcopy(net.features)  # what is scored is on the processor
+        features = deepcopy(net.features)  # what is scored is on the CPU
         found = prediction.score(
             net.to(run.device), features, test, held_out, samples=samples, seed=run.seed, **options,
-            progress=f"{short(env)} {model}: {'segments' if segments else 'open loop'}",
+            progress=f"{EnvSpec.parse(env).name} {model}: {'segments' if segments else 'open loop'}",
         )  # fmt: skip
         tensors = {f"values.{metric}": value for metric, value in found.values.items()}
         tensors |= {f"fitted.{name}": torch.as_tensor(value) for name, value in asdict(found.fitted).items()}
@@ -57,51 +61,80 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> predict
     return _unpacked(artifacts.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
 
 
-def evidence(run: Run, rows: list[dict[str, Any]], table: str = "") -> list[dict[str, Any]]:
+class Scored(NamedTuple):
+    """Scores of a model on whole episodes, and on segments from the true past."""
+
+    open_loop: prediction.Scores
+    segments: prediction.Scores
+
+
+def score_all(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Scored]:
+    """(environment, model) -> its scores. At scale paper several models are trained and scored at a time."""
+    pairs = list(dict.fromkeys(wanted))
+    precompute_models(run, pairs)
+    both = (scores, partial(scores, segments=True))
+    precompute(run, [(score, *pair) for pair in pairs for score in both], progress="scores")
+    return {pair: Scored(*(score(run, *pair) for score in both)) for pair in pairs}
+
+
+def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Rows of ``score_all``, see ``results.prediction``."""
+    found = []
+    for (env, model), (open_loop, segments) in score_all(run, wanted).items():
+        test = dataset(run, env, "test").take(slice(len(open_loop.outside)))
+        found += prediction_results.rows(env, model, open_loop, segments, test, seed=run.seed, scale=run.scale)
+    return found
+
+
+def published_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, Any]], table: str = "") -> pd.DataFrame:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
     Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come
     to its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
     rows. table: what follows the notebook's name in the table's, ``_rows`` for instance.
     """
-    name = f"{run.notebook}{table}.csv"
+    name, own = f"{run.notebook}{table}.csv", tables.frame(rows)
     if run.scale == "laptop" and (RESULTS / name).exists():
-        published = tables.load_table(RESULTS / name)
-        known = {row["env"] for row in published}
-        return [*published, *(row for row in rows if row["env"] not in known)]
-    if run.scale != "paper":
-        return rows
-    for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")):
+        published = tables.load(RESULTS / name)
+        return tables.frame(pd.concat([published, own[~own["env"].isin(published["env"])]]))
+    parts = [own]
+    for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.scale == "paper" else ():
         if run.dir not in path.parents:
             folder = path.parents[1]
             require(replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder), run.notebook)
-            rows = [*rows, *tables.load_table(path)]
-    return rows
+            parts.append(tables.load(path))
+    return tables.frame(pd.concat(parts))
 
 
-def table(run: Run, name: str) -> list[dict[str, Any]]:
-    """The rows of a run's table, else of the published one; none where neither is there."""
+def save_rows(run: Run, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write the table of a notebook's run. Returns the rows that its figures draw (``published_rows``)."""
+    tables.save(run.metrics / f"{run.notebook}.csv", rows)
+    return published_rows(run, rows)
+
+
+def table(run: Run, name: str) -> pd.DataFrame:
+    """A run's table, else the published one; without rows where neither is there."""
     for path in (run.metrics / name, RESULTS / name):
         if path.exists():
-            return tables.load_table(path)
-    return []
+            return tables.load(path)
+    return tables.frame([])
 
 
 def _unpacked(tensors: dict[str, torch.Tensor]) -> prediction.Scores:
     values = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("values.")}
     fitted = {name.partition(".")[2]: tensor for name, tensor in tensors.items() if name.startswith("fitted.")}
     numbers: dict[str, Any] = {name: tensor if tensor.ndim else float(tensor) for name, tensor in fitted.items()}
-    return prediction.Scores(values, tensors["pit"], tensors["outside"], prediction.Fitted(**numbers))
+    return prediction.Scores(values, tensors["pit"], tensors["outside"], scoring.Fitted(**numbers))
 
 
 class WithoutPastActions:
-    """A model that is shown zeros for the past actions U-: what they were worth (section 3)."""
+    """A model that is shown zeros for the past actions U- (section 3)."""
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: DynamicsModel) -> None:
         self.model = model
         self.segment_len, self.past_len, self.features = model.segment_len, model.past_len, model.features
-        self.stochastic = getattr(model, "stochastic", True)
+        self.stochastic = model.stochastic
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """As the model's, see ``DynamicsModel``."""
-        return self.model.predict_segment(Segment(past.states, 0 * past.actions), actions, generator=generator)
+        return predict_segment(self.model, Segment(past.states, 0 * past.actions), actions, generator=generator)

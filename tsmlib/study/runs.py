@@ -1,20 +1,16 @@
-"""Where the results of a notebook live, how it is executed, and what is known of a run afterwards.
+"""Runs: scale, seed, device and folders of what a notebook makes.
 
 Everything that a run makes is in one folder, ``runs/<scale>/seed<k>/``: ``data``, ``models``, ``metrics``, ``figures``,
-the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (an executed notebook
-whose kernel was killed looks complete): running, complete, failed or interrupted, with what made it and the SHA-256 of
-each table and picture. `require` refuses what is not complete.
+the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (``notebooks.require``).
 """
-
-from __future__ import annotations
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from tsmlib.study import parameters
-from tsmlib.study.parameters import ParameterError
+from tsmlib.study.parameters import ParameterError, Value
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = ROOT / "notebooks"
@@ -24,9 +20,6 @@ T = TypeVar("T")
 
 class RunError(RuntimeError):
     """A notebook that did not run to its end, or whose results are asked for all the same."""
-
-
-# Where things live ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -80,22 +73,41 @@ class Run:
         return folder
 
 
+@dataclass(frozen=True)
+class Notebook:
+    """One of the study: ``control`` is in notebooks/05_control.ipynb."""
+
+    name: str
+    path: Path
+
+    @property
+    def stem(self) -> str:
+        """What its run, its tables and its status are called: ``05_control``."""
+        return self.path.stem
+
+
+def notebooks() -> dict[str, Notebook]:
+    """Name -> notebook, in order."""
+    return {path.stem[3:]: Notebook(path.stem[3:], path) for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
+
+
 def resolve(
-    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Any
+    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Value
 ) -> Run:
     """The run that a notebook belongs to. Touches no file.
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
     run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
     device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu.
-    others: the notebook's other parameters, checked against the same schema.
+    others: the notebook's other parameters. All are checked here and nowhere else, whichever way they came.
     Raises ParameterError naming the value and what is allowed.
     """
     parameters.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
     base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
-    defaults = parameters.declared(notebooks()[notebook[3:]]) if others and notebook[3:] in notebooks() else {}
+    known = [each.path for each in notebooks().values() if each.stem == notebook] if others else []
+    defaults = parameters.declared(known[0]) if known else {}
     for name, value in others.items():
         parameters.check(name, value, default=defaults.get(name, value))
     try:
@@ -111,7 +123,9 @@ def resolve(
 def _setting(name: str, value: str, variable: str, default: str) -> str:
     """A parameter, else its environment variable, else ``default``."""
     parameters.check(name, value)
-    return value or parameters.check(name, os.environ.get(variable, ""), origin=variable) or default
+    if not value:
+        parameters.check(name, value := os.environ.get(variable, ""), origin=variable)
+    return value or default
 
 
 def _present(device: str) -> str:
@@ -127,11 +141,3 @@ def _present(device: str) -> str:
             "TSM_DEVICE) out, or install a torch that is built for this machine's: https://pytorch.org/get-started"
         )
     return device
-
-
-# Notebooks ------------------------------------------------------------------------------------------------------------
-
-
-def notebooks() -> dict[str, Path]:
-    """Word -> file, in order: 'control' is notebooks/05_control.ipynb."""
-    return {path.stem[3:]: path for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}

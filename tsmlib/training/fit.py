@@ -1,24 +1,57 @@
-"""fit(): one flat loop for every model and the prior."""
+"""Training: one flat loop for every model and the prior."""
 
-from __future__ import annotations
-
-import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
 from tsmlib.storage.artifacts import digest
-from tsmlib.storage.files import only_writer
-from tsmlib.training.checkpoint import TrainingHistory, TrainingState
+from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Windows and schedule of a training.
+
+    past_len, future_len: steps of a window. patience: validations without improvement before stopping early; 0: never.
+    """
+
+    past_len: int
+    future_len: int
+    steps: int
+    batch_size: int = 256
+    lr: float = 1e-3  # Adam's default, appendix A
+    lr_final: float = 1e-5  # end of the cosine schedule
+    warmup: int = 100  # steps
+    clip: float = 1.0  # gradient norm: windows with contact have heavy tails
+    validate_every: int = 250  # steps; a checkpoint is written as often
+    patience: int = 0
+    bf16: bool = False  # matrix products in bfloat16, weights in float32
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.batch_size, self.validate_every) < 1:
+            raise ValueError(
+                f"steps {self.steps}, batch_size {self.batch_size}, validate_every {self.validate_every}: "
+                "expected positive"
+            )
+
+
+@dataclass
+class TrainingHistory(Curve):
+    """Record of a ``fit`` at each validation: optimiser step, training loss since the last one, validation loss."""
+
+    step: list[int] = field(default_factory=list)
+    train: list[float] = field(default_factory=list)
+    validation: list[float] = field(default_factory=list)
 
 
 @torch.enable_grad()  # an interrupt within torch.no_grad, in a notebook, may leave gradients off
@@ -27,20 +60,10 @@ def fit(
     loss: Loss,
     train: Trajectories,
     validation: Trajectories,
+    options: TrainingOptions,
     *,
-    past_len: int,
-    future_len: int,
-    steps: int,
-    batch_size: int = 256,
-    lr: float = 1e-3,  # Adam's default, appendix A
-    lr_final: float = 1e-5,  # end of the cosine schedule
-    warmup: int = 100,  # steps
-    clip: float = 1.0,  # gradient norm: windows with contact have heavy tails
-    validate_every: int = 250,  # steps; a checkpoint is written as often
-    patience: int = 0,  # validations without improvement before stopping early; 0: never
     seed: int = 0,
-    bf16: bool = False,  # matrix products in bfloat16, weights in float32
-    device: str = "cpu",  # where it is trained, such as "cuda"; the model comes back to the processor
+    device: str = "cpu",  # where it is trained, such as "cuda"; the model comes back to the CPU
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
 ) -> TrainingHistory:
@@ -50,64 +73,83 @@ def fit(
     as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
     weights so far in ``model``, and StoreError for a checkpoint of another run, or one that another process writes.
     """
-    if steps < 1 or batch_size < 1 or validate_every < 1:
-        raise ValueError(f"steps {steps}, batch_size {batch_size}, validate_every {validate_every}: expected positive")
-    identity = dict(
-        past_len=past_len, future_len=future_len, steps=steps, batch_size=batch_size, lr=lr, lr_final=lr_final,
-        warmup=warmup, clip=clip, validate_every=validate_every, patience=patience, seed=seed, bf16=bf16,
-        loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
+    o, generator, lengths = options, torch.Generator(), (options.past_len, options.future_len)
+    held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, *lengths)))
+    draw = batches(
+        train.padded(o.past_len).to(device),
+        past_len=o.past_len, future_len=o.future_len, batch_size=o.batch_size, generator=generator,
+    )  # fmt: skip
+    identity = asdict(options) | dict(
+        seed=seed, loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
         data=[_digest(data) for data in (train, validation)],
     )  # fmt: skip
-    generator, kind = torch.Generator(), torch.device(device).type
-    held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, past_len, future_len)))
-    draw = batches(
-        train.padded(past_len).to(device),
-        past_len=past_len, future_len=future_len, batch_size=batch_size, generator=generator,
-    )  # fmt: skip
-    with contextlib.ExitStack() as stack:
-        stack.callback(model.to, "cpu")
-        optimizer = torch.optim.Adam(model.to(device).parameters(), lr=lr, fused=True)
-        state = TrainingState(model, optimizer)
-        torch.set_autocast_enabled(kind, False)  # or this on
-        stack.callback(torch.set_autocast_enabled, kind, False)
-        if checkpoint is not None:
-            stack.enter_context(only_writer(checkpoint, f"training, seed {seed}"))
-            state.load(checkpoint, identity)
-        began, total, counted = time.process_time() - state.seconds, 0.0, 0
-        bar = stack.enter_context(
-            tqdm(total=steps, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
-        )
-        for step in range(state.step, steps):
-            if patience and step - state.best_step >= patience * validate_every:
-                break
-            generator.manual_seed(seed * 1_000_003 + step)
-            for group in optimizer.param_groups:
-                group["lr"] = schedule(step, steps, lr, lr_final, warmup)
-            torch.clear_autocast_cache()  # which one left on would never clear
-            with torch.autocast(kind, torch.bfloat16, enabled=bf16):
-                value = loss(next(draw), generator)
-            if not torch.isfinite(value):
-                raise state.stopped("training loss", value.item(), f"{step} of {steps}", lr)
-            optimizer.zero_grad(set_to_none=True)
-            value.backward()
-            norm = nn.utils.clip_grad_norm_(model.parameters(), clip)
-            if not torch.isfinite(norm):  # before it reaches the weights
-                raise state.stopped("gradient", norm.item(), f"{step} of {steps}", lr)
-            optimizer.step()
-            total, counted = total + value.item(), counted + 1
-            bar.update()
-            if (step + 1) % validate_every == 0 or step + 1 == steps:
-                state.step, state.seconds = step + 1, time.process_time() - began
-                held_out_loss = validate(loss, held_out, seed)
-                if not math.isfinite(held_out_loss):
-                    raise state.stopped("validation loss", held_out_loss, f"{step + 1} of {steps}", lr)
-                state.record(total / counted, held_out_loss)
-                bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
-                total, counted = 0.0, 0
-                if checkpoint is not None:
-                    state.save(checkpoint, identity)
+    with _trained_on(device, model):
+        optimizer = torch.optim.Adam(model.parameters(), lr=o.lr, fused=True)
+        state = TrainingState(model, optimizer, TrainingHistory(), o.steps, identity, checkpoint)
+        with resumable(state, purpose=f"training, seed {seed}", progress=progress) as bar:
+            began, losses = time.process_time() - state.seconds, []
+            for step in range(state.step, o.steps):
+                if o.patience and step - state.best_step >= o.patience * o.validate_every:
+                    break
+                generator.manual_seed(seed * 1_000_003 + step)
+                losses.append(_update(state, loss, draw, generator, step, o))
+                bar.update()
+                if (step + 1) % o.validate_every == 0 or step + 1 == o.steps:
+                    state.step, state.seconds = step + 1, time.process_time() - began
+                    _record(state, sum(losses) / len(losses), validate(loss, held_out, seed))
+                    state.save()
+                    bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
+                    losses = []
     state.restore_best()
     return state.curve
+
+
+def _update(
+    state: TrainingState[TrainingHistory], loss: Loss, draw: Iterator[Window], generator: torch.Generator,
+    step: int, o: TrainingOptions,
+) -> float:  # fmt: skip
+    """One step of Adam; the loss before it."""
+    for group in state.optimizer.param_groups:
+        group["lr"] = schedule(step, o.steps, o.lr, o.lr_final, o.warmup)
+    window = next(draw)
+    torch.clear_autocast_cache()  # which one left on would never clear
+    with torch.autocast(window.past.states.device.type, torch.bfloat16, enabled=o.bf16):
+        value = loss(window, generator)
+    _require_finite(state, "training loss", value.item(), step)
+    state.optimizer.zero_grad(set_to_none=True)
+    value.backward()
+    norm = nn.utils.clip_grad_norm_(state.model.parameters(), o.clip)
+    _require_finite(state, "gradient", norm.item(), step)  # before it reaches the weights
+    state.optimizer.step()
+    return value.item()
+
+
+def _record(state: TrainingState[TrainingHistory], train: float, validation: float) -> None:
+    _require_finite(state, "validation loss", validation, state.step)
+    state.curve.step.append(state.step)
+    state.curve.seconds.append(state.seconds)
+    state.curve.train.append(train)
+    state.curve.validation.append(validation)
+    if validation < state.best_loss:
+        state.keep(validation)
+
+
+def _require_finite(state: TrainingState[TrainingHistory], what: str, value: float, step: int) -> None:
+    if not math.isfinite(value):
+        raise state.stopped(f"the {what} became {value}", step)
+
+
+@contextmanager
+def _trained_on(device: str, model: nn.Module) -> Iterator[None]:
+    """The model on ``device``, with no autocast left on by somebody else; then on the CPU again."""
+    kind = torch.device(device).type
+    try:
+        model.to(device)
+        torch.set_autocast_enabled(kind, False)
+        yield
+    finally:
+        torch.set_autocast_enabled(kind, False)
+        model.to("cpu")
 
 
 def _digest(data: Trajectories) -> str:

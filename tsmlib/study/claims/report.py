@@ -1,50 +1,48 @@
-"""The ledger of claims as tables and a picture: verdicts, what decides them, and what the paper leaves open."""
+"""Verdicts as tables and as arrays: deciding effects, causes, and changes under other readings of the paper."""
 
-from __future__ import annotations
-
-import re
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 
-from tsmlib.study.claims.evaluate import REPLICATED, VERDICTS, Claim, Verdict, figure
+import numpy as np
+import pandas as pd
+
+from tsmlib.study.claims.claim import DEFINITIONAL, REPLICATED, VERDICTS, Claim
+from tsmlib.study.claims.evaluate import Verdict
+from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
-
-CHOICES = Path(__file__).with_name("choices.toml")
 
 
 def counts(verdicts: Sequence[Verdict]) -> str:
-    """How often each word was given."""
+    """How often each verdict was given; what holds by definition is not counted."""
     words = [verdict.word for verdict in verdicts]
-    return ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS)
+    given = ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS if word != DEFINITIONAL)
+    return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}"
 
 
 def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "") -> str:
     """The ledger as a Markdown table. The deciding check is the one that is furthest from holding.
 
-    ours: the same claims with ``claims.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
+    ours: the same claims with ``query.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
     """
-    head = "| | the paper says | verdict | with our model | measured | deciding check | n | shown in |"
-    lines = [head, "|---" * 8 + "|"]
+    lines = []
     for verdict, other in zip(verdicts, ours, strict=True):
         claim, key, checks = verdict.claim, verdict.key, len(verdict.effects[""])
-        found = "no rows yet" if key.value is None else f"{figure(key).rpartition(', n = ')[0]}"
-        decides = f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}"
-        lines.append(
-            f"| {claim.id} | {claim.statement} ({claim.place}) | **{verdict.word}** | {other.word.lower()} "
-            f"| {claim.statistic} | {decides} | {key.n} | {_links(claim, root)} |"
-        )
-    return "\n".join(lines)
+        found = "no rows yet" if key.value is None else key.text.removesuffix(f", n = {key.n}")
+        lines.append({
+            "": claim.id, "the paper says": f"{claim.statement} ({claim.place})", "verdict": f"**{verdict.word}**",
+            "with our model": other.word.lower(), "measured": claim.statistic,
+            "deciding check": f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}",
+            "n": key.n, "shown in": _links(claim, root),
+        })  # fmt: skip
+    return markdown(pd.DataFrame(lines))
 
 
 def _links(claim: Claim, root: str) -> str:
-    """Where a claim's numbers are shown: notebook, section and figure, as far as they exist."""
-    found, section = claim.notebook, claim.section.replace(" ", "-")
-    if (ROOT / "notebooks" / f"{claim.notebook}.ipynb").exists():
-        found = f"[{claim.notebook}]({root}notebooks/{claim.notebook}.ipynb{f'#{section}' * bool(section)})"
-    if claim.figure and (ROOT / "figures" / f"{claim.figure}.png").exists():
-        found += f", [{claim.figure}]({root}figures/{claim.figure}.png)"
-    return found
+    notebook, section, figure = claim.shown
+    at = f"#{section.replace(' ', '-')}" if section else ""
+    found = [f"[{notebook}]({root}notebooks/{notebook}.ipynb{at})"]
+    if figure and (ROOT / "figures" / f"{figure}.png").exists():
+        found.append(f"[{figure}]({root}figures/{figure}.png)")
+    return ", ".join(found)
 
 
 def reasons(verdicts: Sequence[Verdict]) -> str:
@@ -52,25 +50,29 @@ def reasons(verdicts: Sequence[Verdict]) -> str:
     return "\n".join(f"- **{v.claim.id}**, {v.word.lower()}. {v.why}" for v in verdicts if v.word != REPLICATED)
 
 
-def choices(verdicts: Sequence[Verdict]) -> str:
-    """What the paper leaves open, what was chosen, why, and what happens otherwise, as a Markdown table (A1 to A31).
+def readings(verdicts: Sequence[Verdict]) -> str:
+    """The claims of which a check changes sides under another reading of the paper, and those of which none does."""
+    found: dict[str, tuple[list[str], list[str]]] = {}
+    for verdict in verdicts:
+        first = [effect.right_side for effect in verdict.effects[""]]
+        for reading, effects in verdict.effects.items():
+            if reading and any(effect.value is not None for effect in effects):
+                same = [effect.right_side for effect in effects] == first
+                found.setdefault(reading, ([], []))[same].append(verdict.claim.id)
+    lines = [(reading, *map(", ".join, sides)) for reading, sides in sorted(found.items())]
+    return markdown(pd.DataFrame(lines, columns=["reading", "turns", "does not turn"]))
 
-    The last column is from rows: the claims whose checks change sides under a reading of that name, and those that
-    do not.
+
+def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, np.ndarray]]:
+    """What ``figures.claim_margins`` draws, of every claim with rows.
+
+    Id, verdict, the deciding effect in words, and how far each estimate and its interval (n, 3) lie beyond the margin,
+    the deciding one last.
     """
-    lines = ["| | the paper leaves open | chosen here | why | otherwise | verdicts |", "|---" * 6 + "|"]
-    for entry in tomllib.loads(CHOICES.read_text())["choice"]:
-        sides: dict[bool, list[str]] = {True: [], False: []}
-        for verdict in verdicts:
-            tried = [
-                [effect.right_side for effect in effects]
-                for reading, effects in verdict.effects.items()
-                if re.match(rf"{entry['id']}(?!\d)", reading) and any(effect.value is not None for effect in effects)
-            ]
-            if tried:
-                first = [effect.right_side for effect in verdict.effects[""]]
-                sides[all(found == first for found in tried)].append(verdict.claim.id)
-        said = [f"{word} {', '.join(ids)}" for word, ids in (("turns", sides[False]), ("not", sides[True])) if ids]
-        cells = [entry[field] for field in ("id", "open", "chosen", "why", "otherwise")]
-        lines.append(f"| {' | '.join(cells)} | {'; '.join(said)} |")
-    return "\n".join(lines)
+    found = []
+    for verdict in verdicts:
+        effects = sorted(verdict.effects[""], key=lambda effect: effect is verdict.key)
+        if any(effect.value is not None for effect in effects):
+            beyond = np.array([e.beyond for e in effects if e.value is not None or e is verdict.key])
+            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond))
+    return found

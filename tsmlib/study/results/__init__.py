@@ -1,1 +1,7 @@
-"""Rows of each notebook, and tables and panels made of them."""
+"""Rows of each notebook, and tables and panels made of them; a file is imported when it is first used."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, ["action_prior", "latent", "planning", "policies", "prediction", "robustness", "table"]
+)

@@ -1,29 +1,81 @@
-"""Results of 07_action_prior as rows and tables."""
+"""Results of 07_action_prior: rows from torques and trials; tables from rows.
+
+Rows of executed plans have the execution "open loop". The ``subset`` of others is "data" (held-out torques),
+"sampled" (of the prior) or "reconstructed" (the data, encoded and decoded by the prior).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from tsmlib.envs.spec import sim_of
 from tsmlib.evaluation.actions import novelty, roughness, traits
+from tsmlib.figures.method import Method
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
-from tsmlib.statistics import spearman, told_apart
+from tsmlib.statistics import interval, spearman, two_sample_auc
+from tsmlib.study import zoo
+from tsmlib.study.results import table
+from tsmlib.study.results.table import Row
+from tsmlib.study.runs import Run
 
-BARS = {"codes": ("at most", 0.65), "actions": ("at least", 0.9)}  # of the AUC, set before it was measured
+THRESHOLDS = {"latent": "at most 0.65", "direct": "at least 0.9"}  # of the AUC, set before it was measured
 SHARPER = 3.0  # times the training data's mean change: claim C52's "sharp, discontinuous"
+TORQUES = ("rms", "peak", "change", "change_ratio", "centroid", "autocorrelation", "novelty", "auc", "auc_shape")
+COSTS = ("lost", "lost_share", "further", "outside", "lost_with_distance", "lost_with_peak")
+STARTS = ("change_ratio", "centroid", "novelty", "auc", "final_distance", "exploitation_gap")
+_SUBSETS = {"data": "training data, held out", "sampled": "samples of the prior",
+            "reconstructed": "the data, reconstructed by the prior"}  # fmt: skip
+_UNITS = {"change": "full torque", "centroid": "Hz", "fast": "share", "autocorrelation": ""}
+
+Trials = Mapping[Method, Trial]
 
 
-# Rows of metrics/07_action_prior.csv ---------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Torques:
+    """Torques of a task's training and held-out episodes (N, T', du), and by ``subset`` those measured (B, T, du)."""
+
+    task: Task
+    train: Tensor
+    held_out: Tensor
+    subsets: dict[str, Tensor]
 
 
-def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: Any) -> list[dict[str, Any]]:
-    """What torques (B, T, du) are like, against held-out and training torques of the data (N, T', du).
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def task_rows(own: Torques, trials: Trials, run: Run) -> list[Row]:
+    """All rows of a task but its gradients': of the subsets, of executed plans, and of what the prior costs them."""
+    common, rest = table.of_task(own.task, run), own.held_out[len(own.subsets["data"]) :]
+    found: list[Row] = []
+    for subset, actions in own.subsets.items():
+        source = zoo.method("random") if subset == "data" else zoo.method("prior", "latent")
+        found += rows(actions, rest, own.train, **common | table.fields(source) | dict(subset=subset))
+    for method, trial in trials.items():
+        about = common | table.fields(method) | dict(execution="open loop")
+        found += rows(trial.actions, own.held_out, own.train, **about)
+        worth = {
+            "return_true": trial.executed_return,
+            "exploitation_gap": trial.gap,
+            "final_distance": trial.final_distance,
+        }
+        found += [
+            dict(about, metric=metric, value=float(each.mean()), unit="m", n=len(each))
+            for metric, each in worth.items()
+        ]
+    for model, planner in dict.fromkeys((method.model, method.planner) for method in trials):
+        found += cost_of_prior(own, trials, model, planner, seed=run.seed, scale=run.scale)[0]
+    return found
+
+
+def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: Any) -> list[Row]:
+    """Rows of action statistics of torques (B, T, du), against held-out and training torques of the data (N, T', du).
 
     The AUC takes all held-out torques, so it stays away where there are too few plans for five folds.
     """
@@ -37,38 +89,38 @@ def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: Any) -> lis
     values["novelty"] = (float(novelty(actions, train).mean()), "s.d.")
     if len(actions) >= 10 and len(held_out) >= 10:
         for name, shape in (("auc", False), ("auc_shape", True)):
-            values[name] = (told_apart(traits(actions, shape=shape), traits(held_out, shape=shape)), "")
+            values[name] = (two_sample_auc(traits(actions, shape=shape), traits(held_out, shape=shape)), "")
     return [
         dict(common, metric=metric, value=value, unit=unit, n=len(actions)) for metric, (value, unit) in values.items()
     ]
 
 
-_UNITS = {"change": "full torque", "centroid": "Hz", "fast": "share", "autocorrelation": ""}
-
-
 def cost_of_prior(
-    task: Task, over_codes: Trial, over_actions: Trial, held_out: Tensor, train: Tensor, **common: Any
-) -> tuple[list[dict[str, Any]], dict[str, Tensor]]:
-    """What searching over codes loses against the same search over torques, target by target, and where.
+    own: Torques, trials: Trials, model: str, planner: str, **common: Any
+) -> tuple[list[Row], dict[str, Tensor]]:
+    """Return lost by the latent against the direct search space, target by target, and where.
 
-    ``lost``: return over torques minus return over codes; ``further``: the same of the final distance, in metres;
-    ``peak``: largest torque of the plan over torques; ``novelty``: its distance from the data; ``distance``: metres
-    that the fingertip or object has to go. ``outside``: the share of targets whose plan over torques is further from
-    the data than 95 % of the data's own held-out episodes. Returns rows and the values per target (B,).
+    ``lost``: return of the direct plan minus that of the latent one; ``further``: the same of the final distance (m);
+    ``peak``: largest torque of the direct plan; ``novelty``: its distance from the data; ``distance``: metres that the
+    fingertip or object has to go. ``outside``: the share of targets whose direct plan is further from the data than
+    95 % of the data's own held-out episodes. Returns rows and the values per target (B,).
     """
+    task, (latent, direct) = own.task, (trials[method] for method in zoo.methods([model], planner))
     start = torch.from_numpy(task.start)[:, task.position].float()
     values = {
-        "lost": over_actions.executed_return - over_codes.executed_return,
-        "further": over_codes.final_distance - over_actions.final_distance,
-        "peak": over_actions.actions.abs().amax((1, 2)),
-        "novelty": novelty(over_actions.actions, train),
+        "lost": direct.executed_return - latent.executed_return,
+        "further": latent.final_distance - direct.final_distance,
+        "peak": direct.actions.abs().amax((1, 2)),
+        "novelty": novelty(direct.actions, own.train),
         "distance": (task.target - start).norm(dim=1),
     }
-    usual = novelty(held_out[:, : task.horizon], train).quantile(0.95)
-    common = dict(common, env=task.env, sim=sim_of(task.env), task=task.name, n=len(task))
+    usual = novelty(own.held_out[:, : task.horizon], own.train).quantile(0.95)
+    common |= table.place(task.env) | dict(
+        task=task.name, model=model, planner=planner, search_space="latent", execution="open loop", n=len(task)
+    )  # fmt: skip
     summary = {
         "lost": (float(values["lost"].mean()), "m"),
-        "lost_share": (float(values["lost"].mean() / over_actions.executed_return.mean().abs()), "share"),
+        "lost_share": (float(values["lost"].mean() / direct.executed_return.mean().abs()), "share"),
         "further": (float(values["further"].mean()), "m"),
         "outside": (float((values["novelty"] > usual).float().mean()), "share"),
         "lost_with_distance": (spearman(values["lost"], values["distance"]), ""),
@@ -77,34 +129,50 @@ def cost_of_prior(
     return [dict(common, metric=metric, value=value, unit=unit) for metric, (value, unit) in summary.items()], values
 
 
-def board(found: Sequence[Mapping[str, Any]], env: str) -> str:
-    """Rows as a Markdown table, one line per method, mean over seeds, the data first."""
-    columns = ("rms", "peak", "change", "change_ratio", "centroid", "autocorrelation", "novelty", "auc", "auc_shape")
-    lines = ["| torques | n | " + " | ".join(columns) + " |", "|---" * (len(columns) + 2) + "|"]
-    methods: dict[str, dict[str, list[float]]] = {}
-    counts: dict[str, int] = {}
-    for row in found:
-        if row["env"] == env and row["metric"] in columns:
-            label = title(row)
-            methods.setdefault(label, {}).setdefault(row["metric"], []).append(row["value"])
-            counts[label] = row["n"]
-    for label, values in methods.items():
-        cells = [f"{np.mean(values[column]):.3g}" if column in values else "" for column in columns]
-        lines.append(f"| {label} | {counts[label]} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+# Tables --------------------------------------------------------------------------------------------------------------
 
 
-def same_method(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two rows are about one method under one condition, whatever their metric and seed."""
-    fields = ("env", "model", "planner", "prior", "condition")
-    return all(row[field] == other[field] for field in fields)
+def _means(found: pd.DataFrame, index: Sequence[str], metrics: Sequence[str], form: str) -> pd.DataFrame:
+    own = table.with_method(table.select(found, metric=metrics))
+    if "torques" in index:
+        words = [_SUBSETS.get(subset, "") for subset in own["subset"]]
+        own["torques"] = [word or made.label for word, made in zip(words, own["method"], strict=True)]
+    return table.printed(table.means(own, list(index)), {metric: (metric, form) for metric in metrics})
 
 
-def title(row: Mapping[str, Any]) -> str:
-    """Whose torques a row is about, in words."""
-    known = {
-        "data": "training data, held out",
-        "samples": "samples of the prior",
-        "again": "the data, told again by the prior",
-    }
-    return known.get(row["condition"]) or f"{row['model']}, {row['planner']} over {row['prior']}"
+def torques_table(found: pd.DataFrame, env: str) -> str:
+    """Action statistics in Markdown: one line per method, mean over seeds, the data first."""
+    return table.markdown(_means(table.select(found, env=env), ("torques", "n"), TORQUES, "{:.3g}"))
+
+
+def thresholds_table(found: pd.DataFrame) -> str:
+    """THRESHOLDS beside what plans came to, in Markdown: means over seeds."""
+    plans = table.select(found, execution="open loop")
+    wide = _means(plans, ("task", "method", "search_space"), ("auc", "change_ratio"), "{:.3f}")
+    return table.markdown(wide.assign(threshold=wide["search_space"].map(THRESHOLDS)).drop(columns="search_space"))
+
+
+def costs_table(found: pd.DataFrame) -> str:
+    """Rows of ``cost_of_prior`` in Markdown: means over seeds."""
+    return table.markdown(_means(found, ("task", "model", "planner", "n"), COSTS, "{:.3f}"))
+
+
+def starts_table(found: pd.DataFrame) -> str:
+    """Plans from smooth and from noisy first torques (07_starts.csv), in Markdown."""
+    return table.markdown(_means(found, ("torque_weight", "search_space", "start"), STARTS, "{:.3f}"))
+
+
+def gradients_table(found: pd.DataFrame) -> str:
+    """Signal-to-noise ratio of gradients in Markdown: the geometric mean over starts, and by how much that of the
+    latent search space is larger, with the 95 % t interval over starts (means over the seeds there are)."""
+    own = table.select(found, metric="gradient_snr")
+    own = own.assign(value=np.log(own["value"]))
+    lines = []
+    for (env, model), part in table.groups(own, ["env", "model"]):
+        wide = table.means(part, "target", "search_space")
+        mean, half = interval(wide["latent"] - wide["direct"])
+        low, ratio, high = np.exp([mean - half, mean, mean + half])
+        lines.append({"env": env, "method": zoo.method(model), "n": len(wide)}
+                     | {space: f"{np.exp(wide[space].mean()):.3g}" for space in ("latent", "direct")}
+                     | {"latent / direct": f"{ratio:.3g} [{low:.3g}, {high:.3g}]"})  # fmt: skip
+    return table.markdown(pd.DataFrame(lines)) if lines else ""

@@ -1,71 +1,77 @@
-"""The scoreboard of 03_predict: what ``evaluate.score`` found as rows of a table, and rows as curves, tables and pairs.
+"""Results of 03_predict: rows from scores; curves, pairs and tables from rows.
 
-Conditions, in the table's column of that name:
-
-    clean              open loop from the first H observed steps to the end of the episode, all test episodes
-    contact            the same, from the first touch of arm and obstacle or object on
-    segments           H steps from the true past, three to an episode (what the model defines)
-    segments contact   the same, segments with a touch in them
-
-A row with an empty horizon is the mean over all predicted steps, the paper's "per timestep".
+``execution`` is "open loop" (from the first ten observed steps to the end of the episode) or "segments" (ten steps from
+the true past, three to an episode); ``subset`` is empty or "contact" (steps from the first touch of arm and obstacle or
+object on; segments with a touch in them). Empty ``steps_ahead``: mean over all predicted steps, the paper's "per
+timestep".
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
-from tsmlib.envs.spec import has_block, imperfections, sim_of
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.contacts import after_first, contact_steps
-from tsmlib.evaluation.prediction import LEVELS, Scores, cut
-from tsmlib.statistics import interval
+from tsmlib.evaluation.prediction import Scores, cut
+from tsmlib.evaluation.scoring import LEVELS
+from tsmlib.figures.method import Method
+from tsmlib.study.results import table
+from tsmlib.study.results.table import Row
 from tsmlib.trajectory import Trajectories
 
 SEGMENTS = range(10, 100, 30)  # steps at which the segments that are scored from the true past begin
 HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
-Rows = Sequence[Mapping[str, Any]]
 
 
-def rows(
-    env: str, model: str, open_loop: Scores, segments: Scores, test: Trajectories, **common: Any
-) -> list[dict[str, Any]]:
-    """One model's rows of metrics/03_predict.csv. common: seed and scale."""
-    common = dict(env=env, sim=sim_of(env), model=model, planner="none", **common)
-    subsets: dict[str, tuple[Scores, Tensor | None]] = {"clean": (open_loop, None), "segments": (segments, None)}
-    if has_block(test.env):
+def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajectories, **common: Any) -> list[Row]:
+    """One model's rows. test: the episodes that were scored, or more; common: seed and scale."""
+    test = test.take(slice(len(open_loop.outside)))
+    common = table.place(env) | dict(model=model, planner="none", **common)
+    whole = torch.ones(open_loop.pit.shape[:2], dtype=torch.bool)
+    parts = [("open loop", "", open_loop, whole), ("segments", "", segments, torch.ones_like(segments.pit[..., 0] > 0))]
+    if EnvSpec.parse(test.env).has_block:
         touched = touches(test, segments, SEGMENTS).any(1, keepdim=True)
-        subsets["contact"] = (open_loop, after_first(touches(test, open_loop)))
-        subsets["segments contact"] = (segments, touched.expand(-1, segments.pit.shape[1]))
+        parts.append(("open loop", "contact", open_loop, after_first(touches(test, open_loop))))
+        parts.append(("segments", "contact", segments, touched.expand(-1, segments.pit.shape[1])))
     found = []
-    for condition, (scores, where) in subsets.items():
-        n = torch.full((scores.pit.shape[1],), len(scores.outside)) if where is None else where.sum(0)  # at each step
-        if not n.any():
-            continue
-        here = dict(common, condition=condition, n=len(scores.outside) if where is None else int(where.any(1).sum()))
-        curves = scores.against_horizon(where)
-        for metric, value in means(scores, where).items():
-            found.append(dict(here, metric=metric, value=value))
-            steps = [h for h in HORIZONS if h <= len(n) and n[h - 1]] if scores is open_loop else []
-            found += [
-                dict(here, metric=metric, horizon=h, value=float(curves[metric][h - 1]), n=int(n[h - 1])) for h in steps
-            ]
-        if scores is open_loop:
-            observed = scores.calibration(where)
-            found += [
-                dict(here, metric=f"calibration{round(100 * float(level))}", value=float(share), unit="share")
-                for level, share in zip(LEVELS, observed, strict=True)
-            ]
-    found.append(
-        dict(common, condition="clean", n=len(open_loop.outside), metric="diverged", unit="share",
-             value=float(open_loop.outside.mean()))
-    )  # fmt: skip
-    return found
+    for execution, subset, scores, where in parts:
+        if where.any():
+            chosen = where if subset else None
+            here = dict(common, execution=execution, subset=subset, n=int(where.any(1).sum()))
+            found += [dict(here, metric=metric, value=value) for metric, value in means(scores, chosen).items()]
+            if scores is open_loop:
+                found += _by_step(scores, chosen, where.sum(0), here) + _calibrated(scores, chosen, here)
+    diverged = dict(metric="diverged", unit="share", value=float(open_loop.outside.mean()), n=len(open_loop.outside))
+    return [*found, dict(common, execution="open loop", **diverged)]
+
+
+def _by_step(scores: Scores, where: Tensor | None, n: Tensor, here: Row) -> list[Row]:
+    """Scores at the steps of HORIZONS that ``n`` (T,) rollouts, at least one, have."""
+    steps = [h for h in HORIZONS if h <= len(n) and n[h - 1]]
+    return [
+        dict(here, metric=metric, steps_ahead=h, value=float(curve[h - 1]), n=int(n[h - 1]))
+        for metric, curve in scores.against_horizon(where).items()
+        for h in steps
+    ]
+
+
+def _calibrated(scores: Scores, where: Tensor | None, here: Row) -> list[Row]:
+    return [
+        dict(here, metric=_coverage(level), value=float(share), unit="share")
+        for level, share in zip(LEVELS, scores.calibration(where), strict=True)
+    ]
+
+
+def _coverage(level: Any) -> str:
+    return f"calibration{round(100 * float(level))}"
 
 
 def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:
@@ -79,76 +85,83 @@ def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:
 
 def touches(test: Trajectories, scores: Scores, starts: Sequence[int] = (10,)) -> Tensor:
     """(N, T) bool in the order of ``scores``: the arm touches the obstacle or object. ValueError for noisy states."""
-    if imperfections(test.env)[1]:
+    if EnvSpec.parse(test.env).noise:
         raise ValueError(f"noisy states of {test.env} do not tell what touches; give the same episodes without noise")
     return cut(contact_steps(test.states, test.env), starts, scores.pit.shape[1])
+
+
+def extremes(test: Trajectories, scores: Scores) -> tuple[np.ndarray, np.ndarray | None]:
+    """Best, median and worst episode by energy score, among those with a touch if these are three or more, and the step
+    of their first touch: negative without one, None without a block."""
+    energy = scores.values["energy_score"].mean(1).numpy()
+    if not EnvSpec.parse(test.env).has_block:
+        return np.argsort(energy)[[0, len(energy) // 2, -1]], None
+    touching = touches(test, scores).numpy()
+    first = np.where(touching.any(1), touching.argmax(1), -1)
+    among = np.flatnonzero(first >= 0) if (first >= 0).sum() >= 3 else np.arange(len(first))
+    order = among[np.argsort(energy[among])]
+    picked = order[[0, len(order) // 2, -1]]
+    return picked, first[picked]
 
 
 # Reading rows --------------------------------------------------------------------------------------------------------
 
 
-def values(found: Rows, metric: str, *, env: str, condition: str = "clean", horizon: Any = "") -> dict[str, np.ndarray]:
-    """Model -> one value per seed, in the order of the seeds."""
-    by_model = _by_seed(found, metric, env=env, condition=condition, horizon=horizon)
-    return {model: np.array([seeds[k] for k in sorted(seeds)]) for model, seeds in by_model.items()}
+def select(found: pd.DataFrame, metric: str | Sequence[str], *, env: str, **where: Any) -> pd.DataFrame:
+    """Rows of an environment, imperfect or not: open loop, of everything, mean over steps, unless ``where`` says
+    otherwise of execution, subset or steps_ahead."""
+    spec = EnvSpec.parse(env)
+    arm = {"env": spec.arm.id, "noise": spec.noise or None, "delay": spec.delay or None}
+    asked = arm | {"execution": "open loop", "subset": "", "steps_ahead": None} | where
+    return table.select(found, metric=metric, **asked)
 
 
-def paired(found: Rows, subject: str, metric: str, **where: Any) -> dict[str, np.ndarray]:
-    """Model -> ``subject`` minus that model, one difference per seed that both were trained with."""
-    chosen = _by_seed(found, metric, **where)
-    first = chosen.pop(subject, {})
-    pairs = {model: sorted(set(first) & set(seeds)) for model, seeds in chosen.items()}
-    return {model: np.array([first[k] - chosen[model][k] for k in seeds]) for model, seeds in pairs.items() if seeds}
+def values(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> dict[str, np.ndarray]:
+    """Model -> one value per seed, in the order of the seeds; of the rows that ``select`` gives."""
+    return table.values(select(found, metric, env=env, **where))
 
 
-def curves(found: Rows, metric: str, *, env: str, condition: str = "clean") -> dict[str, np.ndarray]:
-    """Model -> (seeds, 90): the metric at every step ahead, on straight lines between those of HORIZONS."""
-    given = {h: values(found, metric, env=env, condition=condition, horizon=h) for h in HORIZONS}
-    given = {h: by_model for h, by_model in given.items() if by_model}
-    steps = np.arange(1, max(given, default=0) + 1)
-    return {
-        model: np.stack(
-            [np.interp(steps, list(given), seeds) for seeds in np.stack([v[model] for v in given.values()]).T]
-        )
-        for model in next(iter(given.values()), {})
-    }
+def ranking(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> list[str]:
+    """Models from the best to the worst mean over seeds."""
+    means = {model: seeds.mean() for model, seeds in values(found, metric, env=env, **where).items()}
+    return sorted(means, key=lambda model: means[model], reverse=metric not in LOWER_IS_BETTER)
 
 
-def calibration(found: Rows, *, env: str, condition: str = "clean") -> dict[str, np.ndarray]:
-    """Model -> (19,): observed coverage at the nominal LEVELS, mean over seeds."""
-    shares = [values(found, f"calibration{round(100 * float(v))}", env=env, condition=condition) for v in LEVELS]
-    return {model: np.array([share[model].mean() for share in shares]) for model in shares[0]}
+def paired(found: pd.DataFrame, subject: str, metric: str, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+    """Method -> ``subject`` minus that model, one difference per seed that both were trained with."""
+    return table.methods(table.pairs(select(found, metric, env=env, **where), subject))
 
 
-def board(
-    found: Rows, metrics: Sequence[str], *, env: str, condition: str = "clean", horizons: Sequence[Any] = ("",)
+def curves(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+    """Method -> (seeds, 90): the metric at every step ahead, on straight lines between those of HORIZONS."""
+    lines: dict[str, np.ndarray] = {}
+    for model, own in table.groups(select(found, metric, env=env, steps_ahead=HORIZONS, **where), "model"):
+        wide = own.pivot(index="seed", columns="steps_ahead", values="value").dropna(axis=1, how="all")
+        known = wide.columns.to_numpy(dtype=float)
+        lines[model] = np.stack([np.interp(np.arange(1, known[-1] + 1), known, seed) for seed in wide.to_numpy()])
+    return table.methods(lines)
+
+
+def calibration(found: pd.DataFrame, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+    """Method -> (19,): observed coverage at the nominal LEVELS, mean over seeds."""
+    metrics = [_coverage(level) for level in LEVELS]
+    wide = table.means(select(found, metrics, env=env, **where), "model").reindex(columns=metrics)
+    return table.methods(table.arrays(wide.T))
+
+
+def scores_table(
+    found: pd.DataFrame, metrics: Sequence[str], *, env: str, steps_ahead: Sequence[int | None] = (None,), **where: Any
 ) -> str:
     """A Markdown table: one line per model, mean over seeds ± half its 95 % interval; fewer seeds are said."""
-    columns = [(metric, h) for metric in metrics for h in horizons]
-    cells = {c: values(found, c[0], env=env, condition=condition, horizon=c[1]) for c in columns}
-    heads = [metric + (f" at {h}" if h != "" else "") for metric, h in columns]
-    lines = ["| model | " + " | ".join(heads) + " |", "|---" * (len(columns) + 1) + "|"]
-    most = max((len(seeds) for seeds in cells[columns[0]].values()), default=0)
-    for model, seeds in cells[columns[0]].items():
-        fewer = f" (seeds: {len(seeds)})" if len(seeds) < most else ""
-        lines.append(
-            f"| {model}{fewer} | " + " | ".join(_spell(by_model.get(model)) for by_model in cells.values()) + " |"
-        )
-    return "\n".join(lines)
-
-
-def _spell(seeds: np.ndarray | None) -> str:
-    if seeds is None:
+    own = select(found, metrics, env=env, steps_ahead=list(steps_ahead), **where)
+    if own.empty:
         return ""
-    mean, half = interval(seeds)
-    return f"{mean:.3g}" + (f" ± {half:.2g}" if len(seeds) > 1 else "")
-
-
-def _by_seed(
-    found: Rows, metric: str, *, env: str, condition: str = "clean", horizon: Any = ""
-) -> dict[str, dict[int, float]]:
-    by_model: dict[str, dict[int, float]] = {}
-    for row in found:
-        if (row["metric"], row["env"], row["condition"], row.get("horizon", "")) == (metric, env, condition, horizon):
-            by_model.setdefault(row["model"], {})[row["seed"]] = row["value"]
-    return by_model
+    own = own.assign(
+        column=own["metric"] + own["steps_ahead"].map(lambda h: "" if pd.isna(h) else f" at {h}").astype(str)
+    )
+    titles = [metric + (f" at {h}" if h else "") for metric in metrics for h in steps_ahead]
+    wide = own.pivot_table(index="model", columns="column", values="value", aggfunc=table.spell, sort=False)
+    seeds = own[own["column"] == titles[0]].groupby("model")["seed"].nunique()
+    wide = wide.reindex(columns=titles).loc[[model for model in wide.index if model in seeds]]
+    wide.index = [f"{model} (seeds: {seeds[model]})" if seeds[model] < seeds.max() else model for model in wide.index]
+    return table.markdown(wide.rename_axis("model").reset_index())

@@ -1,0 +1,123 @@
+"""Reliability checks in their quick forms; ``make reliability`` runs them at full length (docs/reliability.md)."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from reliability import files, pipelines, simulators, training
+from reliability.__main__ import CHECKS, said
+from reliability.world import Outcome
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
+QUICK = {check.__name__: quick for part in CHECKS.values() for check, quick, _ in part}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """As in the children that a check forks; a training that goes on with other threads would say so."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def quick(check: Callable[[int], Outcome]) -> None:
+    """A check with the few trials that tests have time for."""
+    check(QUICK[check.__name__]).check()
+
+
+def test_a_training_killed_at_any_moment_ends_with_the_bits_of_one_left_alone() -> None:
+    quick(training.killed_at_random_moments)
+
+
+def test_no_call_that_fails_or_kills_within_a_save_costs_more_than_that_save() -> None:
+    quick(training.at_every_call)
+
+
+def test_a_spoilt_generation_is_named_and_the_one_before_it_used() -> None:
+    quick(training.newest_generation_spoilt)
+
+
+def test_a_value_that_is_not_finite_is_refused_by_episode_step_and_field() -> None:
+    quick(training.values_that_are_not_finite)
+
+
+def test_a_loss_or_gradient_that_is_not_finite_never_reaches_the_weights() -> None:
+    quick(training.losses_that_are_not_finite)
+
+
+def test_of_three_trainings_in_one_folder_one_writes_and_the_others_name_it() -> None:
+    quick(training.two_writers)
+
+
+def test_a_full_disk_leaves_the_old_file_and_says_how_much_did_not_fit() -> None:
+    quick(training.full_disk)
+
+
+def test_a_cell_interrupted_as_it_trains_goes_on_where_it_was() -> None:
+    quick(training.interrupted_in_a_cell)
+
+
+def test_a_long_training_needs_no_more_memory_than_a_short_one() -> None:
+    quick(training.memory)
+
+
+def test_no_damage_to_any_kind_of_file_goes_unnoticed() -> None:
+    quick(files.damage)
+
+
+def test_a_hostile_file_is_neither_executed_nor_unpacked() -> None:
+    quick(files.malice)
+
+
+def test_a_hostile_minari_data_set_is_refused_or_read_harmlessly() -> None:
+    pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    quick(files.hostile_minari)
+
+
+def test_data_and_models_of_another_world_are_refused_naming_both() -> None:
+    quick(files.mismatched)
+
+
+def test_a_hostile_parameter_is_refused_before_any_file_exists() -> None:
+    quick(files.hostile_parameters)
+
+
+def test_whatever_a_forged_file_says_only_our_own_errors_come_of_it() -> None:
+    quick(files.fuzz)
+
+
+def test_a_blow_up_in_mujoco_raises_where_it_happens() -> None:
+    quick(simulators.faults_in_mujoco)
+
+
+def test_data_hold_no_warning_and_no_jump() -> None:
+    quick(simulators.large_sets)
+
+
+def test_a_blow_up_in_pymunk_raises_where_it_happens() -> None:
+    quick(simulators.faults_in_pymunk)
+
+
+def test_an_episode_restored_or_replayed_goes_on_with_the_same_bits() -> None:
+    quick(simulators.restores)
+
+
+def test_another_place_time_zone_locale_or_hash_seed_changes_no_bit() -> None:
+    quick(pipelines.elsewhere)
+
+
+def test_a_training_that_goes_on_with_other_threads_says_so_and_notes_it() -> None:
+    quick(pipelines.another_thread_count)
+
+
+def test_every_check_says_which_number_it_answers() -> None:
+    for check in (check for part in CHECKS.values() for check, _, _ in part):
+        number, what = said(check)
+        assert re.fullmatch(r"R\d+(, R\d+)*", number), check
+        assert what, check

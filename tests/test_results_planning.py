@@ -1,0 +1,255 @@
+"""Rows say what trials measured, tables say what rows say, and a threshold is reached or it is not."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from tsmlib import study
+from tsmlib.envs import imperfect
+from tsmlib.envs.spec import DELAY, NOISE
+from tsmlib.planning import tasks
+from tsmlib.planning.base import Plan
+from tsmlib.planning.execution import Trial, execute
+from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.storage import tables
+from tsmlib.study import media, runs, zoo
+from tsmlib.study.results import planning as planning_results
+from tsmlib.study.results import table
+
+REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+TSM, LSTM = (zoo.method(model, "latent", "cem") for model in ("tsm", "lstm"))
+ZERO, RANDOM = (zoo.method("none", planner=word) for word in ("zero", "random"))
+RUN = runs.resolve("05_control", scale="smoke", seed=2, run_dir="/nowhere")
+
+
+def some_task(env: str = PUSH, n: int = 10) -> Task:
+    return dataclasses.replace(study.draw_task(env, seed=3, n=n), horizon=20)
+
+
+def dreamt(task: Task, torques: Any, promised: float = 0.0) -> Trial:
+    """A trial of torques whose model saw the truth coming, and promised so much more."""
+    seen = execute(task, torques)
+    states = seen.states[None, :, 1:].clone()
+    plan = Plan(torques, torques, states, seen.executed_return + promised, seen.executed_return[None], seconds=1.0)
+    return dataclasses.replace(seen, plan=plan)
+
+
+def value(rows: Any, metric: str, **wanted: Any) -> float:
+    (found,) = (row["value"] for row in rows if row["metric"] == metric and all(row[k] == v for k, v in wanted.items()))
+    return float(found)
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_table_holds_what_the_trials_measured() -> None:
+    task = some_task(REACHER, 4)
+    trial = execute(task, zero_torques(task))
+    summary, per_target = planning_results.rows([task], {REACHER: {ZERO: trial}}, RUN)
+    assert value(summary, "return_true") == pytest.approx(float(trial.executed_return.mean()))
+    near = trial.final_distance <= tasks.TOLERANCE
+    assert value(summary, "success") == pytest.approx(float(near.float().mean()))
+    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
+    np.testing.assert_allclose(
+        planning_results.by_target(tables.frame(per_target), "return_true")[ZERO], trial.executed_return, rtol=1e-6
+    )
+
+
+def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> None:
+    task = some_task(REACHER, 4)
+    nothing, random = (execute(task, torques(task)) for torques in (zero_torques, random_torques))
+    oracle = dataclasses.replace(nothing, executed_return=nothing.executed_return / 2)
+    trials = {REACHER: {ZERO: nothing, planning_results.ORACLE: oracle, RANDOM: random}}
+    rows, _ = planning_results.rows([task], trials, RUN)
+    assert value(rows, "cost_over_oracle", model="oracle") == pytest.approx(1)
+    assert value(rows, "gain_share", model="oracle") == pytest.approx(1)
+    assert value(rows, "cost_over_oracle", planner="zero") == pytest.approx(2)
+    assert value(rows, "gain_share", planner="zero") == pytest.approx(0)
+
+
+def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
+    task = some_task()
+    torques = random_torques(task)
+    sound, careless = dreamt(task, torques), dreamt(task, torques)
+    assert careless.plan is not None
+    jump = torch.zeros(10)
+    jump[3] = 0.05
+    careless.plan.states[0, :, 10:, 6] += jump[:, None]  # one object of ten, for half the time
+    careless.plan.predicted_return[3] += 1.0
+    rows, per_target = planning_results.rows([task], {PUSH: {TSM: sound, LSTM: careless}}, RUN)
+    assert value(rows, "violations", model="tsm") == 0
+    assert value(rows, "violations", model="lstm") == pytest.approx(0.05, abs=0.006)
+    assert value(rows, "violations_worst", model="lstm") == pytest.approx(0.5, abs=0.06)  # the worst tenth is that one
+    assert planning_results.by_target(tables.frame(per_target), "violations")[LSTM].argmax() == 3
+    closed, _ = planning_results.rows([task], {PUSH: {TSM: sound}}, RUN, execution=planning_results.CLOSED)
+    assert not any(row["metric"].startswith("violations") for row in closed)  # each plan dreams from another start
+
+
+def test_rough_torques_are_told_from_smooth_ones() -> None:
+    task = some_task(REACHER)
+    rough = 0.1 * torch.randn(10, 20, 2, generator=torch.Generator().manual_seed(0))
+    trials = {
+        REACHER: {RANDOM: execute(task, random_torques(task)), zoo.method("tsm", "direct", "cem"): dreamt(task, rough)}
+    }
+    rows, _ = planning_results.rows([task], trials, RUN)
+    for metric in ("torque_change", "torque_fast", "torque_novelty"):
+        assert value(rows, metric, model="tsm") > 1.5 * value(rows, metric, model="none"), metric
+
+
+def test_plans_along_the_way_are_told_by_their_iteration() -> None:
+    task = some_task(REACHER)
+    rows = []
+    for iteration, promised in ((0, 0.0), (5, 0.5), (20, 2.0)):
+        trials = {REACHER: {TSM: dreamt(task, zero_torques(task), promised)}}
+        rows += planning_results.rows([task], trials, RUN, iteration=iteration)[0]
+    (curve,) = planning_results.along_the_way(tables.frame(rows), REACHER).values()
+    np.testing.assert_array_equal(curve["iterations"], [0, 5, 20])
+    np.testing.assert_allclose(curve["predicted"] - curve["true"], [0.0, 0.5, 2.0], atol=1e-5)
+    assert planning_results.along_the_way(tables.frame(rows), PUSH) == {}
+
+
+def test_how_soon_a_plan_was_nearly_done_is_counted_target_by_target() -> None:
+    task = some_task(n=3)
+    plan = dreamt(task, zero_torques(task)).plan
+    assert plan is not None
+    curve = torch.arange(200.0)[:, None] * torch.tensor([0.0, 1.0, 1.0])
+    curve[60:, 2] = 199
+    rows = planning_results.convergence(
+        task, dataclasses.replace(plan, curve=curve), RUN, zoo.method("tsm", "latent", "adam")
+    )
+    assert [(row["target"], row["value"]) for row in rows] == [(0, 0), (1, 190), (2, 60)]
+    assert {(row["execution"], row["horizon"], row["metric"]) for row in rows} == {
+        ("open loop", 20, "iterations_to_95")
+    }
+    assert cells(planning_results.convergence_table(tables.frame(rows)))[1][2:] == ["3", "60", "66.7%", "66.7%"]
+
+
+def test_seeds_are_averaged_target_by_target() -> None:
+    given = dict(model="tsm", search_space="latent", planner="cem", metric="return_true")
+    rows = [dict(given, target=i, seed=seed, value=i + seed) for seed in (0, 2) for i in range(3)]
+    np.testing.assert_array_equal(planning_results.by_target(tables.frame(rows), "return_true")[TSM], [1.0, 2.0, 3.0])
+
+
+# Tables --------------------------------------------------------------------------------------------------------------
+
+
+def cells(markdown: str) -> list[list[str]]:
+    """Head and lines."""
+    head, _, *lines = markdown.splitlines()
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in (head, *lines)]
+
+
+def made_up(**changed: float) -> pd.DataFrame:
+    """Rows of a study in which every threshold is reached, but for what is ``changed``."""
+    given = {
+        "near": 1.05, "relative": 0.02, "far": 1.1, "size": 0.1, "rival_size": 0.3, "executed": -7.0, "rival": -7.5,
+        "success": 0.5, "oracle_success": 0.4, "violations": 0.01,
+    } | changed  # fmt: skip
+    ours, oracle, rival = ("tsm", "latent"), ("oracle", "latent"), ("lstm", "direct")
+    numbers = [
+        (REACHER, *ours, planning_results.OPEN, "cost_over_oracle", given["near"]),
+        (REACHER, *ours, planning_results.OPEN, "relative_gap_median", given["relative"]),
+        (PUSH, *ours, planning_results.OPEN, "cost_over_oracle", given["far"]),
+        (PUSH, *ours, planning_results.OPEN, "gap_absolute", given["size"]),
+        (PUSH, *ours, planning_results.OPEN, "exploitation_gap", given["size"]),
+        (PUSH, *ours, planning_results.OPEN, "return_true", given["executed"]),
+        (PUSH, *ours, planning_results.OPEN, "violations", given["violations"]),
+        (PUSH, *rival, planning_results.OPEN, "gap_absolute", given["rival_size"]),
+        (PUSH, *rival, planning_results.OPEN, "exploitation_gap", given["rival_size"]),
+        (PUSH, *rival, planning_results.OPEN, "return_true", given["rival"]),
+        (PUSH, *ours, planning_results.CLOSED, "success", given["success"]),
+        (PUSH, *oracle, planning_results.CLOSED, "success", given["oracle_success"]),
+    ]
+    columns = ("env", "model", "search_space", "execution", "metric", "value")
+    return tables.frame(dict(zip(columns, row, strict=True), planner="cem", n=100) for row in numbers)
+
+
+def test_every_threshold_can_be_reached_and_missed() -> None:
+    found = planning_results.thresholds(made_up(), "tsm")
+    assert found["reached"].all()
+    for changed in (
+        {"near": 1.2}, {"relative": 0.06}, {"far": 1.16}, {"size": 0.2}, {"rival": -6.9}, {"success": 0.3},
+        {"violations": 0.06},
+    ):  # fmt: skip
+        missed = planning_results.thresholds(made_up(**changed), "tsm")
+        assert (~missed["reached"]).sum() == 1, changed
+        assert [line[-1] for line in cells(table.markdown(missed))].count("no") == 1
+    most = planning_results.thresholds(made_up(success=0.8, oracle_success=0.9), "tsm").set_index("what")
+    assert most["reached"]["push, closed loop: within 0.03 m, the oracle's or 80 %"]
+
+
+def test_tables_keep_models_planners_and_loops_apart() -> None:
+    rows = made_up()
+    other = rows[rows["execution"] == planning_results.OPEN].assign(planner="mppi", value=-1.0)
+    along = rows[rows["execution"] == planning_results.OPEN].assign(iteration=3, value=-2.0)
+    rows = tables.frame(pd.concat([rows, other, along]))
+    assert "-1.00" not in planning_results.plans_table(rows)
+    assert "-2.00" not in planning_results.plans_table(rows)
+    assert "| TSM, latent, CEM " in planning_results.plans_table(rows)
+    head, ours, _ = cells(planning_results.planners_table(rows[rows["env"] == PUSH]))
+    assert head == ["environment", "method", "CEM", "MPPI"]
+    assert ours[1:] == ["TSM, latent", "-7.00 (+0.10)", "-1.00 (-1.00)"]
+    (line,) = (line for line in planning_results.loops_table(rows).splitlines() if "| TSM, latent" in line)
+    assert "50.0%" in line
+    assert "| 1.0%" in planning_results.violations_table(rows)
+
+
+def test_what_the_prior_changes_is_paired_by_target() -> None:
+    hard = np.random.default_rng(0).normal(size=50)  # targets differ much, the two methods little
+    given = dict(env=PUSH, model="tsm", planner="cem", execution=planning_results.OPEN)
+    rows = [
+        dict(given, search_space=space, metric=metric, target=i, value=value)
+        for space, more in (("latent", 0.1), ("direct", 0.0))
+        for metric, extra in (("return_true", 0.0), ("return_predicted", 2 * more))
+        for i, value in enumerate(hard + more + extra)
+    ]
+    _, line = cells(planning_results.spaces_table(tables.frame(rows)))
+    assert line == [f"`{PUSH}`", "TSM, CEM", "50", "+0.100 ± 0.000", "+0.200 ± 0.000"]
+
+
+def test_the_shipped_rows_make_tables() -> None:
+    rows = study.table(dataclasses.replace(RUN, scale="laptop"), "05_control.csv")
+    if rows.empty:
+        pytest.skip("nothing is published")
+    for text in (
+        planning_results.plans_table,
+        planning_results.planners_table,
+        planning_results.violations_table,
+        planning_results.loops_table,
+    ):
+        assert len(text(rows).splitlines()) > 2
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_film_of_actions_that_nobody_planned_is_refused() -> None:
+    task = some_task(REACHER, 2)
+    with pytest.raises(ValueError, match="not planned"):
+        media.strip(task, execute(task, zero_torques(task)), 0)
+
+
+def test_a_film_of_an_arm_behind_noisy_sensors_shows_what_they_say_beside_what_it_did() -> None:
+    task = dataclasses.replace(some_task("tsm/PymunkReacher-v0", 2), horizon=3)
+    noisy = dataclasses.replace(task, env=imperfect(task.env, noise=NOISE))
+    trial = execute(noisy, torch.full((2, 3, 2), 0.3))
+    film = media.film(noisy, trial, 1)
+    seen, done = np.split(film, 2, axis=2)
+    assert len(film) == 4  # the start and three steps
+    assert (seen[:, 40:] != done[:, 40:]).any((1, 2, 3)).all()  # below the words, in every frame
+    perfect = dataclasses.replace(trial, observed=trial.states)
+    seen, again = np.split(media.film(noisy, perfect, 1), 2, axis=2)
+    np.testing.assert_array_equal(seen[:, 40:], again[:, 40:])
+    np.testing.assert_array_equal(again, done)
+
+
+def test_a_film_of_late_actions_that_nobody_planned_is_refused() -> None:
+    task = dataclasses.replace(some_task(REACHER, 2), env=imperfect(REACHER, delay=DELAY))
+    with pytest.raises(ValueError, match="not planned"):
+        media.film(task, execute(task, zero_torques(task)), 0)

@@ -1,0 +1,57 @@
+"""Figure of the claim ledger: every effect against its margin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from tsmlib.figures.style import WIDTH, legend, styled
+
+VERDICTS = {  # verdict -> colour
+    "REPLICATED": "#009E73", "READING-DEPENDENT": "#E69F00", "INCONCLUSIVE": "#7A7A7A", "NOT REPLICATED": "#D55E00",
+    "NOT TESTABLE": "#B0B0B0", "DEFINITIONAL": "#56B4E9",
+}  # fmt: skip
+
+
+@styled
+def claim_margins(claims: Sequence[tuple[str, str, str, np.ndarray]]) -> Figure:
+    """Every effect against its margin, a row per claim: the margin is the line, the claimed side tinted.
+
+    claims: id, verdict, the deciding effect in words, and how far estimate and ends of the interval of each effect
+    (n, 3) lie beyond the margin, the deciding one last; ends that are NaN are no interval. Each effect has a scale of
+    its own, to the furthest end: the further out the estimate, the surer. Thick is the one that decides; an open mark
+    has no interval. ValueError without claims.
+    """
+    if not claims:
+        raise ValueError("no claim has rows: nothing to draw")
+    figure, ax = plt.subplots(figsize=(WIDTH, 0.17 * len(claims) + 0.75))
+    ax.axvspan(0, 1.05, color="#EEF6F2", lw=0, zorder=0)
+    ax.axvline(0, color="#555555", lw=0.8, zorder=1)
+    for y, (_, verdict, text, beyond) in enumerate(claims):
+        scaled = beyond / np.maximum(np.fmax.reduce(np.abs(beyond), axis=1, keepdims=True), 1e-300)
+        offsets = [*np.linspace(-0.25, 0.25, len(beyond) - 1), 0.0]
+        for i, (value, low, high) in enumerate(scaled):
+            main, at = i == len(beyond) - 1, y + offsets[i]
+            colour, alpha, above = VERDICTS[verdict], 1 if main else 0.55, 4 if main else 3
+            ax.plot([low, high], [at, at], color=colour, alpha=alpha, zorder=above, lw=1.3 if main else 0.5)
+            ax.plot(value, at, "o", color=colour, alpha=alpha, zorder=above, ms=3.4 if main else 1.8, mew=0.7,
+                    mfc="white" if np.isnan(low) else colour)  # fmt: skip
+        ax.annotate(text, (1, y), (4, 0), ("axes fraction", "data"), "offset points", va="center", fontsize=5.5,
+                    color="#444444")  # fmt: skip
+    ax.set_yticks(range(len(claims)), [claim for claim, *_ in claims], fontsize=6)
+    ax.set(xlim=(-1.05, 1.05), ylim=(len(claims) - 0.5, -0.5), xticks=[-1, 0, 1])
+    ax.set_xticklabels(["against the claim", "margin", "for it"])
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+    given = {verdict for _, verdict, *_ in claims}
+    marks = [
+        Line2D([], [], color=VERDICTS[word], marker="o", ms=3.4, label=word.lower())
+        for word in VERDICTS
+        if word in given
+    ]
+    legend(figure, marks)
+    return figure

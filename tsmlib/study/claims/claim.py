@@ -1,0 +1,79 @@
+"""A claim of the paper, and the verdicts that it can get.
+
+    REPLICATED          every check holds, and keeps its sign under every other reading of the paper that has rows
+    READING-DEPENDENT   the checks hold under some reading, not under all
+    NOT REPLICATED      the interval of some check lies beyond its margin, on the wrong side
+    INCONCLUSIVE        the interval of some check holds its margin, or there is none
+    NOT TESTABLE        rows are missing, or were refused
+    DEFINITIONAL        nothing that could be measured would contradict it; not counted
+
+The SHA-256 of all that decides a verdict is stored with it; under another rule a stored verdict is void.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from tsmlib.study.claims.query import PAPERS, Check, Checks, Query
+from tsmlib.study.claims.shown import Shown
+
+VERSION = 2  # raise it when verdicts are reached in another way: those that are stored are void then
+REPLICATED, DEPENDENT, INCONCLUSIVE, FAILED, UNTESTABLE, DEFINITIONAL = VERDICTS = (
+    "REPLICATED", "READING-DEPENDENT", "INCONCLUSIVE", "NOT REPLICATED", "NOT TESTABLE", "DEFINITIONAL",
+)  # fmt: skip
+Rule = Callable[[Query], Checks]
+
+
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """A claim of the paper; it decorates the rule that yields its checks, whose docstring is what the paper says.
+
+    readings: name -> fields of Query. why: verdict -> what is known of its cause. depends_on: claims that have to hold
+    as well. picture: the paper makes it of a video or of one picture. definition: why it cannot fail.
+    subject: the model in place of the paper's own.
+    """
+
+    id: str
+    place: str
+    shown: Shown
+    statistic: str
+    rule: Rule = lambda _: iter(())
+    readings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    why: Mapping[str, str] = field(default_factory=dict)
+    depends_on: Sequence[Claim] = ()
+    headline: bool = False
+    picture: bool = False
+    definition: str = ""
+    subject: str = PAPERS
+
+    def __call__(self, rule: Rule) -> Claim:
+        return replace(self, rule=rule)
+
+    @property
+    def statement(self) -> str:
+        return inspect.getdoc(self.rule) or ""
+
+    @cached_property
+    def checks(self) -> dict[str, list[Check]]:
+        """Reading -> checks; that of the name '' decides first."""
+        others = [check for one in self.depends_on for check in replace(one, subject=self.subject).checks[""]]
+        queries = {name: replace(Query(self.subject), **change) for name, change in {"": {}, **self.readings}.items()}
+        return {name: [*self.rule(query), *others] for name, query in queries.items()}
+
+    @cached_property
+    def sha256(self) -> str:
+        """Of all that decides the verdict: the source of the rule, and every check as it is asked."""
+        lines = inspect.getsource(self.rule).splitlines()
+        body = list(itertools.dropwhile(lambda line: not line.lstrip().startswith("def "), lines))
+        checks = {
+            reading: [[c.text, c.op, c.margin, c.level, c.number.terms] for c in checks]
+            for reading, checks in self.checks.items()
+        }
+        decides = json.dumps([VERSION, self.id, self.definition, body, checks], sort_keys=True)
+        return hashlib.sha256(decides.encode()).hexdigest()

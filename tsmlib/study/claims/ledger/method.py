@@ -1,0 +1,136 @@
+"""Claims of sections 3 to 5.2."""
+# fmt: off
+# isort: off
+
+from tsmlib.study.claims.claim import FAILED, Claim
+from tsmlib.study.claims.query import (
+    ADAM, ARMS, DELAY, LAP, LSTM, MULTI_STEP, ONE_STEP, PUSH, REACHER, TASKS, TSM, VARIANCE, Check, Checks, Model,
+    Query, between, constant, log,
+)
+from tsmlib.study.claims.shown import (
+    ACTION_PRIOR, CAUSES, CHANGES, DATA, FIGURE6, FIGURE7, HORIZON, ITERATIONS, PROBLEM, ROBUSTNESS, WORKSPACE,
+)
+
+@Claim("C09", "section 3", CHANGES,
+       statistic="log-likelihood, full encoder minus ours, against a tenth of the lead over the one-step model")
+def c09(q: Query) -> Checks:
+    """An encoder that sees the future states alone is as good as one that sees everything."""
+    tsm, tenth = q.ablation(TSM), 0.1 * (q.ablation(TSM) - q.ablation(ONE_STEP))
+    yield from between(-tenth, q.ablation(Model("tsm+full")) - tsm, tenth)
+
+@Claim("C10", "section 3.1", CHANGES,
+       statistic="log-likelihood with them minus without, against a quarter of the lead over the one-step model")
+def c10(q: Query) -> Checks:
+    """Residual and skip connections help a little and are not essential."""
+    tsm, plain = q.ablation(TSM), q.ablation(Model("tsm+plain"))
+    yield tsm - plain > 0
+    yield tsm - plain <= 0.25 * (tsm - q.ablation(ONE_STEP))
+
+@Claim("C11", "section 3", ROBUSTNESS,
+       statistic="log-likelihood with delay: TSM minus the same with zeros for past actions")
+def c11(q: Query) -> Checks:
+    """Seeing past actions is what makes delayed actions predictable."""
+    yield q.ll(TSM, DELAY) - q.ll(TSM, DELAY, subset="past actions zero") > 0
+
+@Claim("C12", "section 4.2", CAUSES, readings=ADAM,
+       statistic="predicted minus true return, distance to the training torques, power above 5 Hz: raw actions minus "
+                 "codes")
+def c12(q: Query) -> Checks:
+    """Plans over raw actions exploit the model with actions unlike its data."""
+    for task in TASKS:
+        yield q.gap(TSM, task).mean() - q.gap(LAP, task).mean() > 0
+        for metric in ("torque_novelty", "torque_fast"):
+            yield q.plans(metric, TSM, task, trials=False) - q.plans(metric, LAP, task, trials=False) > 0
+
+@Claim("C13", "section 4.2", ACTION_PRIOR,
+       statistic="logarithm of the signal-to-noise ratio of gradients over model samples: codes minus actions")
+def c13(q: Query) -> Checks:
+    """Gradients with respect to codes carry a stronger signal than those with respect to actions."""
+    for task in TASKS:
+        codes, actions = (q.torques("gradient_snr", model, task, planner="adam", trials=True) for model in (LAP, TSM))
+        yield log(codes).mean() - log(actions).mean() > 0
+
+@Claim("C14", "section 4.2", PROBLEM,
+       statistic="8 codes for each of K segments against 2 torques for each of T = 10 K steps, T = 50 and 100",
+       definition="It is arithmetic: 8 K < 20 K.")
+def c14(_: Query) -> Checks:
+    """Codes are fewer numbers to optimise than actions."""
+    for segments in (5, 10):
+        yield constant(2 * 10 * segments, "torques of a plan") > 8 * segments
+
+@Claim("C15", "section 4.2", ITERATIONS,
+       statistic="iterations to 95 % of the gain at 500 iterations: share of targets within 100 and within 150",
+       why={FAILED: "On reaching no target gets there within 150 iterations, since from codes of zero a hundred steps "
+                    "of 0.01 do not get far. On pushing most do."})
+def c15(q: Query) -> Checks:
+    """Adam with step 0.01 converges in about 100 iterations."""
+    for task in TASKS:
+        iterations = q.plans("iterations_to_95", LAP, task, planner="adam")
+        yield (iterations <= 100).share() > 0.5
+        yield (iterations <= 150).share() > 0.75
+
+@Claim("C16", "section 4.3", FIGURE7,
+       statistic="share of executed steps within the training torques' 95 % range; size of the gap against a one-step "
+                 "policy")
+def c16(q: Query) -> Checks:
+    """A policy that acts through the prior stays where the model is valid."""
+    for task in TASKS:
+        yield q.policy("within_data", LAP, task).mean() >= 0.9
+        lap, tsm = (abs(q.policy("exploitation_gap", model, task)).mean() for model in (LAP, TSM))
+        yield lap - tsm < 0
+
+@Claim("C17", "sections 5.1 and 6", WORKSPACE, picture=True,
+       statistic="share of the cells of a 20 x 20 grid over the workspace that data visit; share of episodes with "
+                 "contact")
+def c17(q: Query) -> Checks:
+    """Smooth random torques explore enough."""
+    yield q.data("cells_visited", REACHER) >= 0.9
+    yield q.data("contact_share", PUSH) >= 0.1
+
+@Claim("C18", "section 5.1", CHANGES,
+       statistic="log-likelihood, H = 1 minus the one-step model, against a tenth of the lead of H = 10")
+def c18(q: Query) -> Checks:
+    """With segments of one step it is a one-step model."""
+    one, tenth = q.ablation(ONE_STEP), 0.1 * (q.ablation(TSM) - q.ablation(ONE_STEP))
+    yield from between(-tenth, q.ablation(Model("tsm+h1")) - one, tenth)
+
+@Claim("C19", "section 5.1", CHANGES,
+       statistic="log-likelihood, H = 20 minus H = 10, against a tenth of what H = 10 has over H = 1")
+def c19(q: Query) -> Checks:
+    """Segments longer than ten steps bring little."""
+    tsm = q.ablation(TSM)
+    yield q.ablation(Model("tsm+h20")) - tsm < 0.1 * (tsm - q.ablation(Model("tsm+h1")))
+
+@Claim("C20", "section 5.1", DATA, statistic="autocorrelation of the joint velocities at 20 steps",
+       why={FAILED: "Torques are smooth and joints have little friction, so that speeds last longer than a segment."})
+def c20(q: Query) -> Checks:
+    """The end of a long segment hardly depends on its beginning."""
+    for task in TASKS:
+        yield from between(-0.2, q.data("velocity_autocorrelation", task, lag=20), 0.2)
+
+@Claim("C21", "section 5.1", CHANGES, statistic="log-likelihood, 8 dimensions minus 4, and 16 minus 8")
+def c21(q: Query) -> Checks:
+    """Eight latent dimensions are a good trade-off."""
+    yield q.ablation(TSM) - q.ablation(Model("tsm+z4")) >= 0
+    yield Check(q.ablation(Model("tsm+z16")) - q.ablation(TSM), "==", 0)
+
+@Claim("C22", "section 5.2", HORIZON, readings=VARIANCE,
+       statistic="log-likelihood at 10, 20, 50 and 90 steps, multi-step minus one-step",
+       why={FAILED: "On the plain arm, training over several steps costs accuracy from the first step on and does not "
+                    "gain it back."})
+def c22(q: Query) -> Checks:
+    """Training over several steps makes a one-step model more robust."""
+    for arm in ARMS:
+        for h in (10, 20, 50, 90):
+            yield q.ll(MULTI_STEP, arm, step=h) - q.ll(ONE_STEP, arm, step=h) > 0
+
+@Claim("C23", "section 5.2", FIGURE6, readings=ADAM,
+       statistic="log-likelihood, LSTM minus one-step; executed return of plans over raw actions, TSM minus LSTM",
+       why={FAILED: "The LSTM, trained for the same time, predicts pushing more closely than TSM, and plans through it "
+                    "return more. CEM asks for no gradient; of Adam, which does, the reading has rows for pushing "
+                    "alone."})
+def c23(q: Query) -> Checks:
+    """An LSTM learns the dynamics and is harder to optimise through."""
+    for task in TASKS:
+        yield q.ll(LSTM, task) - q.ll(ONE_STEP, task) > 0
+        yield q.executed(TSM, task) - q.executed(LSTM, task) > 0

@@ -1,0 +1,163 @@
+"""Results tables (``tsmlib.storage.tables``): selections, values paired by seed, summaries, Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.figures.method import Method
+from tsmlib.planning.tasks import Task
+from tsmlib.statistics import interval
+from tsmlib.storage import tables
+from tsmlib.study.runs import Run
+from tsmlib.study.zoo import LOOKS, ZOO, method
+
+T = TypeVar("T")
+Row = dict[str, Any]
+Columns = Mapping[str, tuple[str, str]]  # metric -> title and format of its column
+
+
+# Places and methods --------------------------------------------------------------------------------------------------
+
+
+def place(env: str) -> Row:
+    """The columns that say where a row is from: the arm without its imperfections, simulator, noise and delay."""
+    spec = EnvSpec.parse(env)
+    return {"env": spec.arm.id, "sim": spec.simulator, "noise": spec.noise or None, "delay": spec.delay or None}
+
+
+def of_task(task: Task, run: Run) -> Row:
+    """The columns of whatever a run measured on a task."""
+    return place(task.env) | dict(task=task.name, horizon=task.horizon, seed=run.seed, scale=run.scale)
+
+
+def fields(method: Method) -> Row:
+    """The columns model, search_space and planner of a method."""
+    model, planner = method.model, method.planner
+    if model in ("random", "zero"):
+        model, planner = "none", model
+    return {"model": model, "search_space": method.search_space, "planner": planner}
+
+
+def policy(header: Mapping[str, Any]) -> Row:
+    """The columns of a learned policy, from the header of its file."""
+    return place(header["fingerprint"]["env"]) | dict(
+        task=header["made_from"]["task"], model=header["model"], planner="policy", execution="policy",
+        search_space=header["search_space"], seed=header["seed"], scale=header["scale"],
+    )  # fmt: skip
+
+
+def with_method(table: pd.DataFrame, *columns: str) -> pd.DataFrame:
+    """The table with a column ``method``, made of these columns, by default of model, search_space and planner."""
+    named = columns or ("model", "search_space", "planner")
+    made = [method(**dict(zip(named, row, strict=True))) for row in zip(*(table[name] for name in named), strict=True)]
+    return table.assign(method=pd.Series(made, index=table.index, dtype=object))
+
+
+def methods(values: Mapping[str, T]) -> dict[Method, T]:
+    """The same with methods, which figures take, in place of the words of models; in the order of the zoo."""
+    order = [*ZOO, *LOOKS]
+    return {method(model): values[model] for model in sorted(values, key=order.index)}
+
+
+def save(run: Run, rows: Iterable[Row], **common: Any) -> pd.DataFrame:
+    """Save the rows of a run's notebook; common: what all have in common, beside seed, scale and no planner."""
+    common = dict(planner="none", seed=run.seed, scale=run.scale) | common
+    return tables.save(run.metrics / f"{run.notebook}.csv", [common | row | place(row["env"]) for row in rows])
+
+
+# Selections ----------------------------------------------------------------------------------------------------------
+
+
+def select(table: pd.DataFrame, **where: Any) -> pd.DataFrame:
+    """The rows that have these values; of a list, tuple, set or range any of them. None or "": an empty field."""
+    keep = np.ones(len(table), dtype=bool)
+    for name, wanted in where.items():
+        column = table[name]
+        among = list(wanted) if isinstance(wanted, list | tuple | set | frozenset | range) else [wanted]
+        known = [value for value in among if value is not None and value != ""]
+        found = column.isin(known)
+        if len(known) < len(among):
+            found = found | column.isna() | (column.astype(object) == "")
+        keep &= found.to_numpy(dtype=bool)
+    return table[keep]
+
+
+def groups(table: pd.DataFrame, by: str | list[str]) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Rows of the same value, or values, in order of appearance."""
+    return iter(table.groupby(by, sort=False)) if len(table) else iter(())
+
+
+def by_seed(table: pd.DataFrame, by: str = "model") -> pd.DataFrame:
+    """Values with a line per seed and a column per model, NaN where there is none. ValueError if a value is doubled."""
+    doubled = table[table.duplicated([by, "seed"])]
+    if len(doubled):
+        first = doubled.iloc[0]
+        raise ValueError(f"{first['metric']} of {first[by]} stands twice for seed {first['seed']}; select one of them")
+    wide = table.pivot(index="seed", columns=by, values="value")
+    return wide[list(table[by].unique())]
+
+
+def values(table: pd.DataFrame, by: str = "model") -> dict[Any, np.ndarray]:
+    """Model -> one value per seed, in the order of the seeds."""
+    return arrays(by_seed(table, by))
+
+
+def pairs(table: pd.DataFrame, subject: str, by: str = "model") -> dict[Any, np.ndarray]:
+    """Model -> ``subject`` minus that model, one difference per seed that both have."""
+    wide = by_seed(table, by)
+    if subject not in wide:
+        return {}
+    found = {key: (wide[subject] - seeds).dropna().to_numpy() for key, seeds in wide.items() if key != subject}
+    return {key: seeds for key, seeds in found.items() if len(seeds)}
+
+
+def arrays(wide: pd.DataFrame) -> dict[Any, np.ndarray]:
+    """Name -> a column's numbers, without what is missing."""
+    return {name: column.dropna().to_numpy() for name, column in wide.items()}
+
+
+def means(table: pd.DataFrame, by: str | list[str], columns: str | list[str] = "metric") -> pd.DataFrame:
+    """Means, over seeds above all, with a line per ``by`` and a column per metric, in order of appearance."""
+    return table.pivot_table(index=by, columns=columns, values="value", sort=False)
+
+
+# Printed tables ------------------------------------------------------------------------------------------------------
+
+
+def spell(numbers: Iterable[float], form: str = "{:.3g} ± {:.2g}") -> str:
+    """Mean and half the 95 % t interval; the mean alone where there is no interval."""
+    mean, half = interval(np.asarray(list(numbers)))
+    return form.format(mean, half) if half else form.partition(" ± ")[0].format(mean)
+
+
+def printed(wide: pd.DataFrame, columns: Columns) -> pd.DataFrame:
+    """Numbers as text in named columns, for those metrics that there are; the index in front."""
+    texts = {title: wide[name].map(form.format, na_action="ignore") for name, (title, form) in columns.items()
+             if name in wide}  # fmt: skip
+    return pd.DataFrame(texts, index=wide.index).reset_index()
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A Markdown table of texts; methods and environments as readers know them."""
+    known: dict[str, Callable[[Any], str]] = {
+        "env": "`{}`".format, "method": lambda method: method.label, "reached": {True: "yes", False: "no"}.__getitem__,
+    }  # fmt: skip
+    texts = table.astype(object).where(table.notna(), "")
+    texts = texts.assign(**{name: texts[name].map(text) for name, text in known.items() if name in texts})
+    texts = texts.rename(columns={"env": "environment", "search_space": "search space"}).astype(str)
+    return texts.to_markdown(index=False, disable_numparse=True)
+
+
+def thresholds(lines: Iterable[tuple[str, str, float, float, str]]) -> pd.DataFrame:
+    """Thresholds: of what, "at most" or "at least", bound, measured and format, with whether it was."""
+    found = [
+        {"what": what, "threshold": f"{word} {form.format(bound)}", "measured": form.format(value),
+         "reached": bool(value <= bound if word == "at most" else value >= bound)}
+        for what, word, bound, value, form in lines
+    ]  # fmt: skip
+    return pd.DataFrame(found, columns=["what", "threshold", "measured", "reached"])

@@ -1,0 +1,223 @@
+"""The models of the study: the one place where a model is added. Imports nothing heavy.
+
+Trained, scored, planned with and drawn it is by its word alone: every other file asks here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from importlib import import_module
+from itertools import product
+from typing import TYPE_CHECKING, Literal
+
+from tsmlib.figures.method import PLANNERS, SEARCH_SPACES, Look, Method
+
+if TYPE_CHECKING:
+    import torch
+
+    from tsmlib.envs.spec import EnvSpec
+
+BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
+    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 290.0,
+    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 60.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of a training: a loss of the model, minimised for a share of the budget.
+
+    rate: updates per second on one core of the machine that the published models were trained on, on the plain arm and
+    where there is a block. future_len: steps ahead, 2 H. lr: the best of 1e-3, 2e-3 and 4e-3 for every baseline, on
+    validation. bf16: whether products in bfloat16 are faster: not where a gated stack is run step by step.
+    """
+
+    loss: str
+    rate: float | tuple[float, float]
+    share: float = 1.0
+    future_len: int = 20
+    lr: float = 4e-3
+    batch: int = 256
+    bf16: bool = True
+
+    def within(self, seconds: float, block: bool) -> Updates:
+        """The stage in its share of a budget: updates in tens, and never fewer than 20."""
+        rate = self.rate[block] if isinstance(self.rate, tuple) else self.rate
+        steps = max(20, 10 * round(seconds * self.share * rate / 10))
+        return Updates(self.loss, steps, self.future_len, self.lr, self.batch, self.bf16)
+
+
+@dataclass(frozen=True)
+class Updates:
+    """A stage of a training with its number of updates; but for ``bf16`` it stands so in the header of a model."""
+
+    loss: str
+    steps: int
+    future_len: int
+    lr: float
+    batch: int
+    bf16: bool
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """A model: how it looks, what it is made of and how it is trained.
+
+    cls: ``module:Class``, imported when first used. arguments: of the class, beyond the sizes of states and actions.
+    budget: seconds of training of its own, in place of the environment's. group: dynamics models are compared
+    everywhere; an ablation takes something away from TSM, a choice changes one of the paper's; the prior is the prior.
+    planned: whether figure 6 plans with it.
+    """
+
+    word: str
+    look: Look
+    cls: str
+    stages: tuple[Stage, ...]
+    arguments: Callable[[EnvSpec], Mapping[str, object]] = lambda env: {}
+    group: Literal["dynamics", "ablation", "choice", "prior"] = "dynamics"
+    budget: float | None = None
+    planned: bool = False
+
+    def load(self) -> type[torch.nn.Module]:
+        """The class."""
+        module, _, name = self.cls.partition(":")
+        return getattr(import_module(module), name)
+
+    def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
+        """How the model is trained in a share of its budget, on an imperfect arm as on the plain one."""
+        seconds = share * (BUDGET[env.arm.name] if self.budget is None else self.budget)
+        return [stage.within(seconds, env.has_block) for stage in self.stages]
+
+
+# Training stages and arguments ----------------------------------------------------------------------------------------
+
+
+def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> Stage:
+    """Free-running over two chained segments."""
+    return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False)
+
+
+TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
+LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10)
+PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
+
+
+def _wide(env: EnvSpec) -> dict[str, object]:
+    """Appendix A.1."""
+    return {"channels": 64, "head_channels": 128} if env.has_block else {}
+
+
+def _skip(env: EnvSpec) -> dict[str, object]:
+    """A head that sees the state itself, over a narrower stack."""
+    return {"channels": 32, "state_skip": 200}
+
+
+def _choice(word: str, name: str, colour: str, **arguments: object) -> ModelSpec:
+    """One of the paper's choices, changed; as many updates as TSM."""
+    look = Look(f"TSM, {name}", colour)
+    return ModelSpec(word, look, "tsmlib.models.tsm:TSM", PAPER, lambda env: _wide(env) | arguments, "choice")
+
+
+# The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any colour vision --------
+
+_TSM, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
+    f"tsmlib.models.{name}"
+    for name in ("tsm:TSM", "baselines:OneStep", "baselines:LSTM", "ensemble:Ensemble", "action_prior:ActionPrior")
+)
+_MODELS = (
+    ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True),
+    ModelSpec(  # the energy score in place of squared error and KL
+        "tsm+energy", Look("TSM + energy", "#56B4E9", "D"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
+    ),
+    ModelSpec(  # the same with the state skip, and more teacher forcing
+        "tsm+energy+direct", Look("TSM + energy + skip", "#003C8F", "*"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
+        _skip, planned=True,
+    ),
+    ModelSpec(
+        "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "p"), _TSM, (replace(TEACHER, share=1.0),), _wide,
+        "ablation",
+    ),
+    ModelSpec(  # the state skip with the paper's loss
+        "tsm+direct", Look("TSM + skip", "#7BA7D9", "h"), _TSM, (LONGER, _free("loss", 11, 0.6)), _skip, "ablation",
+    ),
+    ModelSpec(
+        "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (Stage("loss", 36),), planned=True,
+    ),
+    ModelSpec(  # free-running over 2 H steps
+        "multistep", Look("multi-step", "#D55E00", "^"), _ONE_STEP, (Stage("multi_step_loss", 21),), planned=True,
+    ),
+    ModelSpec("lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5),), planned=True),
+    ModelSpec(
+        "ensemble", Look("ensemble (Gaussian)", "#CC79A7", "P"), _ENSEMBLE, (Stage("loss", 33.3),),
+        lambda env: {"gaussian": True},
+    ),
+    ModelSpec(
+        "ensemble+mse", Look("ensemble (squared error)", "#6A2BD9", "X"), _ENSEMBLE, (Stage("loss", 33.3),),
+        lambda env: {"gaussian": False}, planned=True,
+    ),
+    ModelSpec(
+        "prior", Look("action prior", "#882255"), _PRIOR, (Stage("loss", 30, lr=1e-3, bf16=False),), group="prior",
+        budget=100.0,
+    ),
+    _choice("tsm+full", "full encoder", "#4C6A92", full_encoder=True),
+    _choice("tsm+plain", "no skip connections", "#6C8EBF", plain=True),
+    _choice("tsm+z4", "4 latent dimensions", "#8AB6D6", latent_dim=4),
+    _choice("tsm+z16", "16 latent dimensions", "#2F6F9F", latent_dim=16),
+    _choice("tsm+h1", "H = 1", "#A6C8E0", segment_len=1),
+    replace(
+        _choice("tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)),  # receptive field 2 H
+        stages=(replace(TEACHER, future_len=20), PAPER[1]),
+    ),
+)  # fmt: skip
+ZOO = {spec.word: spec for spec in _MODELS}
+LOOKS = {  # of what is run and drawn beside the models; greys for what is no method
+    "ppo": Look("PPO", "#999933"), "trpo": Look("TRPO", "#7B4B2A"), "oracle": Look("oracle", "#111111"),
+    "random": Look("random torques", "#7A7A7A"), "zero": Look("zero torque", "#B0B0B0"),
+    "data": Look("data", "#4A4A4A"), "filter": Look("Kalman filter", "#B03A2E"),
+    "exponential": Look("exponential average", "#8C8C8C"),
+    "pets": Look("PETS (mbrl-lib)", "#C2A5CF", "d"),
+    "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", "d"),
+}  # fmt: skip
+
+
+def words(*groups: str, cls: str = "") -> tuple[str, ...]:
+    """The models of some groups, or of all, in the order of ZOO; cls: of one class alone, ``TSM`` for example."""
+    named = ((word, spec) for word, spec in ZOO.items() if not groups or spec.group in groups)
+    return tuple(word for word, spec in named if cls in ("", spec.cls.partition(":")[2]))
+
+
+def find(word: str) -> ModelSpec:
+    """The entry of a model; ValueError naming those that there are."""
+    if word not in ZOO:
+        raise ValueError(f"no model is called {word!r:.80}; there are {', '.join(ZOO)}")
+    return ZOO[word]
+
+
+def look(word: str) -> Look:
+    """How a model is drawn, or what stands in a model's place; ValueError naming those that there are."""
+    if word in LOOKS:
+        return LOOKS[word]
+    if word not in ZOO:
+        raise ValueError(f"nothing is called {word!r:.80}; there are {', '.join([*ZOO, *LOOKS])}")
+    return ZOO[word].look
+
+
+def method(model: str, search_space: str = "", planner: str = "", variant: str = "") -> Method:
+    """A method by its words, as they stand in the tables; there, random and zero torques are planners of model none.
+
+    ValueError for a model, a search space or a planner that is not known.
+    """
+    if model == "none":
+        model, planner = planner, ""
+    if search_space not in ("", *SEARCH_SPACES) or planner not in ("", "none", "policy", *PLANNERS):
+        raise ValueError(
+            f"search space is {search_space!r:.80}, planner {planner!r:.80}; expected {' or '.join(SEARCH_SPACES)}, "
+            f"and one of {', '.join(PLANNERS)}, policy; or ''"
+        )
+    return Method(model, search_space, "" if planner == "none" else planner, variant, look=look(model))
+
+
+def methods(models: Iterable[str], planner: str, spaces: Iterable[str] = SEARCH_SPACES) -> list[Method]:
+    """Every model with a planner, in every search space."""
+    return [method(model, space, planner) for model, space in product(models, spaces)]
