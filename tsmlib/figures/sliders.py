@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
@@ -27,7 +27,7 @@ def slider_panel(draw: Callable[..., Figure], **ranges: tuple[float, float, floa
     }
     picture = Image(format="png")
 
-    def turn(_: Any = None) -> None:
+    def turn(_: object = None) -> None:
         drawn = BytesIO()
         draw(**{name: slider.value for name, slider in sliders.items()}).savefig(drawn, format="png")
         picture.value = drawn.getvalue()

@@ -86,7 +86,7 @@ def load(path: PathLike) -> pd.DataFrame:
     return frame(pd.DataFrame(rows, columns=columns, dtype=object))
 
 
-def records(table: pd.DataFrame) -> list[dict[Hashable, Any]]:
+def records(table: pd.DataFrame) -> list[dict[Hashable, object]]:
     """The rows of a table as dicts of Python's own values, empty ones as ''."""
     return table.astype(object).where(table.notna(), "").to_dict("records")
 

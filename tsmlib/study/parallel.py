@@ -19,7 +19,9 @@ from tqdm.auto import tqdm
 from tsmlib.study.runs import Run, RunError
 
 
-def precompute(run: Run, calls: Sequence[tuple[Any, ...]], *, progress: str = "ahead") -> None:
+def precompute(
+    run: Run, calls: Sequence[tuple[Callable[..., object], *tuple[object, ...]]], *, progress: str = "ahead"
+) -> None:
     """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
 
     make: a function that keeps what it makes in the run's folder, such as ``plan``. Calls must not need each other's

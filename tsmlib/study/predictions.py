@@ -77,7 +77,7 @@ def score_all(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, st
     return {pair: Scored(*(score(run, *pair) for score in both)) for pair in pairs}
 
 
-def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, object]]:
     """Rows of ``score_all``, see ``results.prediction``."""
     found = []
     for (env, model), (open_loop, segments) in score_all(run, wanted).items():
@@ -86,7 +86,7 @@ def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, An
     return found
 
 
-def published_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, Any]], table: str = "") -> pd.DataFrame:
+def published_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
     """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
 
     Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come
@@ -106,7 +106,7 @@ def published_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, Any]], t
     return tables.frame(pd.concat(parts))
 
 
-def save_rows(run: Run, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+def save_rows(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFrame:
     """Write the table of a notebook's run. Returns the rows that its figures draw (``published_rows``)."""
     tables.save(run.metrics / f"{run.notebook}.csv", rows)
     return published_rows(run, rows)

@@ -60,7 +60,7 @@ class Effect:
     @property
     def right_side(self) -> bool:
         """Whether the estimate keeps the claimed sign; what cannot be estimated does not contradict it."""
-        return self.value is None or self.check.op == "==" or self.check.accepts(self.value, self.value)
+        return self.value is None or self.check.op == "==" or bool(self.check.accepts(self.value, self.value))
 
     @property
     def ease(self) -> tuple[int, float]:

@@ -150,7 +150,7 @@ class Check:
         """All of it as it is read."""
         return f"{self.number.text} {self.op} {self.margin:g}"
 
-    def accepts(self, low: Any, high: Any) -> Any:
+    def accepts(self, low: float | np.ndarray, high: float | np.ndarray) -> bool | np.ndarray:
         """Whether all that lies between ``low`` and ``high`` is on the accepted side of the margin."""
         return {
             ">": low > self.margin, ">=": low >= self.margin, "<": high < self.margin, "<=": high <= self.margin,
@@ -160,7 +160,7 @@ class Check:
     def share(self) -> Number:
         """The share of a seed's trials for which it is true."""
 
-        def share(rows: Mapping[Term, np.ndarray]) -> Any:
+        def share(rows: Mapping[Term, np.ndarray]) -> np.floating:
             values = self.number.of(rows)
             return np.mean(self.accepts(values, values))
 

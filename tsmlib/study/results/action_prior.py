@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -74,7 +73,7 @@ def task_rows(own: Torques, trials: Trials, run: Run) -> list[Row]:
     return found
 
 
-def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: Any) -> list[Row]:
+def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: object) -> list[Row]:
     """Rows of action statistics of torques (B, T, du), against held-out and training torques of the data (N, T', du).
 
     The AUC takes all held-out torques, so it stays away where there are too few plans for five folds.
@@ -96,7 +95,7 @@ def rows(actions: Tensor, held_out: Tensor, train: Tensor, **common: Any) -> lis
 
 
 def cost_of_prior(
-    own: Torques, trials: Trials, model: str, planner: str, **common: Any
+    own: Torques, trials: Trials, model: str, planner: str, **common: object
 ) -> tuple[list[Row], dict[str, Tensor]]:
     """Return lost by the latent against the direct search space, target by target, and where.
 

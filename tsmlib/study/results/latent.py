@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -49,15 +48,18 @@ STRETCHES = tuple(range(10, HORIZON + 1, 10))  # last steps of the stretches of 
 # Rows ----------------------------------------------------------------------------------------------------------------
 
 
-def rows(model: TSM, seen: SampledFutures, swings: SampledFutures | None = None, /, **common: Any) -> list[Row]:
+def rows(
+    model: TSM, seen: SampledFutures, swings: SampledFutures | None = None, /, *, seed: int, **common: object
+) -> list[Row]:
     """All rows of a model. swings: where the arm pushes an object, windows before its first touch."""
-    found = code_rows(model, seen, torch.Generator().manual_seed(common["seed"]), **common)
+    common["seed"] = seed
+    found = code_rows(model, seen, torch.Generator().manual_seed(seed), **common)
     if swings is not None:
         found += contact_rows(seen, **common) + deflection_rows(deflections(swings), swings.env, **common)
     return found
 
 
-def code_rows(model: TSM, seen: SampledFutures, generator: torch.Generator, /, **common: Any) -> list[Row]:
+def code_rows(model: TSM, seen: SampledFutures, generator: torch.Generator, /, **common: object) -> list[Row]:
     """Use of the code and spread of the next segment. common: model, seed, scale. The encoder's part for tsm alone:
     the energy score trains a decoder without it."""
     seen = seen.first(model.segment_len)
@@ -115,7 +117,7 @@ def _spread(model: TSM, seen: SampledFutures, after: Tensor) -> Iterator[Row]:
         yield dict(metric="spearman", value=inside, subset="contact", n=int(ever.sum()))
 
 
-def contact_rows(seen: SampledFutures, **common: Any) -> list[Row]:
+def contact_rows(seen: SampledFutures, **common: object) -> list[Row]:
     """Recall and precision of contacts: of all within the horizon, and in each stretch of ten, by its last step."""
     common |= table.place(seen.env) | dict(planner="none", execution="open loop", unit="share")
     steps = seen.samples.shape[2]
@@ -132,7 +134,7 @@ def contact_rows(seen: SampledFutures, **common: Any) -> list[Row]:
     return found
 
 
-def deflection_rows(found: Deflections, env: str, **common: Any) -> list[Row]:
+def deflection_rows(found: Deflections, env: str, **common: object) -> list[Row]:
     """Directions and distances after the first touch; no rows where no object was moved."""
     if not len(found.travel):
         return []

@@ -59,7 +59,7 @@ def learning_rows(
     ]
 
 
-def plateau_rows(curves: Mapping[Method, Curves], *, steps: int, share: float = 0.9, **common: Any) -> list[Row]:
+def plateau_rows(curves: Mapping[Method, Curves], *, steps: int, share: float = 0.9, **common: object) -> list[Row]:
     """Rows of what each policy needed to come to ``share`` of the common plateau (claims C37 and C39), one task's.
 
     curves: of one seed, of the policies that are compared. Their common plateau is what those learned inside models

@@ -31,7 +31,7 @@ HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
 
 
-def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajectories, **common: Any) -> list[Row]:
+def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajectories, **common: object) -> list[Row]:
     """One model's rows. test: the episodes that were scored, or more; common: seed and scale."""
     test = test.take(slice(len(open_loop.outside)))
     common = table.place(env) | dict(model=model, planner="none", **common)
@@ -107,7 +107,7 @@ def extremes(test: Trajectories, scores: Scores) -> tuple[np.ndarray, np.ndarray
 # Reading rows --------------------------------------------------------------------------------------------------------
 
 
-def select(found: pd.DataFrame, metric: str | Sequence[str], *, env: str, **where: Any) -> pd.DataFrame:
+def select(found: pd.DataFrame, metric: str | Sequence[str], *, env: str, **where: object) -> pd.DataFrame:
     """Rows of an environment, imperfect or not: open loop, of everything, mean over steps, unless ``where`` says
     otherwise of execution, subset or steps_ahead."""
     spec = EnvSpec.parse(env)
@@ -116,23 +116,23 @@ def select(found: pd.DataFrame, metric: str | Sequence[str], *, env: str, **wher
     return table.select(found, metric=metric, **asked)
 
 
-def values(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> dict[str, np.ndarray]:
+def values(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> dict[str, np.ndarray]:
     """Model -> one value per seed, in the order of the seeds; of the rows that ``select`` gives."""
     return table.values(select(found, metric, env=env, **where))
 
 
-def ranking(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> list[str]:
+def ranking(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> list[str]:
     """Models from the best to the worst mean over seeds."""
     means = {model: seeds.mean() for model, seeds in values(found, metric, env=env, **where).items()}
     return sorted(means, key=lambda model: means[model], reverse=metric not in LOWER_IS_BETTER)
 
 
-def paired(found: pd.DataFrame, subject: str, metric: str, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+def paired(found: pd.DataFrame, subject: str, metric: str, *, env: str, **where: object) -> dict[Method, np.ndarray]:
     """Method -> ``subject`` minus that model, one difference per seed that both were trained with."""
     return table.methods(table.pairs(select(found, metric, env=env, **where), subject))
 
 
-def curves(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+def curves(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> dict[Method, np.ndarray]:
     """Method -> (seeds, 90): the metric at every step ahead, on straight lines between those of HORIZONS."""
     lines: dict[str, np.ndarray] = {}
     for model, own in table.groups(select(found, metric, env=env, steps_ahead=HORIZONS, **where), "model"):
@@ -142,7 +142,7 @@ def curves(found: pd.DataFrame, metric: str, *, env: str, **where: Any) -> dict[
     return table.methods(lines)
 
 
-def calibration(found: pd.DataFrame, *, env: str, **where: Any) -> dict[Method, np.ndarray]:
+def calibration(found: pd.DataFrame, *, env: str, **where: object) -> dict[Method, np.ndarray]:
     """Method -> (19,): observed coverage at the nominal LEVELS, mean over seeds."""
     metrics = [_coverage(level) for level in LEVELS]
     wide = table.means(select(found, metrics, env=env, **where), "model").reindex(columns=metrics)
@@ -150,7 +150,12 @@ def calibration(found: pd.DataFrame, *, env: str, **where: Any) -> dict[Method, 
 
 
 def scores_table(
-    found: pd.DataFrame, metrics: Sequence[str], *, env: str, steps_ahead: Sequence[int | None] = (None,), **where: Any
+    found: pd.DataFrame,
+    metrics: Sequence[str],
+    *,
+    env: str,
+    steps_ahead: Sequence[int | None] = (None,),
+    **where: object,
 ) -> str:
     """A Markdown table: one line per model, mean over seeds ± half its 95 % interval; fewer seeds are said."""
     own = select(found, metrics, env=env, steps_ahead=list(steps_ahead), **where)

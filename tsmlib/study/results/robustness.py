@@ -29,7 +29,7 @@ THRESHOLDS = {"lost": 0.2, "success50": 0.6}  # of a policy, with noise and with
 
 
 def error_rows(
-    env: str, model: str, ahead: np.ndarray | None, now: np.ndarray | None = None, **common: Any
+    env: str, model: str, ahead: np.ndarray | None, now: np.ndarray | None = None, **common: object
 ) -> list[Row]:
     """Rows ``rmse_clean``: of the steps ahead (N, K, dx) and over all of them, and of now (``steps_ahead`` 0).
 

@@ -64,7 +64,7 @@ def methods(values: Mapping[str, T]) -> dict[Method, T]:
     return {method(model): values[model] for model in sorted(values, key=order.index)}
 
 
-def save(run: Run, rows: Iterable[Row], **common: Any) -> pd.DataFrame:
+def save(run: Run, rows: Iterable[Row], **common: object) -> pd.DataFrame:
     """Save the rows of a run's notebook; common: what all have in common, beside seed, scale and no planner."""
     common = dict(planner="none", seed=run.seed, scale=run.scale) | common
     return tables.save(run.metrics / f"{run.notebook}.csv", [common | row | place(row["env"]) for row in rows])
@@ -73,7 +73,7 @@ def save(run: Run, rows: Iterable[Row], **common: Any) -> pd.DataFrame:
 # Selections ----------------------------------------------------------------------------------------------------------
 
 
-def select(table: pd.DataFrame, **where: Any) -> pd.DataFrame:
+def select(table: pd.DataFrame, **where: object) -> pd.DataFrame:
     """The rows that have these values; of a list, tuple, set or range any of them. None or "": an empty field."""
     keep = np.ones(len(table), dtype=bool)
     for name, wanted in where.items():
