@@ -10,7 +10,7 @@ import numpy as np
 
 from tsmlib.envs.mujoco_arm import CHUNK, load_model
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 
 
 def raw(starts: np.ndarray, actions: np.ndarray, *, threads: int) -> Callable[[], None]:

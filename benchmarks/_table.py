@@ -19,7 +19,7 @@ from tsmlib.figures import style
 from tsmlib.storage import files
 from tsmlib.study import runs
 
-ORDER = ("collect", "train", "rollout", "plan", "policy", "score", "seed", "parallel", "growth", "trust")
+ORDER = ("collect", "train", "avx2", "rollout", "plan", "policy", "score", "seed", "parallel", "growth", "trust")
 DOCS = runs.ROOT / "docs" / "speed.md"
 PICTURE = runs.ROOT / "figures" / "bench_growth"
 MARKS = ("<!-- table -->", "<!-- end of table -->")
@@ -54,6 +54,8 @@ TARGETS = (
            starts("train tsm, free-running: targets"), "ratio", True, 1.4),
     Target("share of the CPU's float32 matrix products in training TSM, both stages", "train",
            starts("train tsm, teacher-forced: targets", "train tsm, free-running: targets"), "share", True, 0.55),
+    Target("training on AVX2 alone, any model, updates per second over float32", "avx2",
+           starts("train "), "ratio", True, 0.95),
     Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, best of all batches", "rollout",
            starts("imagine with tsm, "), "ratio", True, 5, best=True),
     Target("100 latent plans, T = 50, over plain eager, per iteration", "plan",

@@ -17,7 +17,7 @@ from tsmlib.study import runs
 from tsmlib.study.parallel import cores
 from tsmlib.study.runs import Run
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 
 
 def little(run: Run, seed: int, updates: int) -> None:
@@ -25,7 +25,7 @@ def little(run: Run, seed: int, updates: int) -> None:
     data, held_out = (study.random_data(ENV, n, seed=seed) for n in (100, 1))
     stage = study.schedule(run, ENV, "tsm")[-1]
     net = study.initialise(run, "tsm", data)
-    training(net, stage, (data, held_out), updates=updates, bf16=stage.bf16)()
+    training(net, stage, (data, held_out), updates=updates)()
 
 
 def main() -> None:

@@ -33,18 +33,16 @@ from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam, cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.storage import artifacts
 from tsmlib.study import runs
+from tsmlib.study.models import load_pretrained
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 
 
 def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
     """The shipped models; where there are none, untrained ones, which are as fast."""
-    folder = run.shipped / EnvSpec.parse(env).name
-    if all((folder / f"{name}.safetensors").exists() for name in ("tsm", "prior")):
-        tsm = artifacts.load_model(folder / "tsm.safetensors", TSM)
-        return tsm, artifacts.load_model(folder / "prior.safetensors", ActionPrior), "shipped"
+    if (run.shipped / EnvSpec.parse(env).name / "tsm.safetensors").exists():
+        return load_pretrained("tsm", env=env), load_pretrained("prior", env=env), "shipped"
     data = study.random_data(env, 50, seed=0)
     return study.initialise(run, "tsm", data), study.initialise(run, "prior", data), "untrained"
 
@@ -68,7 +66,7 @@ def main() -> None:
     options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
     options.add_argument("--few", type=int, default=4, help="iterations in a round (default 4)")
     options.add_argument("--candidates", type=int, default=16, help="of the cross-entropy method (default 16)")
-    options.add_argument("--samples", type=int, default=2, help="model samples per target (default 2, as scale laptop)")
+    options.add_argument("--samples", type=int, default=0, help="that judge a candidate (default 0, the mode)")
     options.add_argument("--whole", action="store_true", help="run the whole plan too, minutes")
     arguments = parsed(options)
     few, samples = arguments.few, arguments.samples
@@ -96,7 +94,7 @@ def main() -> None:
     few_adam = partial(adam, reward=task.reward, start=n_targets, iterations=few)
     few_cem = partial(cem, reward=task.reward, start=n_targets, iterations=1, candidates=arguments.candidates,
                       elites=max(2, arguments.candidates // 4))  # fmt: skip
-    simulated = max(1, samples * n_targets // 4)  # rollouts, a part of those of one iteration
+    simulated = max(1, max(1, samples) * n_targets // 4)  # rollouts, a part of those of one iteration
     start, torques = task.start, 0.1 * torch.randn(n_targets, horizon, 2, generator=torch.Generator().manual_seed(0))
     ways: dict[str, Callable[[], object]] = {
         "latent, Adam": lambda: few_adam(fast, space=latent(prior)),
@@ -128,7 +126,7 @@ def main() -> None:
         )  # fmt: skip
         if planner == "cem":
             continue
-        scale, n_rollouts = arguments.iterations / few, few * samples * n_targets
+        scale, n_rollouts = arguments.iterations / few, few * max(1, samples) * n_targets
         rows.append(
             Row.of(
                 f"plan, {word}, {n_targets} targets, {arguments.iterations} iterations, extrapolated: seconds",

@@ -18,13 +18,13 @@ from _simulator import ENV, raw
 
 from tsmlib import study
 from tsmlib.models.base import rollout
-from tsmlib.study import runs
+from tsmlib.study import runs, zoo
 from tsmlib.trajectory import initial_past
 
 
 def main() -> None:
     options = parser(__doc__, rounds=4)
-    options.add_argument("--models", default="tsm,tsm+energy+direct,lstm,onestep")
+    options.add_argument("--models", default=f"{zoo.PAPERS},{zoo.OURS},lstm,onestep")
     options.add_argument("--rows", default="100,400,1600", help="imagined at once")
     options.add_argument("--horizon", type=int, default=50)
     options.add_argument("--episodes", type=int, default=100, help="that the simulator executes in each round")

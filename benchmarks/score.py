@@ -21,7 +21,7 @@ from tsmlib.models.base import rollout
 from tsmlib.study import runs
 from tsmlib.trajectory import Segment, Trajectories
 
-ENV, BYTES = "tsm/ReacherPush-v0", 2**28
+ENV, BYTES = "tsm/ReacherPush-v1", 2**28
 
 
 def main() -> None:

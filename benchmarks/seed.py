@@ -32,7 +32,7 @@ from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, MUJOCO_IDS, NOISE
 from tsmlib.evaluation import prediction
 from tsmlib.planning.planners import cem, reevaluate
-from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
@@ -43,8 +43,7 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
 
 BUDGET = 2 * 2 * 3600.0  # seconds of two cores in two hours
-REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
-BEST = "tsm+energy+direct"
+REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 IMPERFECT = (imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY))
 WORDS = {
     "train": "all trainings of a seed: CPU seconds", "score": "all scores of a seed: CPU seconds",
@@ -109,29 +108,28 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
     envs = arguments.envs.split(",")
     data = {env: study.random_data(env, 200, seed=0) for env in (*envs, *(IMPERFECT if REACH in envs else ()))}
     few = {env: study.random_data(env, arguments.little, seed=1) for env in data}
-    robust = [word for word in models if word in ("tsm", BEST, "onestep", "multistep", "lstm")]
+    robust = [word for word in models if word in (zoo.PAPERS, zoo.OURS, "onestep", "multistep", "lstm")]
     nets = {(env, word): study.initialise(run, word, data[env]) for env in data for word in (*models, "prior")}
     for env in data:
-        own = robust if env in IMPERFECT else [*models, *(["tsm+teacher"] if env == PUSH else [])]
-        for word in own:
+        for word in robust if env in IMPERFECT else models:
             yield from trainings(run, env, word, data[env], arguments.updates)
-            if word in models:
-                yield from scores(nets[env, word], few[env])
+            yield from scores(nets[env, word], few[env])
     for env in (env for env in (REACH, PUSH) if env in envs):
         yield from trainings(run, env, "prior", data[env], arguments.updates)
         task = study.task(env, "validation")
         for word in models:
             if word in planning_results.PAPER:
                 yield from plans(nets[env, word], nets[env, "prior"], task, arguments.little)
-        for word in (word for word in models if word in (BEST, "onestep", "multistep", "lstm", "ensemble+mse")):
-            yield from policies(nets[env, word], nets[env, "prior"] if word == BEST else None, task, arguments.updates)
+        for word in (word for word in models if word in (zoo.OURS, "onestep", "multistep", "lstm", "ensemble+mse")):
+            prior = nets[env, "prior"] if word == zoo.OURS else None
+            yield from policies(nets[env, word], prior, task, arguments.updates)
 
 
 def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) -> Iterator[Part]:
     """The stages of one model; an update costs the same at any time."""
     net, held_out = study.initialise(run, word, data), data.take(slice(1))
     for stage in study.schedule(run, env, word):
-        few = training(net, stage, (data, held_out), updates=n, bf16=stage.bf16)
+        few = training(net, stage, (data, held_out), updates=n)
         yield Part("train", few, stage.steps / n)
 
 
@@ -145,10 +143,9 @@ def scores(net: Any, few: Trajectories) -> Iterator[Part]:
 def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
     """CEM of 96 candidates and 10 iterations in both search spaces, and predicted returns from 32 other samples."""
     few, horizon = task.take(n), task.horizon
-    past, samples = few.past(net.past_len), 2 if net.stochastic else 1
+    past = few.past(net.past_len)
     for space in (LatentActions(prior, horizon), DirectActions(horizon)):
-        predict = model_predictor(net, past, samples=samples)
-        judge = model_predictor(net, past, samples=16 * samples, seed=1)
+        predict, judge = model_predictor(net, past), fresh_predictor(net, past, seed=1)
 
         def call(space: Any = space, predict: Any = predict) -> None:
             cem(predict, few.reward, space, len(few), candidates=96, elites=9, iterations=2)

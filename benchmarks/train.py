@@ -3,7 +3,8 @@
 Every call is ``tsmlib.training.fit.fit`` for ten updates, with the loss, the batch and the future of a stage of
 ``study.schedule``: windows drawn, loss, gradient, clipping, Adam, and one validation on so few windows that its share
 is that of the study (2,000 windows every 250 updates). The reference is the same stage in float32 through
-``_plain.PlainTSM``; for models that have no plain form, themselves in the other precision. The limit is the time that
+``_plain.PlainTSM``; for models that have no plain form, themselves in the other precision, which is emulated where the
+processor has no bfloat16. The limit is the time that
 the matrix products of the very same call take alone, in float32: the share says how many of the CPU's float32
 operations per second training gets.
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from _plain import PlainTSM
@@ -25,9 +27,10 @@ from tsmlib.models.tsm import TSM
 from tsmlib.study import runs, zoo
 from tsmlib.study.zoo import Updates
 from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 WORDS = {"teacher_forced_loss": "teacher-forced", "loss": "free-running", "energy_loss": "energy score"}
 ONE_STEP = {"onestep", "ensemble", "ensemble+mse"}
 Data = tuple[Trajectories, Trajectories]
@@ -59,22 +62,28 @@ def main() -> None:
     save("train", rows)
 
 
-def training(net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool) -> Callable[[], object]:
-    """``updates`` updates of a stage, as the study has them."""
+def training(net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool | None = None) -> Callable[[], object]:
+    """``updates`` updates of a stage, as the study has them.
+
+    bf16: matrix products in bfloat16, native or not; None: as ``fit`` chooses by the stage and the processor.
+    """
 
     def call() -> None:
         options = TrainingOptions(
             past_len=net.past_len, future_len=stage.future_len, steps=updates,
-            batch_size=stage.batch, validate_every=updates, lr=1e-5, bf16=bf16,
+            batch_size=stage.batch, validate_every=updates, lr=1e-5, muon=1e-5 if stage.muon else 0.0,
+            weight_decay=stage.weight_decay, bf16=stage.bf16 if bf16 is None else bf16,
         )  # fmt: skip
-        fit(net, getattr(net, stage.loss), *data, options)
+        chosen = native_bf16() if bf16 is None else bf16
+        with mock.patch("tsmlib.training.fit.native_bf16", return_value=chosen):
+            fit(net, getattr(net, stage.loss), *data, options)
 
     return call
 
 
 def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) -> Row:
     """Supervised targets per second of one stage."""
-    bf16 = stage.bf16
+    bf16 = stage.bf16 and native_bf16()
     plain = PlainTSM(net) if isinstance(net, TSM) else net
     other = "plain eager float32" if plain is not net else f"itself in {'float32' if bf16 else 'bfloat16'}"
     fast = training(net, stage, data, updates=arguments.updates, bf16=bf16)

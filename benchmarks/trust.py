@@ -36,7 +36,7 @@ from tsmlib.training.checkpoint import TrainingState
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories, Window
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 EVERY = 250  # updates to a checkpoint, at scales laptop and paper
 
 

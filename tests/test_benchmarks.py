@@ -24,6 +24,7 @@ import _table
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],
     "train": ["--models", "tsm,onestep", "--updates", "1", "--batch", "4", "--batches", "4", "--episodes", "3"],
+    "avx2": ["--models", "onestep,prior", "--updates", "1", "--batch", "4", "--episodes", "3"],
     "rollout": ["--models", "tsm,onestep", "--rows", "2,4", "--horizon", "3", "--episodes", "2"],
     "plan": [
         *("--targets", "2", "--iterations", "1", "--few", "1", "--samples", "1"),
@@ -41,6 +42,7 @@ ROWS = {  # configuration -> metrics
     "train": {
         "teacher_forced_loss": {"targets_per_second"}, "loss": {"targets_per_second"}, "batch": {"windows_per_second"},
     },
+    "avx2": {"loss": {"updates_per_second"}},
     "rollout": {"float32": SPEEDS, "bfloat16": SPEEDS},
     "plan": {"plain": {"iterations_per_second"}, "simulate": {"plan_seconds"}},
     "policy": {"one": SECONDS, "copies": SECONDS},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -9,13 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from tsmlib import study
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
+from tsmlib.trajectory import initial_past
 
 sys.path.insert(0, str(runs.ROOT / "benchmarks" / "settings"))
 
 import as_published
+import judge
 import spent
 
 ARM = ["--env", "tsm/Reacher-v0"]
@@ -81,7 +88,7 @@ def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
     said = {
         "models/Reacher/tsm+energy.safetensors": "models, Reacher",
         "models/Reacher-delay5/lstm.safetensors": "models, Reacher-delay5",
-        "models/Reacher/policy-tsm+energy+direct-latent.safetensors": "policies, tsm+energy+direct-latent",
+        "models/Reacher/policy-ensemble+mse-latent.safetensors": "policies, ensemble+mse-latent",
         "plans/Reacher-oracle-latent-cem-every10.safetensors": "plans, oracle",
         "plans/Reacher-ensemble+mse-latent-cem-every10.safetensors": "plans, cem-every10",
     }
@@ -93,3 +100,37 @@ def test_the_plan_that_a_closed_loop_begins_with_is_counted_once(tmp_path: Path)
         path = tmp_path / f"{name}.safetensors"
         artifacts.save(path, {"actions": np.zeros(1, np.float32)}, kind="plan", header={"seconds": seconds})
     assert spent.took(path) == 7.0
+
+
+def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    task = dataclasses.replace(study.load_task("tsm/ReacherPush-v1", "validation").take(2), horizon=20)
+    model, space = RecurrentTSM(10, 2, hidden=8), DirectActions(20)
+    model.features.step_std.fill_(0.01)
+    rows = []
+    for name in ("mode", "mean of 2", "fresh mean of 2", "median of 6", "mode and mean of 2"):
+        way = judge.Way(name, seed=0, candidates=4, iterations=2, again=1)
+        rows += [
+            {"env": task.env, "model": "rtsm"} | row for row in judge.measured(task, model, space, way, closed=True)
+        ]
+    judge.write(tmp_path / "judge.csv", judge.with_differences(rows))
+    found = judge.read(tmp_path / "judge.csv")
+    assert [row["closed"] for row in found] == 5 * ["0", "1"]
+    mode, other = (np.array(found[i]["costs"].split(), float) for i in (0, 2))
+    assert float(found[2]["more_than_mode"]) == pytest.approx(float((other - mode).mean()), rel=0.01, abs=1e-3)
+    (tmp_path / "judge.csv").write_text("model,judge\nrtsm,mode\n")
+    with pytest.raises(ValueError, match="has no columns .*; name another table with --out"):
+        judge.read(tmp_path / "judge.csv")
+
+
+def test_fresh_samples_are_common_to_a_population_and_new_in_the_next() -> None:
+    torch.manual_seed(0)
+    model, past = RecurrentTSM(10, 2, hidden=8), initial_past(torch.zeros(2, 10), 10, 2)
+    fresh = judge.judged_by("fresh mean of 2", 3)(model, past, seed=0)
+    actions = torch.zeros(1, 2, 20, 2)
+    start, *first = (fresh(actions) for _ in range(5))  # the start, three candidates and their mean
+    again = fresh(actions)
+    for states in first[1:]:
+        assert torch.equal(states, first[0])
+    assert not torch.equal(start, first[0])
+    assert not torch.equal(again, first[0])

@@ -34,8 +34,6 @@ from tsmlib.study.claims.query import (
     LIKELIHOODS,
     LSTM,
     ONE_STEP,
-    OURS,
-    PAPERS,
     REACHER,
     TSM,
     Check,
@@ -49,6 +47,7 @@ from tsmlib.study.claims.query import (
 )  # fmt: skip
 from tsmlib.study.claims.shown import FIGURE5
 from tsmlib.study.runs import NOTEBOOKS, ROOT
+from tsmlib.study.zoo import OURS, PAPERS
 
 Rows = list[dict[str, Any]]
 

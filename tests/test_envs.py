@@ -9,8 +9,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from tsmlib.envs.arm import ArmVectorEnv
-from tsmlib.envs.geometry import BLOCK_CLEARANCE, BLOCK_RING, DT, closest_gap, fingertip
-from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS
+from tsmlib.envs.geometry import (
+    BLOCK_CLEARANCE,
+    BLOCK_RING,
+    DT,
+    START_ANGLES,
+    TARGET_RING,
+    closest_gap,
+    fingertip,
+)
+from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS, EnvSpec
 
 WITH_BLOCK = [env_id for env_id in ENV_IDS if not env_id.endswith("Reacher-v0")]
 N, T = 12, 60
@@ -60,6 +68,23 @@ def test_the_block_starts_within_reach_and_clear_of_the_arm(env_id: str) -> None
     assert inner <= distance.min() < inner + 0.01 < outer - 0.01 < distance.max() <= outer
     assert closest_gap(states, env_id).min() > BLOCK_CLEARANCE
     np.testing.assert_array_equal(states[:, 8:], 0)
+
+
+def test_arms_begin_stretched_out_along_x_but_in_every_direction_where_they_push(env_id: str) -> None:
+    angles = arms(env_id, 300).reset(seed=0)[0][:, :2]
+    for joint, most in zip(angles.T, START_ANGLES[EnvSpec.parse(env_id).task], strict=True):
+        assert 0.95 * most < np.abs(joint).max() <= most
+        assert np.abs(np.histogram(joint, 6, (-most, most))[0] - 50).max() < 25  # uniform: 50 each, give or take 6.5
+
+
+def test_targets_lie_in_the_tasks_ring_uniformly_over_its_area(env_id: str) -> None:
+    inner, outer = TARGET_RING[EnvSpec.parse(env_id).task]
+    distance = np.linalg.norm(arms(env_id, 300).reset(seed=1)[1]["target"], axis=1)
+    assert inner <= distance.min() <= distance.max() <= outer
+    assert 0.4 < (distance < np.sqrt((inner**2 + outer**2) / 2)).mean() < 0.6
+    given = arms(env_id, 300)
+    _, info = given.reset(seed=1, options={"states": given.reset(seed=0)[0]})
+    assert np.linalg.norm(info["target"], axis=1).min() >= inner
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(env_id: str) -> None:
@@ -136,7 +161,7 @@ def test_the_reward_is_distance_and_torque_after_the_step(env_id: str) -> None:
     env.reset(seed=6, options={"target": np.array([0.1, 0.05])})
     actions = np.full((N, 2), 2.0)
     states, reward, terminated, truncated, _ = env.step(actions)
-    moved = states[:, 6:8] if env_id.endswith("Push-v0") else states[:, 4:6]
+    moved = states[:, 6:8] if env_id.endswith("Push-v1") else states[:, 4:6]
     np.testing.assert_allclose(reward, -np.linalg.norm(moved - [0.1, 0.05], axis=1) - 2.0)
     assert not terminated.any()
     assert not truncated.any()

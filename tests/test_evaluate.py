@@ -532,7 +532,7 @@ def test_a_step_touches_if_the_arm_is_at_the_block_before_or_after_it() -> None:
     states = np.zeros((1, 5, 10))  # the arm lies along x
     states[..., 6:8] = 0.0, 0.15
     states[0, 2, 6:8] = 0.1, 0.02
-    steps = contacts.contact_steps(states, "tsm/ReacherPush-v0")
+    steps = contacts.contact_steps(states, "tsm/ReacherPush-v1")
     assert steps.tolist() == [[False, True, True, False]]
     assert contacts.after_first(steps).tolist() == [[False, True, True, True]]
     assert prediction.cut(steps, (0, 2), 2).tolist() == [[False, True], [True, False]]

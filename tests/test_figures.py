@@ -50,8 +50,12 @@ def steps() -> dict[figures.Method, dict[str, np.ndarray]]:
     return {PLANNED: {"iterations": at, "true": -5 + at / 20, "predicted": -5 + at / 10}}
 
 
-def draw(ax: plt.Axes, state: np.ndarray, target: np.ndarray) -> None:
-    ax.plot([0, state[4]], [0, state[5]])
+def film(height: int, width: int) -> np.ndarray:
+    return np.zeros((2, height, width, 3), np.uint8)
+
+
+def draw(ax: plt.Axes, states: np.ndarray, target: np.ndarray) -> None:
+    ax.plot([0, states[-1, 4]], [0, states[-1, 5]])
     ax.plot(*target, "o")
 
 
@@ -67,7 +71,13 @@ EVERY = {
     "state_histograms": lambda: figures.state_histograms(noise(4, 20, 6), NAMES, UNITS),
     "workspace_coverage": lambda: figures.workspace_coverage(0.2 * noise(500, 2), 0.21),
     "rollout_panels": lambda: figures.rollout_panels(noise(15, 6), noise(4, 15, 6), NAMES, UNITS, TSM),
-    "plan_strip": lambda: figures.plan_strip(draw, noise(10, 6), noise(10, 6), np.zeros(2), [0, 4, 9]),
+    "plan_strip": lambda: figures.plan_strip(
+        draw,
+        {TSM: (noise(10, 6), noise(10, 6)), PLANNED: (noise(10, 6), noise(10, 6))},
+        np.zeros(2),
+        [0, 4, 9],
+        notes={TSM: "ends 3 mm off"},
+    ),
     "plan_actions": lambda: figures.plan_actions(noise(20, 2), noise(20, 2), noise(20, 2), TSM, dt=0.02),
     "along_the_way": lambda: figures.along_the_way(steps()),
     "final_distances": lambda: figures.final_distances({"push": {PLANNED: {"open": np.abs(noise(9))}}}, 0.03),
@@ -171,7 +181,18 @@ def test_a_rollout_is_drawn_over_the_truth() -> None:
         (lambda: figures.final_distances({"push": {TSM: {"shut": noise(3)}}}, 0.03), "'shut', expected open or"),
         (lambda: figures.plan_paths(noise(2, 9, 2), noise(3, 9, 2), TSM), "predicted holds 2 paths and executed 3"),
         (lambda: figures.loss_curves({TSM: {"train": noise(3)}}), "expected 'seconds' or 'step'"),
-        (lambda: figures.plan_strip(draw, noise(9, 6), noise(9, 6), np.zeros(2), [9]), "between 0 and 8"),
+        (lambda: figures.plan_strip(draw, {TSM: (noise(9, 6), noise(9, 6))}, np.zeros(2), [9]), "between 0 and 8"),
+        (
+            lambda: figures.plan_strip(draw, {TSM: (noise(9, 6), noise(8, 6))}, np.zeros(2), [0]),
+            "executed states of TSM",
+        ),
+        (lambda: figures.plan_strip(draw, {}, np.zeros(2), [0]), "nothing to draw"),
+        (lambda: figures.side_by_side({}), "no film"),
+        (
+            lambda: figures.side_by_side({"low": film(4, 6), "high": film(5, 6)}),
+            "low 4, high 5; render all at one height",
+        ),
+        (lambda: figures.stacked(film(4, 6), film(4, 8)), "above is 6 pixels wide and below 8"),
         (lambda: figures.save_video(noise(2, 4, 4, 3), "a.mp4"), "expected uint8"),
         (lambda: figures.save_video(np.zeros((2, 4, 4, 3), np.uint8), "a.gif"), "must end in .mp4"),
     ],
@@ -186,10 +207,12 @@ def test_a_film_has_even_sides_and_waits_for_the_longer_half(tmp_path) -> None:
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     left, right = np.zeros((3, 65, 63, 3), np.uint8), np.full((5, 65, 64, 3), 200, np.uint8)
-    both = figures.side_by_side(left, right, ("model", "simulator"))
+    both = figures.side_by_side({"model": left, "simulator": right})
     assert both.shape[0] == 5
     assert both.shape[2] == 127
     np.testing.assert_array_equal(both[4, -65:, :63], left[2])
+    tall = figures.stacked(both[:2], both)
+    np.testing.assert_array_equal(tall[4], np.concatenate([both[1], both[4]]))
     first, second = figures.save_video(both, tmp_path / "a.mp4"), figures.save_video(both, tmp_path / "b.mp4")
     assert first.read_bytes() == second.read_bytes()
     frames = np.stack(imageio.mimread(first))

@@ -15,9 +15,9 @@ import pytest
 from tsmlib import study
 from tsmlib.envs import fingerprint, imperfect
 from tsmlib.envs.geometry import HALF_RANGE
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec, gone
 
-REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v0"
+REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
@@ -30,13 +30,13 @@ def test_a_name_says_what_is_imperfect_and_nothing_else(env_id: str) -> None:
         names.add(name)
     assert len(names) == 28
     assert imperfect(env_id) == env_id
-    assert imperfect(env_id, noise=0.25, delay=5) == env_id.replace("-v0", "-noise0.25-delay5-v0")
+    assert imperfect(env_id, noise=0.25, delay=5) == env_id.replace("-v", "-noise0.25-delay5-v")
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_the_papers_imperfections_are_there_from_the_start(env_id: str) -> None:
     for word in ("noise0.25", "delay5"):
-        assert env_id.replace("-v0", f"-{word}-v0") in gymnasium.registry
+        assert env_id.replace("-v", f"-{word}-v") in gymnasium.registry
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
@@ -96,6 +96,28 @@ def test_another_name_is_refused(env_id: str) -> None:
         EnvSpec.parse(env_id)
 
 
+@pytest.mark.parametrize("arm", ["ReacherPush", "PymunkPush"])
+@pytest.mark.parametrize("how", ["", "-noise0.25", "-delay5", "-noise0.1-delay3"])
+def test_version_0_of_pushing_is_refused_with_the_reason_and_what_took_its_place(arm: str, how: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        EnvSpec.parse(f"tsm/{arm}{how}-v0")
+    message = str(caught.value)
+    assert message.startswith(f"tsm/{arm}{how}-v0 is gone: the physics of pushing changed")
+    assert message.endswith(f"tsm/{arm}{how}-v1 took its place")
+    for changed in ("0.05 s, before in 0.2 s", "0.24 m", "first poses in every direction", "T = 100 steps"):
+        assert changed in message
+    with pytest.raises(gymnasium.error.Error, match=f"(deprecated.*tsm/{arm}{how}-v1)|(doesn't exist)"):
+        gymnasium.make(f"tsm/{arm}{how}-v0")
+
+
+def test_only_pushing_has_another_version() -> None:
+    assert [env_id for env_id in ENV_IDS if not env_id.endswith("-v0")] == ["tsm/ReacherPush-v1", "tsm/PymunkPush-v1"]
+    for env_id in ("tsm/Reacher-v1", "tsm/ReacherPush-v2", "tsm/ReacherPush"):
+        assert not gone(env_id)
+        with pytest.raises(ValueError, match="is none of"):
+            EnvSpec.parse(env_id)
+
+
 def test_data_of_other_imperfections_are_other_data() -> None:
     ids = [REACHER, *(imperfect(REACHER, noise=noise, delay=delay) for noise, delay in
                       [(NOISE, 0), (0.1, 0), (0.0, DELAY), (0.0, 4), (NOISE, DELAY)])]  # fmt: skip
@@ -134,8 +156,8 @@ def test_noise_is_in_half_ranges() -> None:
 def test_gymnasium_finds_the_arms_by_themselves_and_imports_a_simulator_when_one_is_made() -> None:
     program = """import sys, gymnasium, tsmlib.envs
 assert not {"mujoco", "pymunk", "torch", "matplotlib"} & set(sys.modules)
-gymnasium.make("tsm/PymunkPush-v0").reset()
+gymnasium.make("tsm/PymunkPush-v1").reset()
 assert "mujoco" not in sys.modules"""
-    for text in ('import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v0").reset()', program):
+    for text in ('import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v1").reset()', program):
         done = subprocess.run([sys.executable, "-W", "error", "-c", text], capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, "")

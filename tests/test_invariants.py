@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tsmlib.collection import smooth_torques
-from tsmlib.envs.geometry import closest_gap, fingertip
+from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
 from tsmlib.evaluation.actions import novelty, roughness, within
 from tsmlib.evaluation.exploitation import shares, violations, worst
 
-PUSH, PYMUNK = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
+PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 
 
 def world(env_id: str, n: int = 200, rms: float = 0.1, steps: int = 50) -> np.ndarray:
@@ -39,7 +39,7 @@ def test_the_true_world_breaks_nearly_none(env_id: str, rms: float) -> None:
     assert found["violations"].mean() < 1e-3
     step = np.linalg.norm(np.diff(states[..., 6:8], axis=1), axis=-1)
     sliding = (step > 0.005) & (closest_gap(states, env_id)[:, 1:] > 0.005)
-    assert sliding.mean() > 5e-3  # the paper's wording alone would blame the world
+    assert sliding.mean() > 5e-4  # the paper's wording alone would blame the world
 
 
 def test_an_object_that_moves_on_its_own_is_found_from_5_mm_on() -> None:
@@ -53,14 +53,14 @@ def test_an_object_that_moves_on_its_own_is_found_from_5_mm_on() -> None:
 
 
 def test_an_object_that_drifts_slowly_is_found() -> None:
-    states = still()
+    states = still(block=(0.0, 0.12))
     states[0, :, 7] += 0.0012 * np.arange(51)
     found = violations(states, PUSH)["moves_untouched"][0]
     np.testing.assert_array_equal(found, 0.0012 * np.arange(1, 51) > 0.005)
 
 
 def test_a_pushed_object_may_slide_as_far_as_its_speed_carries_it() -> None:
-    speed, decay = 1.0, 0.2
+    speed, decay = 1.0, BLOCK_DECAY
     seconds = 0.02 * np.arange(51)
     sliding = still(2, block=(0.0, 0.1))
     sliding[:, :, 7] += speed * decay * (1 - np.exp(-seconds / decay)) * 0.6

@@ -17,13 +17,14 @@ from tsmlib.evaluation.contacts import Deflections
 from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
+from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import tables
 from tsmlib.study import zoo
 from tsmlib.study.results import latent as latent_results
 from tsmlib.trajectory import Segment, Trajectories, Window
 
-PUSH = "tsm/ReacherPush-v0"
+PUSH = "tsm/ReacherPush-v1"
 
 
 def rng(seed: int = 0) -> torch.Generator:
@@ -46,7 +47,7 @@ def model(test_data: Trajectories) -> TSM:
 class Shifts:
     """A model whose future is the last state plus ``reach`` times the code, in every step."""
 
-    segment_len, past_len, latent_dim = 10, 10, 3
+    segment_len, code_len, past_len, latent_dim = 10, 10, 10, 3
     reach = torch.tensor([0.5, 0.1, 0.0])
 
     def __init__(self) -> None:
@@ -54,6 +55,14 @@ class Shifts:
 
     def decode(self, past: Segment, actions: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         return (past.states[:, -1] + self.reach * z)[:, None].expand(-1, actions.shape[1], -1)
+
+
+@pytest.fixture(scope="module")
+def recurrent(test_data: Trajectories) -> RecurrentTSM:
+    torch.manual_seed(0)
+    net = RecurrentTSM(10, 2, hidden=8, latent_dim=3)
+    net.features.fit(torch.from_numpy(test_data.states))
+    return net
 
 
 def still_window(n: int, steps: int = 10) -> Window:
@@ -124,7 +133,27 @@ def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(model: TSM,
     assert near[:, contacts.LEAD - 1].all()
     assert not near[:, : contacts.LEAD - 1].any()
     with pytest.raises(ValueError, match="none of the 40 episodes"):
-        contacts.windows_before_contact(model, test_data, samples=1, horizon=90)
+        contacts.windows_before_contact(model, test_data, samples=1, horizon=95)
+
+
+def test_codes_of_a_recurrent_model_are_looked_at_in_the_same_way(
+    recurrent: RecurrentTSM, test_data: Trajectories
+) -> None:
+    seen = futures.sample_futures(recurrent, test_data, samples=4, horizon=30)
+    swings, _ = contacts.windows_before_contact(recurrent, test_data, samples=2, horizon=20)
+    found = latent_results.rows(recurrent, seen, swings, model="rtsm", seed=0, scale="smoke")
+    effects = [row["value"] for row in found if row["metric"] == "importance"]
+    assert len(effects) == 3
+    assert min(effects) > 0
+    codes = torch.randn(5, 3, generator=rng())
+    one = latent.window_at(seen, recurrent.features, 0.5)
+    ways = latent.decode_codes(recurrent, one, codes, 30)
+    assert ways.shape == (5, 30, 10)
+    past, future = (Segment(*(part.expand(5, -1, -1) for part in side)) for side in one)
+    first = recurrent.decode(past, future.actions[:, :10], codes)
+    torch.testing.assert_close(ways[:, :10], first)  # then the mode goes on
+    still = latent.decode_codes(recurrent, one, torch.zeros(1, 3), 30)
+    assert torch.equal(still, recurrent.predict_segment(*one[:1], one.future.actions))
 
 
 def test_every_step_counts_alike_however_often_it_occurs() -> None:
@@ -150,9 +179,9 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     size[:25, 6:] = 0.1
     seen = SampledFutures(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
     net: Any = SimpleNamespace(
-        segment_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
+        code_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
     )
-    rows = latent_results.code_rows(net, seen, rng(), model="tsm+energy", seed=0, scale="smoke")
+    rows = latent_results.code_rows(net, seen, rng(), model="rtsm", seed=0, scale="smoke")
     value = {(row["metric"], row.get("subset", "")): row["value"] for row in rows}
     assert value["spread_ratio", ""] == pytest.approx(5, rel=0.05)
     assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
@@ -165,7 +194,7 @@ def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> N
     seen, draw = scene(8), rng()
     still = torch.zeros(8, 1)
     net: Any = SimpleNamespace(
-        segment_len=10, latent_dim=1, features=Features(10, ()), encode=lambda states: (still, still),
+        code_len=10, latent_dim=1, features=Features(10, ()), encode=lambda states: (still, still),
         decode=lambda past, u, z: past.states + noise * torch.randn(past.states.shape, generator=draw),
     )  # fmt: skip
     rows = latent_results.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")

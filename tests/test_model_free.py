@@ -62,7 +62,9 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
     task, actions, seen, rewards = played(env)
     trial = execute(task, actions)
     states = trial.states.numpy()
-    flat = model_free.observed(states.reshape(-1, states.shape[2]), np.repeat(task.target.numpy(), 51, axis=0))
+    flat = model_free.observed(
+        states.reshape(-1, states.shape[2]), np.repeat(task.target.numpy(), task.horizon + 1, axis=0)
+    )
     np.testing.assert_allclose(seen.reshape(len(flat), -1), flat, rtol=1e-6, atol=1e-6)
     per_step = task.reward(trial.states[:, 1:], actions)
     np.testing.assert_allclose(rewards, per_step, atol=1e-6)
@@ -76,14 +78,14 @@ def test_a_policy_sees_what_ours_see_and_the_target() -> None:
 
 
 def test_new_episodes_have_other_starts_and_targets_within_the_disc() -> None:
-    episodes = model_free.Episodes("tsm/ReacherPush-v0", 50, seed=0)
+    episodes = model_free.Episodes("tsm/ReacherPush-v1", 50, seed=0)
     first, second = episodes.reset(), episodes.reset()
     assert not np.isclose(first, second).all(axis=1).any()
     targets = np.concatenate([first, second])[:, -2:]
     distance = np.linalg.norm(targets, axis=1)
     assert distance.max() <= 0.2
     assert 0.4 < np.mean(distance < 0.2 / 2**0.5) < 0.6  # uniform over the area
-    again = model_free.Episodes("tsm/ReacherPush-v0", 50, seed=0)
+    again = model_free.Episodes("tsm/ReacherPush-v1", 50, seed=0)
     np.testing.assert_array_equal(again.reset(), first)
 
 
@@ -101,7 +103,7 @@ def test_the_first_configurations_try_each_pair_of_values_once() -> None:
         for pair in (list(settings[0])[:2], list(settings[0])[1:], list(settings[0])[::2]):
             assert len({tuple(setting[name] for name in pair) for setting in settings[:4]}) == 4
         for setting in settings:
-            assert setting["episodes"] * model_free.HORIZON % model_free.MINIBATCH == 0
+            assert setting["episodes"] * model_free.horizon("tsm/Reacher-v0") % model_free.MINIBATCH == 0
 
 
 def records(*steps: int) -> list[dict[str, float]]:
@@ -161,7 +163,7 @@ def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) ->
 def test_the_library_is_told_how_an_episode_ended() -> None:
     arms = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
     arms.reset()
-    for _ in range(model_free.HORIZON - 1):
+    for _ in range(model_free.horizon("tsm/Reacher-v0") - 1):
         *_, done, infos = arms.step(np.zeros((3, 2), np.float32))
         assert not done.any()
         assert infos == [{}, {}, {}]
@@ -207,9 +209,9 @@ def test_the_readme_states_what_is_run() -> None:
     known = {option for action in model_free.parser()._actions for option in action.option_strings}
     assert set(re.findall(r"`?(--(?!no-deps)[a-z]+)", readme)) <= known
     steps = model_free.STEPS
-    assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v0']:,} pushing" in readme
+    assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v1']:,} pushing" in readme
     steps = model_free.SEARCH_STEPS
-    assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v0']:,} for" in readme
+    assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v1']:,} for" in readme
     for name in ("learning_rate", "target_kl", "episodes", "std"):
         values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
         assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name

@@ -169,9 +169,9 @@ def test_a_target_out_of_reach_is_refused() -> None:
     ):
         dataclasses.replace(task, target=far)
     dataclasses.replace(task, target=0.9 * far)
-    push = study.draw_task("tsm/ReacherPush-v0", seed=3, n=N)
+    push = study.draw_task("tsm/ReacherPush-v1", seed=3, n=N)
     dataclasses.replace(push, target=far)  # an object can lie in the corner
-    with pytest.raises(ValueError, match=r"target 0 at \(0.300, 0.300\) m is out of reach: the object gets .* 0.25 m"):
+    with pytest.raises(ValueError, match=r"target 0 at \(0.300, 0.300\) m is out of reach: the object gets .* 0.21 m"):
         dataclasses.replace(push, target=3 * far)
 
 

@@ -70,7 +70,7 @@ def test_the_longest_trainings_begin_first(run: Run, monkeypatch: pytest.MonkeyP
     study.precompute_models(run, [(env, "tsm") for env in ENV_IDS])
     steps = [study.models.schedule(replace(run, scale="paper"), env, model)[0].steps for env, model in asked]
     assert len(asked) == len(ENV_IDS)
-    assert asked[0][0] == "tsm/ReacherPush-v0"
+    assert asked[0][0] == "tsm/ReacherPush-v1"
     assert steps[0] == max(steps)
 
 

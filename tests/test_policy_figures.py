@@ -18,7 +18,7 @@ from tsmlib.statistics import interval
 from tsmlib.study.zoo import method
 
 LATENT, DIRECT, RIVAL = method("tsm", "latent"), method("tsm", "direct"), method("lstm", "direct")
-METHODS = (LATENT, DIRECT, method("tsm+energy+direct", "latent"), method("onestep", "direct"), RIVAL)
+METHODS = (LATENT, DIRECT, method("rtsm", "latent"), method("onestep", "direct"), RIVAL)
 PPO, TRPO, ZERO = method("ppo"), method("trpo"), method("zero")
 FLOORS = {"reach": {method("oracle", "latent", "cem"): -4.2, method("oracle", "direct", "cem"): -4.1, ZERO: -12.0}}
 

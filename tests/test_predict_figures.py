@@ -17,7 +17,7 @@ from tsmlib.figures import axes
 from tsmlib.study.zoo import method
 
 MODELS = TSM, _, _, ONE_STEP, MULTI_STEP, LSTM, ENSEMBLE, _ = tuple(
-    map(method, ("tsm", "tsm+energy", "tsm+teacher", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse"))
+    map(method, ("tsm", "rtsm", "tsm+teacher", "onestep", "multistep", "lstm", "ensemble", "ensemble+mse"))
 )
 ENVS = ("Reacher", "Obstacle", "Push")
 NAMES = ("joint0", "joint1", "tip_x", "tip_y", "block_x", "block_y")

@@ -13,7 +13,7 @@ from tsmlib.evaluation import prediction
 from tsmlib.storage import artifacts, manifest, tables
 from tsmlib.study.runs import Run, RunError
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +59,9 @@ def test_at_scale_laptop_an_environment_that_is_not_published_shows_its_own_rows
     monkeypatch.setattr(study.predictions, "RESULTS", tmp_path)
     row = dict(sim="mujoco", model="tsm", metric="nrmse", value=1.0, n=1, seed=0, scale="paper")
     tables.save(tmp_path / "03_predict.csv", [dict(row, env="tsm/Reacher-v0")])
-    own = [dict(row, env=env, value=2.0) for env in ("tsm/Reacher-v0", "tsm/PymunkPush-v0")]
+    own = [dict(row, env=env, value=2.0) for env in ("tsm/Reacher-v0", "tsm/PymunkPush-v1")]
     drawn = study.published_rows(Run("03_predict", "laptop", 0, tmp_path / "seed0"), own)
-    assert dict(zip(drawn["env"], drawn["value"], strict=True)) == {"tsm/Reacher-v0": 1.0, "tsm/PymunkPush-v0": 2.0}
+    assert dict(zip(drawn["env"], drawn["value"], strict=True)) == {"tsm/Reacher-v0": 1.0, "tsm/PymunkPush-v1": 2.0}
     assert study.published_rows(Run("03_predict", "smoke", 0, tmp_path / "seed0"), own).equals(tables.frame(own))
 
 

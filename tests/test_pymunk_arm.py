@@ -63,8 +63,8 @@ def test_gymnasium_finds_no_fault(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", [OBSTACLE, PUSH])
 def test_an_untouched_object_does_not_move(env_id: str) -> None:
-    env, start = arms(env_id, n=100)
-    states = env.rollout(smooth_torques(100))
+    env, start = arms(env_id, n=200)
+    states = env.rollout(smooth_torques(200))
     untouched = (closest_gap(states, env_id) > 0.02).all(axis=1)  # further away than the arm moves in a substep
     assert untouched.sum() > 20
     moved = np.abs(states[untouched, :, 6:] - start[untouched, None, 6:])

@@ -31,7 +31,7 @@ def test_fingertip_and_block_are_drawn_where_they_are(env_id: str) -> None:
     assert image.shape == (480, 480, 3)
     assert image.dtype == np.uint8
     np.testing.assert_allclose(colour_at(image, state[4:6]), to_rgb(render.TIP), atol=0.02)
-    if env_id.endswith("Push-v0"):
+    if env_id.endswith("Push-v1"):
         np.testing.assert_allclose(colour_at(image, state[6:8]), to_rgb(render.BLOCK), atol=0.02)
 
 
@@ -69,5 +69,5 @@ def test_several_poses_and_paths_share_one_drawing() -> None:
 
 
 def test_a_state_of_another_environment_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(6,\); tsm/PymunkPush-v0 expected \(10,\)"):
+    with pytest.raises(ValueError, match=r"\(6,\); tsm/PymunkPush-v1 expected \(10,\)"):
         render_array(a_state(PYMUNK_IDS[0]), PYMUNK_IDS[2])

@@ -122,7 +122,7 @@ def test_importing_the_package_is_enough_to_make_an_environment() -> None:
     code = (
         "import sys, gymnasium, tsmlib\n"
         "assert not {'torch', 'mujoco', 'pymunk', 'matplotlib'} & set(sys.modules)\n"
-        "print(gymnasium.make('tsm/ReacherPush-v0').observation_space.shape)"
+        "print(gymnasium.make('tsm/ReacherPush-v1').observation_space.shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "(10,)"

@@ -153,8 +153,8 @@ def test_the_table_has_one_line_per_policy_with_its_last_record() -> None:
 def test_references_are_the_oracles_and_zero_torque() -> None:
     found = tables.load(ROOT / "data" / "results" / "05_control.csv")
     references = policies_results.references(table.select(found, execution="open loop"))
-    assert {"reach", "push"} <= set(references)
-    for levels in (references["reach"], references["push"]):
+    assert references
+    for levels in references.values():
         assert max(levels.values()) > levels[zoo.method("none", planner="zero")]
         assert {method.model for method in levels} == {"oracle", "zero"}
     other = found.assign(env=found["env"].str.replace("tsm/", "tsm/Pymunk"))

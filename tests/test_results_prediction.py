@@ -16,7 +16,7 @@ from tsmlib.storage import tables
 from tsmlib.study import zoo
 from tsmlib.study.results import prediction as prediction_results
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 N, T, D = 6, 90, 4
 TSM, LSTM = zoo.method("tsm"), zoo.method("lstm")
 
@@ -77,8 +77,8 @@ def test_contact_rows_average_from_the_first_touch_on(found: pd.DataFrame) -> No
 
 
 def test_what_touches_is_told_by_true_states() -> None:
-    noisy = study.random_data("tsm/ReacherPush-noise0.25-v0", 2, seed=0)
-    with pytest.raises(ValueError, match=r"noisy states of tsm/ReacherPush-noise0.25-v0 do not tell what touches"):
+    noisy = study.random_data("tsm/ReacherPush-noise0.25-v1", 2, seed=0)
+    with pytest.raises(ValueError, match=r"noisy states of tsm/ReacherPush-noise0.25-v1 do not tell what touches"):
         prediction_results.rows(
             noisy.env, "tsm", scores(2, T), scores(2 * len(prediction_results.SEGMENTS), 10), noisy, seed=0
         )

@@ -245,8 +245,8 @@ def test_another_kind_is_refused(saved: Path) -> None:
 
 def test_trajectories_of_another_environment_are_refused(tmp_path: Path) -> None:
     artifacts.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
-    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'"):
-        artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/ReacherPush-v0"})
+    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'"):
+        artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/ReacherPush-v1"})
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -268,11 +268,11 @@ def test_a_value_that_is_not_finite_is_neither_written_nor_read(
 def test_a_model_of_another_environment_is_refused_naming_both_sides(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
     artifacts.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
-    wrong = {**FINGERPRINT, "env": "tsm/ReacherPush-v0", "past_len": 10}
+    wrong = {**FINGERPRINT, "env": "tsm/ReacherPush-v1", "past_len": 10}
     with pytest.raises(StoreError) as caught:
         artifacts.load_model(path, Line, expect=wrong)
     message = str(caught.value)
-    assert "env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v0'" in message
+    assert "env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'" in message
     assert "past_len is 'not stated' in the file, expected 10" in message
     assert "dt is" not in message
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import StoreError
 from tsmlib.study import runs
+from tsmlib.study import tasks as study_tasks
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import Run
 
@@ -92,7 +94,7 @@ def test_data_of_an_imperfect_arm_are_the_plain_arms_episodes(made: Run, how: di
 def test_the_papers_sizes() -> None:
     paper = runs.resolve("01_collect", scale="paper")
     assert study.sizes(paper, REACHER) == {"train": 500, "validation": 200, "test": 1000}
-    assert study.sizes(paper, "tsm/ReacherPush-v0")["train"] == 5000
+    assert study.sizes(paper, "tsm/ReacherPush-v1")["train"] == 5000
     assert study.sizes(paper, "tsm/PymunkObstacle-v0")["train"] == 5000
 
 
@@ -122,7 +124,7 @@ def test_a_model_knows_the_scale_of_its_data(made: Run) -> None:
     torch.testing.assert_close(seen.mean(0), torch.zeros(8), rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("env", ["tsm/ReacherPush-v0", "tsm/PymunkReacher-v0"])
+@pytest.mark.parametrize("env", ["tsm/ReacherPush-v1", "tsm/PymunkReacher-v0"])
 def test_models_with_contacts_are_wider(env: str) -> None:
     run = runs.resolve("02_train", scale="smoke")
     config = study.initialise(run, "tsm", study.random_data(env, 2, seed=0, horizon=10)).config()
@@ -282,6 +284,24 @@ def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_ve
     assert stored(asked)
 
 
+def test_plans_judged_by_other_samples_are_made_again(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = study.plan(run, some_task(), LATENT)
+    monkeypatch.setattr(study.plans, "SAMPLES", 2)
+    second = study.plan(run, some_task(), LATENT)
+    assert second.seconds != first.seconds
+
+
+def test_a_film_shows_the_rollout_by_which_the_plan_was_chosen(made: Run) -> None:
+    trial = study.trial(made, some_task(), LATENT)
+    seen = study.as_judged(made, some_task(), LATENT, trial)
+    assert trial.plan is not None
+    assert seen.plan is not None
+    assert seen.plan.states.shape == (1, 2, 50, 6)  # the mode
+    judged = some_task().reward(seen.plan.states[0], seen.actions).sum(-1)
+    torch.testing.assert_close(judged, trial.plan.curve[-1], rtol=1e-4, atol=1e-4)
+    assert torch.equal(seen.plan.predicted_return, trial.plan.predicted_return)
+
+
 def test_the_return_is_not_predicted_with_the_samples_that_the_planner_searched_with(made: Run) -> None:
     plan = study.plan(made, some_task(), LATENT)
     assert not torch.equal(plan.predicted_return, plan.curve[-1])
@@ -356,6 +376,39 @@ def test_data_of_a_plain_arm_are_refused_for_an_imperfect_one(run: Run) -> None:
         study.dataset(run, env, "train")
 
 
+V0, V1 = "tsm/ReacherPush-v0", "tsm/ReacherPush-v1"
+GONE = rf"{V0} is gone: the physics of pushing changed .* {V1} took its place\. Delete it and make a new one: "
+
+
+def test_data_of_version_0_are_refused_with_the_command_that_makes_new_ones(run: Run) -> None:
+    there = run.folder("data/ReacherPush") / "train.safetensors"
+    old = replace(study.random_data(V1, 2, seed=0), env=V0)
+    artifacts.save_trajectories(there, old, {"fingerprint": {**fingerprint(V1), "env": V0}})
+    with pytest.raises(StoreError, match=rf"train.safetensors does not fit: {GONE}python -m tsmlib run collect"):
+        study.dataset(run, V1, "train")
+
+
+def test_a_model_of_version_0_is_refused_with_the_command_that_makes_a_new_one(run: Run) -> None:
+    there = run.folder("models/ReacherPush") / "onestep.safetensors"
+    net = study.initialise(run, "onestep", study.random_data(V1, 2, seed=0))
+    artifacts.save_model(there, net, {"model": "onestep", "fingerprint": {"env": V0}, "schedule": []})
+    command = rf"python -m tsmlib run train -p env={V1} -p models=onestep"
+    with pytest.raises(StoreError, match=rf"onestep.safetensors does not fit: {GONE}{command}"):
+        study.load_or_train(run, V1, "onestep")
+
+
+def test_a_task_of_version_0_is_refused_with_the_command_that_makes_a_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, path = study.task(V1), tmp_path / "ReacherPush.safetensors"
+    monkeypatch.setattr(study_tasks, "FROZEN", tmp_path)
+    for env, message in ((V0, f"{GONE}python benchmarks/settings/freeze_tasks.py"), (REACHER, f"env is '{REACHER}'")):
+        arrays = {"start": task.start, "target": task.target}
+        artifacts.save(path, arrays, kind="task", header={"task": "push", "env": env, "seed": 0})
+        with pytest.raises(StoreError, match=message):
+            study.load_task(V1)
+
+
 def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
     folder = run.models / "Reacher"
     shutil.copy(folder / "tsm.safetensors", folder / "prior.safetensors")
@@ -425,8 +478,8 @@ def test_planners_refuse_sizes_that_make_no_sense() -> None:
 @pytest.mark.parametrize("text", ["tsm/Nothing-v0", "", "tsm/Reacher-v0,,", "ALL"])
 def test_a_parameter_that_names_something_unknown_lists_what_there_is(text: str) -> None:
     with pytest.raises(
-        ParameterError, match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v0; or all"
+        ParameterError, match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v1; or all"
     ):
-        study.parse_choice("envs", text, [REACHER, "tsm/ReacherPush-v0"])
+        study.parse_choice("envs", text, [REACHER, "tsm/ReacherPush-v1"])
     assert study.parse_choice("envs", f" {REACHER} ", [REACHER]) == [REACHER]
     assert study.parse_choice("envs", "all", ["a", "b"]) == ["a", "b"]

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
-from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, schedule
-from tsmlib.trajectory import Trajectories, TrajectoryError, Window
+from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, optimizers, schedule
+from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches
 
 H = 4
 SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
@@ -48,6 +49,13 @@ def new_tsm(seed: int = 0) -> TSM:
 def new_prior(seed: int = 0) -> ActionPrior:
     torch.manual_seed(seed)
     return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(torch.from_numpy(TRAIN.actions))
+
+
+def new_rtsm(seed: int = 0) -> RecurrentTSM:
+    torch.manual_seed(seed)
+    model = RecurrentTSM(3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5)
+    model.features.fit(torch.from_numpy(TRAIN.states))
+    return model
 
 
 def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
@@ -154,6 +162,69 @@ def test_the_learning_rate_warms_up_and_ends_at_its_final_value() -> None:
     assert rates[1000] == pytest.approx(1e-5)
 
 
+def test_trainings_that_follow_each_other_share_one_schedule() -> None:
+    whole = [schedule(step, 1000, 1e-3, 1e-5, 0) for step in range(1001)]
+    first = [schedule(step, 600, 1e-3, 1e-5, 0, (0.0, 0.6)) for step in range(600)]
+    second = [schedule(step, 400, 1e-3, 1e-5, 50, (0.6, 1.0)) for step in range(401)]  # no second warm-up
+    assert first + second == pytest.approx(whole)
+    warm = [schedule(step, 600, 1e-3, 1e-5, 100, (0.0, 0.6)) for step in range(601)]
+    assert warm[99] == warm[100] == pytest.approx(1e-3)
+    assert warm[600] == pytest.approx(second[0])
+
+
+class Matrix(nn.Module):
+    """One matrix, one bias: 10 times the sum of its weights."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.ones(2, 2)), nn.Parameter(torch.ones(2))
+
+    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+        return 0 * (self.weight.sum() + self.bias.sum())
+
+
+@pytest.mark.parametrize("muon", [0.0, 0.02])
+def test_weight_decay_is_of_matrices_alone_and_decoupled(muon: float) -> None:
+    """Gradients are zero: what remains is (1 - lr decay) at every step."""
+    model, plan = Matrix(), dict(steps=4, validate_every=4, warmup=0, lr=1e-2)
+    at_the_end = {}
+
+    def loss(window: Window, generator: torch.Generator) -> Tensor:
+        at_the_end.update(weights(model))  # the best weights are those of the first validation
+        return model.loss(window, generator)
+
+    train(model, loss, muon=muon, weight_decay=0.5, **plan)
+    rates = [schedule(step, 4, 1e-2, 1e-5, 0) * (muon / 1e-2 if muon else 1) for step in range(4)]
+    expected = math.prod(1 - 0.5 * rate for rate in rates)
+    torch.testing.assert_close(at_the_end["weight"], torch.full((2, 2), expected))
+    assert torch.equal(at_the_end["bias"], torch.ones(2))
+
+
+def test_without_muon_and_decay_it_is_adam() -> None:
+    model, plain, noise = new_tsm(), new_tsm(), torch.Generator()
+    train(model, steps=5, validate_every=5, seed=2)
+    optimizer = torch.optim.Adam(plain.parameters(), lr=1e-3, fused=True)
+    draw = batches(TRAIN.padded(H), past_len=H, future_len=H, batch_size=8, generator=noise)
+    for step in range(5):
+        optimizer.param_groups[0]["lr"] = schedule(step, 5, 1e-3, 1e-5, 3)
+        noise.manual_seed(2 * 1_000_003 + step)
+        optimizer.zero_grad()
+        plain.loss(next(draw), noise).backward()
+        nn.utils.clip_grad_norm_(plain.parameters(), 1.0)
+        optimizer.step()
+    assert same(weights(model), weights(plain))
+
+
+def test_muon_lowers_the_loss_and_leaves_adam_what_is_not_its_own() -> None:
+    made = optimizers(new_tsm(), TrainingOptions(**SIZES, muon=0.02, weight_decay=0.1))
+    held = {name: [p for group in optimizer.param_groups for p in group["params"]] for name, optimizer in made.items()}
+    assert held.keys() == {"adam", "muon"}
+    assert len(held["adam"]) + len(held["muon"]) == len(list(new_tsm().parameters()))
+    assert min(p.ndim for p in held["muon"]) == 2
+    curve = train(new_tsm(), steps=60, lr=1e-2, muon=0.1, weight_decay=0.01, validate_every=20)
+    assert curve.validation[-1] < 0.7 * curve.validation[0]
+
+
 # Stopped and resumed -------------------------------------------------------------------------------------------------
 
 
@@ -168,22 +239,23 @@ def interrupt(_: Tensor) -> Tensor:
 GENERATIONS = {3: [], 6: ["000000005"], 13: ["000000005", "000000010"], 17: ["000000010", "000000015"]}
 
 
-@pytest.mark.parametrize("new", [new_tsm, new_prior])
+@pytest.mark.parametrize("new", [new_tsm, new_prior, new_rtsm])
 @pytest.mark.parametrize("at", GENERATIONS)
+@pytest.mark.parametrize("settings", [{}, {"muon": 0.02, "weight_decay": 0.1}, {"span": (0.6, 1.0)}], ids=str)
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
-    tmp_path: Path, new: Callable[..., Any], at: int
+    tmp_path: Path, new: Callable[..., Any], settings: dict[str, Any], at: int
 ) -> None:
     whole, stopped, resumed = new(), new(), new(seed=0 if at <= 5 else 7)  # other weights: a checkpoint brings them
-    expected = train(whole)
+    expected = train(whole, **settings)
     checkpoint = tmp_path / "run"
     with pytest.raises(Interrupted):
-        train(stopped, Faulty(stopped, at, interrupt), checkpoint=checkpoint)
+        train(stopped, Faulty(stopped, at, interrupt), checkpoint=checkpoint, **settings)
     assert [path.stem for path in sorted(checkpoint.glob("*.safetensors"))] == GENERATIONS[at]
-    curve = train(resumed, checkpoint=checkpoint)
+    curve = train(resumed, checkpoint=checkpoint, **settings)
     assert same(weights(resumed), weights(whole))
     assert (curve.step, curve.train, curve.validation) == (expected.step, expected.train, expected.validation)
     again = new(seed=8)
-    assert asdict(train(again, checkpoint=checkpoint)) == asdict(curve)  # finished: nothing is left to do
+    assert asdict(train(again, checkpoint=checkpoint, **settings)) == asdict(curve)  # finished: nothing is left to do
     assert same(weights(again), weights(whole))
 
 
@@ -195,6 +267,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
         ({"steps": 50}, "steps is 20 in the file, expected 50"),
         ({"batch_size": 4}, "batch_size is 8 in the file, expected 4"),
         ({"future_len": 2 * H}, "future_len is 4 in the file, expected 8"),
+        ({"muon": 0.02}, "muon is 0.0 in the file, expected 0.02"),
+        ({"weight_decay": 0.1}, "weight_decay is 0.0 in the file, expected 0.1"),
+        ({"span": (0.6, 1.0)}, r"span is \[0.0, 1.0\] in the file, expected \[0.6, 1.0\]"),
         ({"bf16": True}, "bf16 is False in the file, expected True"),
     ],
 )
@@ -284,6 +359,23 @@ def test_numbers_that_are_not_positive_are_refused() -> None:
         for value in (0, -5):
             with pytest.raises(ValueError, match=f"{name} {value}.*expected positive"):
                 train(new_tsm(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"muon": -0.02}, "muon -0.02: expected zero or above"),
+        ({"weight_decay": -1.0}, "weight_decay -1.0: expected zero or above"),
+        ({"weight_decay": math.nan}, "weight_decay nan: expected zero or above"),
+        ({"patience": -1}, "patience -1: expected zero or above"),
+        ({"lr": 0.0}, "lr 0.0, lr_final 1e-05: expected lr above zero"),
+        ({"span": (0.6, 0.6)}, r"span \(0.6, 0.6\): expected two numbers from 0 to 1, the first below the second"),
+        ({"span": (0.0, 1.5)}, r"span \(0.0, 1.5\): expected two numbers from 0 to 1"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TrainingOptions(**{**SIZES, **settings})
 
 
 def test_episodes_shorter_than_the_windows_are_refused() -> None:

@@ -20,8 +20,18 @@ from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.base import Plan, Predictor
-from tsmlib.planning.planners import adam, cem, evaluate, expected_return, iterations_to, mppi, plan_at, sampled_starts
-from tsmlib.planning.predictors import model_predictor, simulator_predictor
+from tsmlib.planning.planners import (
+    adam,
+    cem,
+    evaluate,
+    expected_return,
+    iterations_to,
+    mppi,
+    plan_at,
+    reevaluate,
+    sampled_starts,
+)
+from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, standard_normal
@@ -299,10 +309,36 @@ def test_candidates_and_calls_meet_the_same_futures() -> None:
     assert not torch.equal(other(actions), predict(actions))
 
 
-def test_no_samples_means_the_mode() -> None:
+def test_unless_asked_for_samples_a_candidate_is_judged_by_the_mode() -> None:
     actions = torch.full((2, B, T, 1), 0.3)
-    states = model_predictor(Cart(0.3), initial_past(START, 1, 1), samples=0)(actions)
+    states = model_predictor(Cart(0.3), initial_past(START, 1, 1))(actions)
     torch.testing.assert_close(states, predictor(0.0)(actions))
+
+
+def test_a_finished_plan_meets_futures_that_its_planner_did_not_see() -> None:
+    plan = plan_by("cem", predictor(0.3, samples=4), reward, 3)
+    past, actions = initial_past(START, 1, 1), plan.actions[None]
+    fresh = fresh_predictor(Cart(0.3), past, seed=1)
+    assert fresh(actions).shape == (32, 1, B, T, 2)
+    judged = reevaluate(plan, fresh, reward)
+    torch.testing.assert_close(judged.predicted_return, expected_return(fresh(actions), actions, reward)[0])
+    assert not torch.isclose(judged.predicted_return, plan.predicted_return).any()
+
+
+@pytest.mark.parametrize("build", [OneStep, LSTM])
+def test_a_deterministic_model_has_no_samples_and_says_so(build: Any) -> None:
+    torch.manual_seed(0)
+    model, past = build(6, 2, hidden=16), initial_past(torch.zeros(B, 6), 10, 2)
+    with pytest.raises(ValueError, match=f"2 samples of {build.__name__} asked for, but it is deterministic"):
+        model_predictor(model, past, samples=2)
+    actions = torch.full((1, B, T, 2), 0.3)
+    fresh = fresh_predictor(model, past, seed=1)(actions)
+    assert torch.equal(fresh, model_predictor(model, past)(actions))  # one rollout, not 32 times the same
+
+
+def test_a_negative_number_of_samples_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"samples is -1, expected 0 \(the mode\) or a positive number"):
+        model_predictor(Cart(), initial_past(START, 1, 1), samples=-1)
 
 
 def test_a_batch_of_candidates_and_samples_is_laid_out_as_stated() -> None:
@@ -403,12 +439,13 @@ def test_every_planner_plans_through_every_model(prior: ActionPrior, name: str, 
     model = MODELS[name](6, 2).requires_grad_(False)
     model.features.step_std.fill_(0.05)  # a tame world
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
-    predict = model_predictor(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=2)
+    samples = 2 if model.stochastic else 0
+    predict = model_predictor(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=samples)
     task = rewards.reach(torch.tensor([[5.0, 0.0], [0.0, 5.0], [-5.0, 0.0]]), torque_weight=0)
     settings = {"adam": {"iterations": 5, "lr": 0.1}, "cem": {"iterations": 3, "candidates": 12, "elites": 3},
                 "mppi": {"iterations": 3, "candidates": 12}}[planner]  # fmt: skip
     plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner](predict, task, space, B, **settings)  # type: ignore[operator]
-    assert plan.states.shape == (2, B, 20, 6)
+    assert plan.states.shape == (max(samples, 1), B, 20, 6)
     assert plan.actions.abs().max() <= 1
     assert (plan.predicted_return > plan.curve[0]).all()
 
@@ -444,8 +481,8 @@ def test_cem_through_the_simulator_beats_doing_nothing() -> None:
 
 
 def test_candidates_in_the_simulator_do_not_mix() -> None:
-    start = gymnasium.make_vec("tsm/ReacherPush-v0", num_envs=2).reset(seed=0)[0]
-    predict = simulator_predictor("tsm/ReacherPush-v0", start)
+    start = gymnasium.make_vec("tsm/ReacherPush-v1", num_envs=2).reset(seed=0)[0]
+    predict = simulator_predictor("tsm/ReacherPush-v1", start)
     actions = 0.2 * torch.randn(3, 2, 12, 2, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
     states = predict(actions)
     assert states.shape == (1, 3, 2, 12, 10)
@@ -453,7 +490,7 @@ def test_candidates_in_the_simulator_do_not_mix() -> None:
         assert torch.equal(predict(actions[c : c + 1])[0, 0], states[0, c])
 
 
-@pytest.mark.parametrize(("env_id", "off"), [("tsm/ReacherPush-v0", 1e-3), ("tsm/PymunkPush-v0", 5e-2)])
+@pytest.mark.parametrize(("env_id", "off"), [("tsm/ReacherPush-v1", 1e-3), ("tsm/PymunkPush-v1", 5e-2)])
 def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float) -> None:
     env: Any = gymnasium.make_vec(env_id, num_envs=30).unwrapped
     env.reset(seed=0)

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise
 
-ENV = "tsm/PymunkPush-v0"
+ENV = "tsm/PymunkPush-v1"
 SCALE = np.array([3.0, 2.0, 8.0, 6.0, 0.2, 0.2, 0.25, 0.25, 1.0, 1.0])
 STEPS = 60
 
@@ -126,7 +126,7 @@ def test_a_senseless_wrapper_is_refused(wrap, message: str) -> None:
 # Many arms at once ---------------------------------------------------------------------------------------------------
 
 N, TAU = 3, 5
-bulk = pytest.mark.parametrize("env_id", ["tsm/ReacherPush-v0", ENV])
+bulk = pytest.mark.parametrize("env_id", ["tsm/ReacherPush-v1", ENV])
 
 
 def many(env_id: str = ENV, n: int = N, *, sigma: float = 0.0, tau: int = 0) -> ImperfectArms:

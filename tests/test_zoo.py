@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,9 +26,22 @@ def test_a_shipped_model_was_trained_by_its_entry(path: Path) -> None:
     header, spec = artifacts.read_header(path), zoo.ZOO[path.stem]
     assert header["class"] == spec.load().__name__
     planned = spec.schedule(EnvSpec.parse(header["fingerprint"]["env"]))
-    assert {loss: curve["step"][-1] for loss, curve in header["curves"].items()} == {s.loss: s.steps for s in planned}
-    stated = [{name: value for name, value in asdict(stage).items() if name != "bf16"} for stage in planned]
-    assert header.get("schedule", stated) == stated  # the oldest do not say
+    for key, stage in zip(zoo.keys(planned), planned, strict=True):
+        steps = header["curves"][key]["step"][-1]
+        assert steps == stage.steps or (stage.patience and steps < stage.steps)
+    assert list(header["curves"]) == zoo.keys(planned)
+    stated = [stage.stated() for stage in planned]
+    assert zoo.stated(header.get("schedule", stated)) == stated  # the oldest do not say
+
+
+def test_older_headers_mean_the_defaults_of_what_came_later() -> None:
+    stages = zoo.find("tsm").schedule(EnvSpec.parse("tsm/Reacher-v0"))
+    now = [stage.stated() for stage in stages]
+    older = [{name: stage[name] for name in ("loss", "steps", "future_len", "lr", "batch")} for stage in now]
+    assert zoo.stated(older) == now
+    for change in ({"muon": 0.02}, {"weight_decay": 0.1}, {"patience": 4}, {"span": (0.0, 0.6)}):
+        changed = [replace(stages[0], **change), *stages[1:]]
+        assert zoo.stated(older) != [stage.stated() for stage in changed]
 
 
 def test_every_model_has_a_look_of_its_own() -> None:
@@ -83,13 +96,13 @@ def test_a_model_is_added_in_one_entry(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_what_ships_is_loaded_by_word_and_environment() -> None:
-    model, prior = (tsmlib.load_pretrained(word, env="tsm/ReacherPush-v0") for word in ("tsm", "prior"))
+    model, prior = (tsmlib.load_pretrained(word, env="tsm/ReacherPush-v1") for word in ("tsm", "prior"))
     assert (type(model), type(prior)) == (tsmlib.TSM, tsmlib.ActionPrior)
-    assert tsmlib.load_task("tsm/ReacherPush-v0").target.shape == (100, 2)
-    with pytest.raises(ValueError, match=r"no pretrained tsm\+full of tsm/ReacherPush-v0 in .*: there are .*lstm"):
-        tsmlib.load_pretrained("tsm+full", env="tsm/ReacherPush-v0")
+    assert tsmlib.load_task("tsm/ReacherPush-v1").target.shape == (100, 2)
+    with pytest.raises(ValueError, match=r"no pretrained tsm\+full of tsm/ReacherPush-v1 in .*: there are .*lstm"):
+        tsmlib.load_pretrained("tsm+full", env="tsm/ReacherPush-v1")
     with pytest.raises(ValueError, match=r"no model is called 'tms'; there are tsm,"):
-        tsmlib.load_pretrained("tms", env="tsm/ReacherPush-v0")
+        tsmlib.load_pretrained("tms", env="tsm/ReacherPush-v1")
     with pytest.raises(ValueError, match=r"'Push' is none of tsm/Reacher-v0"):
         tsmlib.load_pretrained("tsm", env="Push")
 

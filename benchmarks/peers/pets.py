@@ -5,7 +5,7 @@ and trainer (``ModelTrainer``), with the settings of its own examples, trained f
 it is fed is what the models here are fed: cosine and sine of the angles, standardised velocities and positions, and the
 action; its target is the increment of the state in units of its standard deviation. README.md tells how to install it.
 
-    python benchmarks/peers/pets.py --env tsm/ReacherPush-v0 --form mse --seconds 300
+    python benchmarks/peers/pets.py --env tsm/ReacherPush-v1 --form mse --seconds 300
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def run_of(folder: Path) -> runs.Run:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0", help="default tsm/ReacherPush-v0")
+    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v1", help="default tsm/ReacherPush-v1")
     parser.add_argument("--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)")
     parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of training (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default 0)")

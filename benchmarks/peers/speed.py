@@ -1,7 +1,7 @@
 """Speed of mbrl-lib's PETS beside this package's models and planners: training, planning, and returns of plans.
 
 Training: mbrl-lib's ``ModelTrainer`` and ``GaussianMLP`` (see pets.py) beside ``fit`` and an ``Ensemble``
-of the same size, in transitions per second. Planning: the same targets of the frozen push task, open loop over 50
+of the same size, in transitions per second. Planning: the same targets of the frozen push task, open loop over its
 steps, by mbrl-lib's ``CEMOptimizer`` through its ensemble, one target at a time, as its examples plan; by the planners
 of ``tsmlib.planning`` through the shipped models, all targets at once; and both ways. All plans are executed in the
 true simulator. Everything is timed in turns within one process, in CPU seconds of one thread.
@@ -33,16 +33,17 @@ from tsmlib.models.features import Features
 from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import adam, cem, expected_return
-from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.statistics import interval
 from tsmlib.storage import artifacts, tables
-from tsmlib.study import runs
+from tsmlib.study import runs, zoo
 from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 OURS = {"gaussian": "ensemble", "mse": "ensemble+mse"}  # as pets.MODELS
 EPISODES = 500  # whose transitions the turns of training draw from
 FUTURE = 20  # steps of a training window here, each of them one transition to an ensemble
@@ -100,7 +101,9 @@ def ours(form: str, features: Features, data: Trajectories, *, batch: int, bf16:
         options = TrainingOptions(1, FUTURE, updates, batch_size=windows, validate_every=updates, bf16=bf16)
         fit(net, net.loss, data, held_out, options)
 
-    return Trainer(f"tsmlib, {'bfloat16' if bf16 else 'float32'}, {batch} a member", False, run, batch, size(net))
+    return Trainer(
+        f"tsmlib, {'bfloat16' if bf16 and native_bf16() else 'float32'}, {batch} a member", False, run, batch, size(net)
+    )
 
 
 def size(model: torch.nn.Module) -> int:
@@ -170,7 +173,7 @@ class Way:
 
 PETS = partial(Way, "mbrl-cem", "direct", "pets")
 USUAL = dict(iterations=5, candidates=350, samples=20)  # theirs: pets_pusher.yaml, and algorithm/pets.yaml
-SHIPPED = ("tsm", "tsm+energy+direct")
+SHIPPED = PAPERS, OURS = zoo.PAPERS, zoo.OURS
 WAYS = (
     PETS(**USUAL, bound=1.0),  # the limits of the torques
     PETS(**USUAL, bound=0.2),  # a deviation of 0.1 to start with, that of the training torques
@@ -180,9 +183,9 @@ WAYS = (
     *(Way("cem", "latent", model, iterations=8, candidates=96) for model in SHIPPED),  # scale laptop; paper has 10
     *(Way("cem", "latent", model, iterations=4, candidates=48) for model in SHIPPED),
     *(Way("cem", "latent", model, iterations=2, candidates=24) for model in SHIPPED),
-    Way("adam", "latent", "tsm+energy+direct", iterations=100),
-    Way("mbrl-cem", "direct", "tsm+energy+direct", iterations=5, candidates=350, bound=0.2),
-    Way("mbrl-cem", "latent", "tsm+energy+direct", iterations=5, candidates=350, bound=2.0),
+    Way("adam", "latent", OURS, iterations=100),
+    Way("mbrl-cem", "direct", OURS, iterations=5, candidates=350, bound=0.2),
+    Way("mbrl-cem", "latent", OURS, iterations=5, candidates=350, bound=2.0),
     Way("cem", "latent", "pets", iterations=8, candidates=96),
 )
 
@@ -313,7 +316,7 @@ def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, r
     results = []
     for way in ways:
         model = models.known[way.model]
-        predict = model_predictor(model, task.past(model.past_len), samples=JUDGED, seed=1)
+        predict = fresh_predictor(model, task.past(model.past_len), samples=JUDGED, seed=1)
         with torch.no_grad():
             predicted = expected_return(predict(actions[way][None]), actions[way][None], task.reward)[0]
         results.append(Outcome(way, np.array(seconds[way]), execute(task, actions[way]), predicted))
@@ -352,8 +355,9 @@ def training(
     trainers = [
         theirs(form, features, data, batch=small), ours(form, features, data, batch=small, bf16=False),
         theirs(form, features, data, batch=large), ours(form, features, data, batch=large, bf16=False),
-        ours(form, features, data, batch=large, bf16=True),
     ]  # fmt: skip
+    if native_bf16():
+        trainers.append(ours(form, features, data, batch=large, bf16=True))
     same_size(trainers)
     found = speeds(trainers, clock, transitions=transitions, rounds=rounds)
     first, *_ = trainers

@@ -23,7 +23,7 @@ TRIES = {"twice the batch, half the updates": (2.0, 0.5), "half the batch": (0.5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
+    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v1")
     parser.add_argument("--model", choices=zoo.words("dynamics"), default="tsm")
     parser.add_argument("--stages", type=int, default=2, help="how many of the model's stages (default 2)")
     parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
@@ -41,6 +41,7 @@ def main() -> None:
                 TrainingOptions(
                     past_len=net.past_len, future_len=stage.future_len, steps=max(1, round(updates * stage.steps)),
                     lr=stage.lr, batch_size=round(batches * stage.batch), validate_every=250, bf16=stage.bf16,
+                    muon=stage.muon, weight_decay=stage.weight_decay, span=stage.span,
                 ),
                 seed=run.seed, progress=f"{model}, {condition}: {stage.loss}",
             )  # fmt: skip

@@ -21,12 +21,12 @@ from tsmlib import study
 from tsmlib.study import runs, zoo
 from tsmlib.training.fit import fixed_windows
 
-ENV = "tsm/ReacherPush-v0"
+ENV = "tsm/ReacherPush-v1"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    tsm = zoo.words("dynamics", cls="TSM")
+    tsm = zoo.words("dynamics", cls=("TSM",))
     parser.add_argument("--model", choices=tsm, default="tsm")
     parser.add_argument("--rounds", type=int, default=10)
     arguments = parser.parse_args()

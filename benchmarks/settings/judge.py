@@ -1,149 +1,232 @@
-"""What a candidate of the planner is judged by, with one trained model: its mode, or samples of it, and how many.
+"""What a candidate of the planner is judged by: the mode of a model, or samples of it, and how many.
 
-    mode              one rollout with z = 0
+    mode              one rollout with z = 0: the default of ``model_predictor``, and all that a deterministic model has
     mean of S         mean return over S samples, the same noise for every candidate and iteration
     fresh mean of S   the same, with other noise in every iteration; the plan with the best return by its own noise wins
     median of S       median return over S samples, the same noise for every candidate and iteration
     mode and mean of S    half the mode's return, half the mean's
 
 All with the cross-entropy method over the codes of the action prior, on validation targets, executed open loop; and
-with ``closed`` 1 planning again every 10 steps (4 iterations, from what is left of the plan before). gap is the
-return that the planner's judge (gap_judge) or 32 fresh samples (gap_fresh) predict for the plan, minus the executed
-one. ``costs`` are those of the single targets, for paired differences.
+with --closed planning again every 10 steps too, from what is left of the plan before. Models are those of the run
+(``study.load_or_train``), so a missing one is trained first. gap is the return that the planner's judge (gap_judge) or
+32 fresh samples (gap_fresh) predict for the plan, minus the executed one; of a closed loop, for the first plan.
+``costs`` are those of the single targets, for paired differences: of more_than_mode and its standard error too.
 
-    python benchmarks/settings/judge.py runs/settings/base-x1-seed0.safetensors base
+    python benchmarks/settings/judge.py --models rtsm lstm --targets 100 --seeds 0 1 2 --closed
+    python benchmarks/settings/judge.py --models rtsm --envs tsm/ReacherPush-noise0.25-v1 --judges mode "mean of 6"
+
+A line that the table has already is not measured again.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
-from push_task import CHOSEN, ENV, HERE, action_prior, physics
-from safetensors.torch import load_file
-from successor import TRIES, data, executed, posed, read, write
 from torch import Tensor
 
-from tsmlib import rewards
-from tsmlib.models.base import rollout
-from tsmlib.planning.base import Predictor
-from tsmlib.planning.execution import mpc
-from tsmlib.planning.planners import cem, expected_return
-from tsmlib.planning.predictors import model_predictor
+from tsmlib import study
+from tsmlib.models.base import DynamicsModel, Model
+from tsmlib.planning.base import Judge, Plan, Predictor, SearchSpace
+from tsmlib.planning.execution import Trial, execute, mpc
+from tsmlib.planning.planners import cem, reevaluate
+from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.sampling import SharedNoise
-from tsmlib.trajectory import Segment, initial_past
+from tsmlib.rewards import Reward
+from tsmlib.study import plans, runs
+from tsmlib.study.models import load_prior
+from tsmlib.trajectory import Segment
 
+HERE, EVERY = Path(__file__).resolve().parent, 10
 JUDGES = (
     "mode", "mean of 2", "fresh mean of 2", "mode and mean of 2", "mean of 6", "fresh mean of 6", "median of 6",
     "mean of 16", "median of 16",
 )  # fmt: skip
+KEY = ("env", "model", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
+COLUMNS = (
+    *KEY, "cpu_seconds", "cost", "cost_sem", "more_than_mode", "more_than_mode_sem", "within_5cm", "final_mean",
+    "gap_judge", "gap_fresh", "gap_fresh_abs", "costs",
+)  # fmt: skip
+Row = dict[str, str]
 
 
-def predictor(net: Any, past: Segment, judge: str, seed: int, candidates: int) -> Predictor:
-    """From actions (C, B, T, 2) to the states (S, C, B, T, dx) by which a candidate is judged."""
-    words = judge.split()
-    if judge == "mode":
-        return model_predictor(net, past, samples=0)
-    n = int(words[-1])
-    if words[0] == "fresh":
-        return Fresh(net, past, n, seed, candidates)
-    common = model_predictor(net, past, samples=n, seed=seed)
-    if words[:2] == ["mode", "and"]:
-        mode = model_predictor(net, past, samples=0)
-        return lambda actions: torch.cat([mode(actions).expand(n, -1, -1, -1, -1), common(actions)])
-    return common
+def judged_by(words: str, candidates: int) -> Judge:
+    """A judge by its name."""
+    n = 0 if words == "mode" else int(words.split()[-1])
+    common: Judge = partial(model_predictor, samples=n)
+    if words.startswith("fresh"):
+        return partial(Fresh, samples=n, population=candidates + 1)
+    if not words.startswith("mode and"):
+        return common
+
+    def blend(model: Model, past: Segment, *, seed: int) -> Predictor:
+        mode, samples = model_predictor(model, past), common(model, past, seed=seed)
+        return lambda actions: torch.cat([mode(actions).expand(n, -1, -1, -1, -1), samples(actions)])
+
+    return blend
 
 
 class Fresh:
-    """Samples with other noise for every population, which is asked for in parts: ``candidates`` and their mean."""
+    """Samples with other noise for every population, which is asked for in parts: the candidates and their mean."""
 
-    def __init__(self, net: Any, past: Segment, samples: int, seed: int, candidates: int) -> None:
-        self.net, self.past, self.samples, self.seed = net, past, samples, seed
-        self.population, self.asked = candidates + 1, -1  # the first call asks for the start
+    def __init__(self, model: Model, past: Segment, *, seed: int, samples: int, population: int) -> None:
+        self.through: Callable[..., Predictor] = partial(model_predictor, model, past, samples=samples)
+        self.seed, self.population, self.asked = seed, population, -1  # the first call asks for the start
 
     def __call__(self, actions: Tensor) -> Tensor:
-        n, n_targets = actions.shape[:2]
         index = self.asked // self.population
-        self.asked += n
-        rows = actions[:, None].expand(-1, self.samples, -1, -1, -1).flatten(0, 2)
-        past = Segment(*(part.repeat(n * self.samples, 1, 1) for part in self.past))
-        generator = torch.Generator().manual_seed(1_000_003 * (self.seed + 1) + index)
-        states = rollout(self.net, past, rows, generator=SharedNoise(generator, self.samples * n_targets))
-        return states.unflatten(0, (n, self.samples, n_targets)).transpose(0, 1)
+        self.asked += len(actions)
+        return self.through(seed=1_000_003 * (self.seed + 1) + index)(actions)
 
 
-def by_median(reward: Any) -> Any:
+def by_median(reward: Reward) -> Reward:
     """A reward whose sum, averaged over the samples, is the median return; for planners that take means."""
 
     def judged(states: Tensor, actions: Tensor) -> Tensor:
         per_step = reward(states, actions)
-        middle = per_step.sum(-1).median(0).values  # (C, B)
+        middle = per_step.sum(-1).quantile(0.5, dim=0)  # (C, B)
         return (middle / per_step.shape[-1])[None, ..., None].expand_as(per_step)
 
     return judged
 
 
+@dataclass(frozen=True)
+class Way:
+    """A judge, and the planner that asks it. again: iterations of each later plan of a closed loop."""
+
+    judge: str
+    seed: int
+    candidates: int
+    iterations: int
+    again: int
+
+    def named(self, task: Task, *, closed: bool) -> Row:
+        """Its columns of the key."""
+        values = (self.judge, int(closed), self.seed, len(task), self.candidates, self.iterations, self.again)
+        return dict(zip(KEY[2:], map(str, values), strict=True))
+
+    def search(
+        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /, *, iterations: int
+    ) -> Plan:
+        """A ``Planner``."""
+        judged = by_median(reward) if "median" in self.judge else reward
+        elites = max(2, self.candidates // 10)
+        return cem(predict, judged, space, start, candidates=self.candidates, elites=elites, iterations=iterations,
+                   seed=self.seed)  # fmt: skip
+
+    def opened(self, task: Task, model: DynamicsModel, space: SearchSpace) -> Plan:
+        """The plan of the whole episode, with the return that its judge predicts."""
+        predict = judged_by(self.judge, self.candidates)(model, task.past(model.past_len), seed=self.seed)
+        return self.search(predict, task.reward, space, len(task), iterations=self.iterations)
+
+    def closed(self, task: Task, model: DynamicsModel, space: SearchSpace, first: Plan) -> Trial:
+        """Planning again every ten steps, from ``first`` on."""
+        planner, judge = partial(self.search, iterations=self.again), judged_by(self.judge, self.candidates)
+        return mpc(task, model, space, planner, every=EVERY, plan=first, judge=judge, seed=self.seed)
+
+
+def measured(task: Task, model: DynamicsModel, space: SearchSpace, way: Way, *, closed: bool) -> list[Row]:
+    """The lines of one judge: open loop, and closed loop where it is asked for."""
+    began = time.process_time()
+    plan = way.opened(task, model, space)
+    seconds = [time.process_time() - began]
+    fresh = reevaluate(plan, fresh_predictor(model, task.past(model.past_len), seed=way.seed + 77), task.reward)
+    trials = [execute(task, fresh)]
+    if closed:
+        began = time.process_time()
+        trials.append(way.closed(task, model, space, plan))
+        seconds.append(seconds[0] + time.process_time() - began)
+    rows = []
+    for number, (trial, spent) in enumerate(zip(trials, seconds, strict=True)):
+        cost, gap = -trial.executed_return, fresh.predicted_return - trial.executed_return
+        found = {
+            "cpu_seconds": spent, "cost": cost.mean(), "cost_sem": cost.std() / len(task) ** 0.5,
+            "within_5cm": (trial.final_distance < 0.05).float().mean(), "final_mean": trial.final_distance.mean(),
+            "gap_judge": (plan.predicted_return - trial.executed_return).mean(), "gap_fresh": gap.mean(),
+            "gap_fresh_abs": gap.abs().mean(),
+        }  # fmt: skip
+        row = way.named(task, closed=bool(number))
+        row |= {word: f"{float(value):.4g}" for word, value in found.items()}
+        rows.append(row | {"costs": " ".join(f"{value:.3f}" for value in cost.tolist())})
+    return rows
+
+
+def with_differences(rows: list[Row]) -> list[Row]:
+    """The table with each line's cost over that of the mode, open loop, paired by target."""
+    plain = {_rest(row): row for row in rows if row["judge"] == "mode" and row["closed"] == "0"}
+    for row in rows:
+        if (other := plain.get(_rest(row))) is not None and other is not row:
+            more = np.subtract(*(np.array(each["costs"].split(), float) for each in (row, other)))
+            error = more.std(ddof=1) / len(more) ** 0.5 if len(more) > 1 else float("nan")
+            row |= {"more_than_mode": f"{more.mean():.3g}", "more_than_mode_sem": f"{error:.2g}"}
+    return rows
+
+
+def _rest(row: Row) -> tuple[str, ...]:
+    return tuple(row[word] for word in KEY if word not in ("judge", "closed"))
+
+
+def read(path: Path) -> list[Row]:
+    """The table in ``path``, or an empty one. ValueError for one of other columns."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if rows and (missing := set(COLUMNS) - set(rows[0])):
+        raise ValueError(f"{path} has no columns {', '.join(sorted(missing))}; name another table with --out")
+    return rows
+
+
+def write(path: Path, rows: list[Row]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("weights", type=Path, help="as successor.py leaves them")
-    parser.add_argument("what", choices=list(TRIES), help="the try they are from")
-    parser.add_argument("--judges", nargs="+", choices=JUDGES, default=JUDGES, metavar="JUDGE")
-    parser.add_argument("--targets", type=int, default=25)
+    parser.add_argument("--models", nargs="+", default=["rtsm"], help="words of the zoo (default rtsm)")
+    parser.add_argument("--envs", nargs="+", default=["tsm/ReacherPush-v1"], help="default tsm/ReacherPush-v1")
+    parser.add_argument("--judges", nargs="+", choices=JUDGES, default=JUDGES, metavar="JUDGE", help="default all")
+    parser.add_argument("--targets", type=int, default=25, help="of the 100 of validation (default 25)")
     parser.add_argument("--candidates", type=int, default=96)
-    parser.add_argument("--iterations", type=int, default=10)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the planner")
+    parser.add_argument("--iterations", type=int, default=10, help="of an open-loop plan (default 10)")
+    parser.add_argument("--again", type=int, default=plans.AGAIN["cem"]["paper"], help="of each later plan (default 4)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the planner (default 0)")
     parser.add_argument("--closed", action="store_true", help="plan again every 10 steps too")
-    parser.add_argument("--out", type=Path, default=HERE / "judge.csv")
+    parser.add_argument("--scale", default="", help="of the models; default TSM_SCALE, else laptop")
+    parser.add_argument("--model-seed", type=int, default=0, help="of the models (default 0)")
+    parser.add_argument("--out", type=Path, default=HERE / "judge.csv", help="default judge.csv beside this script")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    net = TRIES[arguments.what].build(data("train", 0), 0)
-    net.load_state_dict(load_file(arguments.weights))
-    net.eval()
-    n, (starts, targets) = arguments.targets, posed(arguments.targets)
-    past, reward = initial_past(torch.from_numpy(starts), net.past_len, 2), rewards.push(targets)
-    space = LatentActions(action_prior(), CHOSEN.horizon)
-    fresh = model_predictor(net, past, samples=32 if getattr(net, "stochastic", True) else 1, seed=77)
-    elites = max(2, arguments.candidates // 10)
-    for seed in arguments.seeds:
-        for judge in arguments.judges:
-            search = partial(cem, candidates=arguments.candidates, elites=elites, seed=seed)
-            began = time.process_time()
-            predict = predictor(net, past, judge, seed, arguments.candidates)
-            judged = by_median(reward) if "median" in judge else reward
-            plan = search(predict, judged, space, n, iterations=arguments.iterations)
-            seconds = time.process_time() - began
-            with torch.no_grad():
-                foreseen = expected_return(fresh(plan.actions[None]), plan.actions[None], reward)[0]
-            found = [(0, seconds, *executed(plan.actions, targets, starts))]
-            if arguments.closed and judge == "mode":
-                with physics(CHOSEN):
-                    task = replace(Task.standard(ENV, starts, targets), horizon=CHOSEN.horizon)
-                    trial = mpc(
-                        task, net, space, partial(search, iterations=4),
-                        every=10, plan=plan, samples=0, seed=seed,
-                    )  # fmt: skip
-                found.append((1, time.process_time() - began, trial.executed_return, trial.final_distance))
-            for closed, spent, returns, final in found:
-                row = {
-                    "model": arguments.weights.stem, "judge": judge, "closed": closed, "planner_seed": seed,
-                    "targets": n, "candidates": arguments.candidates, "iterations": arguments.iterations,
-                    "cpu_seconds": spent, "cost": -float(returns.mean()), "cost_sem": float(returns.std() / n**0.5),
-                    "within_5cm": float((final < 0.05).float().mean()), "final_mean": float(final.mean()),
-                    "gap_judge": float((plan.predicted_return - returns).mean()),
-                    "gap_fresh": float((foreseen - returns).mean()),
-                    "gap_fresh_abs": float((foreseen - returns).abs().mean()),
-                    "costs": " ".join(f"{-value:.2f}" for value in returns.tolist()),
-                }  # fmt: skip
-                row = {word: f"{value:.4g}" if isinstance(value, float) else str(value) for word, value in row.items()}
-                write(arguments.out, [*read(arguments.out), row])
-                print(row, flush=True)
+    run = runs.resolve("05_control", scale=arguments.scale, seed=arguments.model_seed)
+    for env in arguments.envs:
+        task = study.load_task(env, "validation").take(arguments.targets)
+        space = LatentActions(load_prior(run, env), task.horizon)
+        for word in arguments.models:
+            model = study.load_or_train(run, env, word).model.eval()
+            for seed in arguments.seeds:
+                for judge in arguments.judges if model.stochastic else ("mode",):
+                    way = Way(judge, seed, arguments.candidates, arguments.iterations, arguments.again)
+                    known, common = read(arguments.out), {"env": env, "model": word}
+                    wanted = common | way.named(task, closed=arguments.closed)
+                    if any(all(row[key] == value for key, value in wanted.items()) for row in known):
+                        continue
+                    new = [common | row for row in measured(task, model, space, way, closed=arguments.closed)]
+                    keys = [tuple(row[key] for key in KEY) for row in new]
+                    kept = [row for row in known if tuple(row[key] for key in KEY) not in keys]
+                    write(arguments.out, with_differences([*kept, *new]))
+                    for row in new:
+                        print({key: value for key, value in row.items() if key != "costs"}, flush=True)
 
 
 if __name__ == "__main__":

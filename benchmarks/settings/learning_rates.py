@@ -22,9 +22,9 @@ FACTORS = (0.5, 1.0, 2.0)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
+    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v1")
     parser.add_argument("--models", nargs="+", choices=zoo.words("dynamics"), metavar="MODEL", default=[
-        "onestep", "multistep", "lstm", "ensemble+mse", "tsm", "tsm+energy+direct"])  # fmt: skip
+        "onestep", "multistep", "lstm", "ensemble+mse", "tsm", "rtsm"])  # fmt: skip
     parser.add_argument("--share", type=float, default=0.2, help="of the budget (default 0.2)")
     parser.add_argument("--scale", choices=parameters.SCALES, default="paper")
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/02_learning_rates.csv of the run)")

@@ -21,8 +21,8 @@ TRIES = {"2,200": (2200, 0.9), "880, decayed as far": (880, 0.9**2.5), "880, cut
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=("tsm/Reacher-v0", "tsm/ReacherPush-v0"), default="tsm/ReacherPush-v0")
-    parser.add_argument("--model", choices=zoo.words("dynamics"), default="tsm+energy+direct")
+    parser.add_argument("--env", choices=("tsm/Reacher-v0", "tsm/ReacherPush-v1"), default="tsm/ReacherPush-v1")
+    parser.add_argument("--model", choices=zoo.words("dynamics"), default=zoo.OURS)
     arguments = parser.parse_args()
     run, task = runs.resolve("bench", scale="laptop"), study.task(arguments.env, "validation")
     model, _ = study.load_or_train(run, arguments.env, arguments.model)

@@ -34,7 +34,7 @@ from torch import Tensor
 from tsmlib import rewards
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import geometry, mujoco_arm, pymunk_arm, render
-from tsmlib.envs.geometry import DT, START_ANGLE, START_VELOCITY, closest_gap, fingertip
+from tsmlib.envs.geometry import DT, START_VELOCITY, closest_gap, fingertip
 from tsmlib.evaluation import contacts, exploitation
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.planning import tasks
@@ -44,7 +44,7 @@ from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.storage import artifacts
 from tsmlib.study.runs import ROOT
 
-ENV, OTHER = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"  # whose numbers are changed
+ENV, OTHER = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"  # whose numbers are changed
 # Every module that has the numbers by name. All are imported before a number is changed: what is imported after it
 # would keep the changed one.
 PLACES = (geometry, mujoco_arm, pymunk_arm, render, tasks, contacts, exploitation)
@@ -55,7 +55,10 @@ MOVED = 0.005  # m
 
 @dataclass(frozen=True)
 class Setting:
-    """One pushing task. Lengths in metres; rings are distances from the shoulder, uniform over the area."""
+    """One pushing task, by default version 0's. Lengths in metres.
+
+    Rings are distances from the shoulder, uniform over the area.
+    """
 
     decay: float = 0.2  # s; a free object slows down by a factor e in this time
     horizon: int = 100  # steps of 0.02 s
@@ -64,8 +67,8 @@ class Setting:
     mass: float = 1.0  # kg
     start: tuple[float, float] = (0.08, 0.17)  # ring of the object's first positions
     target: tuple[float, float] = (0.0, 0.2)  # ring of targets
-    shoulder: float = START_ANGLE  # rad; first angles are uniform within plus and minus this
-    elbow: float = START_ANGLE
+    shoulder: float = 0.1  # rad; first angles are uniform within plus and minus this
+    elbow: float = 0.1
 
 
 @contextlib.contextmanager
@@ -151,7 +154,7 @@ def of_random_torques(setting: Setting, n: int, env_id: str = ENV) -> dict[str, 
 @cache
 def action_prior() -> ActionPrior:
     """The shipped one. Random torques do not depend on the object, so neither does it."""
-    return artifacts.load_model(ROOT / "data" / "pretrained" / "ReacherPush" / "prior.safetensors", ActionPrior)
+    return artifacts.load_model(ROOT / "data" / "pretrained" / "ReacherObstacle" / "prior.safetensors", ActionPrior)
 
 
 def simulator_predictor(starts: np.ndarray) -> Predictor:

@@ -107,6 +107,8 @@ class Recurrent(Configured):
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Energy score, mean over the segments of the window's future, plus the weighted distance of the mode."""
+        if self.mode_weight > 0 and self.samples == 1:
+            return self.mode_loss(window)
         (past, future), draws = window, self.samples + (self.mode_weight > 0)
         memory = [part.repeat(draws, 1) for part in self.read(past)]
         n, length = future.actions.shape[:2]
@@ -127,6 +129,15 @@ class Recurrent(Configured):
             if self.mode_weight > 0:
                 total = total + self.mode_weight * distance(samples[-1], x, 2)
         return total / len(parts)
+
+    def mode_loss(self, window: Window) -> Tensor:
+        """Distance between the mode and the truth, mean over the segments: with one sample, codes are but noise."""
+        past, future = window
+        codes = past.states.new_zeros(len(past.states), -(-future.actions.shape[1] // self.code_len), self.latent_dim)
+        states = self.decode(past, future.actions, codes)
+        mode, truth = (self.features(each)[..., self.features.scored] for each in (states, future.states))
+        pairs = zip(mode.split(self.code_len, dim=1), truth.split(self.code_len, dim=1), strict=True)
+        return torch.stack([distance(a, b, 2) for a, b in pairs]).mean()
 
     def _run(self, x: Tensor, memory: Any, actions: Tensor, codes: Any) -> Tensor:
         (h, c), states = memory, []

@@ -23,8 +23,8 @@ METRICS = ("ll_paper", "ll_shared", "ll_horizon", "ll_own", "energy_score_noise"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v0")
-    parser.add_argument("--model", choices=zoo.words("dynamics"), default="tsm+energy+direct")
+    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v1")
+    parser.add_argument("--model", choices=zoo.words("dynamics"), default=zoo.OURS)
     parser.add_argument(
         "--samples", type=int, nargs="+", default=[8, 16, 32, 64, 128, 500], help="the last is the reference"
     )

@@ -40,13 +40,15 @@ from tsmlib import rewards
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
 from tsmlib.evaluation import prediction
-from tsmlib.models.baselines import LSTM
+from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.planning.base import Plan
 from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.study.runs import ROOT
 from tsmlib.training.fit import fixed_windows, schedule
+from tsmlib.training.muon import Muon
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories, batches, initial_past
 
 RUNS = ROOT / "runs" / "settings"
@@ -69,7 +71,8 @@ class Try:
     lr: float = 4e-3
     windows: tuple[tuple[float, int, int], ...] = ((1.0, 20, 0),)
     weight_decay: float = 0.0  # decoupled
-    muon: float = 0.0  # learning rate of torch.optim.Muon for the matrices inside; 0: Adam for everything
+    muon: float = 0.0  # learning rate of Muon for the matrices inside; 0: Adam for everything
+    loss: str = "loss"  # a method of the model
     average: float = 0.0  # of the weights: decay of an exponential mean; 0: the weights themselves
 
     def build(self, data: Trajectories, seed: int) -> Any:
@@ -117,6 +120,17 @@ TRIES: dict[str, Try] = {
     "muon 0.02, hidden 256, 1 then 2 samples": replace(
         MUON, options=(("hidden", 256),), windows=((0.5, 20, 1), (0.3, 20, 2), (0.2, 30, 2)), updates=2800
     ),
+    "muon 0.02, 1 then 2 samples, mode weight 0.5": replace(
+        MUON, windows=((0.6, 20, 1), (0.4, 20, 2)), updates=4000, options=(("mode_weight", 0.5),)
+    ),
+    "muon 0.02, 1 then 2 samples, hidden 96": replace(
+        MUON, windows=((0.6, 20, 1), (0.4, 20, 2)), updates=7600, options=(("hidden", 96),)
+    ),
+    "muon 0.02, lstm, decay 0.1": Try(LSTM, updates=4200, batch=256, lr=2e-3, muon=0.02, weight_decay=0.1),
+    "onestep": Try(OneStep, updates=6000, batch=256),
+    "onestep, muon 0.02": Try(OneStep, updates=6000, batch=256, lr=2e-3, muon=0.02),
+    "multistep": Try(OneStep, updates=5600, batch=256, loss="multi_step_loss"),
+    "multistep, muon 0.02": Try(OneStep, updates=5600, batch=256, lr=2e-3, muon=0.02, loss="multi_step_loss"),
     "code of 2": replace(BASE, options=(("latent_dim", 2),)),
 }
 
@@ -154,7 +168,7 @@ def train(what: Try, seed: int, path: Path, *, stop_at: float = float("inf")) ->
     others = [p for p in net.parameters() if not any(p is q for q in inside)]
     optimizers: list[Any] = [torch.optim.AdamW(others, lr=what.lr, weight_decay=what.weight_decay, fused=True)]
     if inside:
-        optimizers.append(torch.optim.Muon(inside, lr=what.muon, weight_decay=what.weight_decay))
+        optimizers.append(Muon(inside, lr=what.muon, weight_decay=what.weight_decay))
     generator, kept = torch.Generator(), what.build(train_on, seed)
     phases = [(length, n) for share, length, n in what.windows for _ in range(round(share * what.updates))]
     phases += [what.windows[-1][1:]] * (what.updates - len(phases))
@@ -186,8 +200,8 @@ def train(what: Try, seed: int, path: Path, *, stop_at: float = float("inf")) ->
             for group in optimizer.param_groups:
                 group["lr"] = rate * peak
         torch.clear_autocast_cache()
-        with torch.autocast("cpu", torch.bfloat16):
-            value = net.loss(next(draws[length]), generator)
+        with torch.autocast("cpu", torch.bfloat16, enabled=native_bf16("cpu")):
+            value = getattr(net, what.loss)(next(draws[length]), generator)
         net.zero_grad(set_to_none=True)
         value.backward()
         nn.utils.clip_grad_norm_(net.parameters(), CLIP)
@@ -200,7 +214,7 @@ def train(what: Try, seed: int, path: Path, *, stop_at: float = float("inf")) ->
                 slow.lerp_(fast, 1 - keep)
         if (step + 1) % EVERY == 0 or step + 1 == what.updates:
             with torch.no_grad():
-                loss = mean.loss(window, generator.manual_seed(seed)).item()
+                loss = getattr(mean, what.loss)(window, generator.manual_seed(seed)).item()
             if loss < done["best"]:
                 done |= dict(best=loss, best_step=step + 1)
                 kept.load_state_dict(mean.state_dict())
@@ -304,7 +318,8 @@ def main() -> None:
     for name in arguments.names:
         what = replace(TRIES[name], updates=round(arguments.times * TRIES[name].updates))
         stem = f"{name.replace(',', '').replace(' ', '-')}-x{arguments.times:g}-seed{arguments.seed}"
-        key = {"what": name, "times": f"{arguments.times:g}", "seed": str(arguments.seed)}
+        arithmetic = "bfloat16" if native_bf16("cpu") else "float32"  # of products, by the processor
+        key = {"what": name, "times": f"{arguments.times:g}", "seed": str(arguments.seed), "arithmetic": arithmetic}
         rows = read(arguments.out)
         if any(all(row[word] == value for word, value in key.items()) for row in rows):
             continue

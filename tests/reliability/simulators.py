@@ -13,7 +13,7 @@ from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
 from tsmlib.envs.geometry import DT, closest_gap
 from tsmlib.envs.spec import MUJOCO_IDS, PYMUNK_IDS
 
-PUSH, PYMUNK_PUSH = "tsm/ReacherPush-v0", "tsm/PymunkPush-v0"
+PUSH, PYMUNK_PUSH = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 
 
 def arms(env_id: str, n: int, seed: int = 0) -> ArmVectorEnv:

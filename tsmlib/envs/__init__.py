@@ -1,7 +1,7 @@
 """Two-link arms in two simulators behind one interface; importing this module registers them with Gymnasium.
 
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose ``rollout`` simulates
-whole action sequences at once; ``gymnasium.make("tsmlib.envs:tsm/ReacherPush-v0")`` imports this module by itself.
+whole action sequences at once; ``gymnasium.make("tsmlib.envs:tsm/ReacherPush-v1")`` imports this module by itself.
 The state is the observation, and its layout is the same in both simulators. ``imperfect`` names the same arms with
 noisy sensors or delayed actions (section 5.3.3). A simulator is imported when an arm in it is first made.
 """

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tsmlib.envs import geometry
-from tsmlib.envs.geometry import DT, MAX_OVERLAP, TARGET_RADIUS, closest_gap, fingertip
+from tsmlib.envs.geometry import DT, MAX_OVERLAP, closest_gap, fingertip
 from tsmlib.envs.spec import EnvSpec
 
 Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
@@ -105,7 +105,7 @@ class ArmVectorEnv(VectorEnv, ABC):
             states = self._checked(options["states"], self._states.shape, "states")
             states[:, 4:6] = fingertip(states[:, :2])
             self._require_apart(states)
-            target = np.stack([_in_ring(rng, 0.0, TARGET_RADIUS) for rng in rngs])
+            target = np.stack([_in_ring(rng, *geometry.TARGET_RING[self.task]) for rng in rngs])
         else:
             states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
         if "target" in options:
@@ -166,9 +166,11 @@ class ArmVectorEnv(VectorEnv, ABC):
 
     def _draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A state (dx,) and a target (2,) from the reset distribution."""
-        q, dq = (rng.uniform(-most, most, 2) for most in (geometry.START_ANGLE, geometry.START_VELOCITY))
+        most = np.array(geometry.START_ANGLES[self.task])
+        q = rng.uniform(-most, most)
+        dq = rng.uniform(-geometry.START_VELOCITY, geometry.START_VELOCITY, 2)
         state = np.concatenate([q, dq, fingertip(q)])
-        target = _in_ring(rng, 0.0, TARGET_RADIUS)
+        target = _in_ring(rng, *geometry.TARGET_RING[self.task])
         if self.task == "reach":
             return state, target
         while True:  # the block must not touch the arm

@@ -20,24 +20,29 @@ DT = 0.02  # s per step
 
 # The block: the object to push, or the obstacle (a disc seen from above).
 BLOCK_RADIUS = 0.03
-WALL = 0.28  # the walls' faces, at the inner edge of Reacher's frame; the block's centre stays within 0.25 m
+WALL = 0.24  # the walls' faces on push; the object's centre stays within 0.21 m along x and y
 BLOCK_MASS = 1.0  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
-BLOCK_DECAY = 0.2  # s; a free object slows down by a factor e in this time
+BLOCK_DECAY = 0.05  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
 FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
 BLOCK_RING = (0.08, 0.17)  # m; distance of the block's centre from the shoulder at reset: within reach all around
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
 MAX_OVERLAP = 0.005  # m of block and arm in a given start; impacts reach 1.5 mm
 
-START_ANGLE = 0.1  # rad, rad/s and m: the reset distribution of Gymnasium's Reacher
-START_VELOCITY = 0.005
-TARGET_RADIUS = 0.2
+START_VELOCITY = 0.005  # rad/s, both joints
+START_ANGLES = {  # rad; shoulder and elbow are uniform within plus and minus this
+    "reach": (0.1, 0.1), "obstacle": (0.1, 0.1),  # the reset distribution of Gymnasium's Reacher
+    "push": (np.pi, 2.5),  # in every direction, and bent
+}  # fmt: skip
+TARGET_RING = {  # m from the shoulder, uniform over the area; nearer to it the first link is in the object's way
+    "reach": (0.0, 0.2), "obstacle": (0.0, 0.2), "push": (0.05, 0.2),
+}  # fmt: skip
 
 STATE_NAMES = (
     "joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y", "block_x", "block_y", "block_vx", "block_vy",
 )  # fmt: skip
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
-HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.25, 0.25, 3.5, 3.0)  # in random data; angles: of cosine, sine
+HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.21, 0.21, 4.8, 4.6)  # in random data; angles: of cosine, sine
 
 
 def arm_points(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

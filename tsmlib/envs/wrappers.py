@@ -147,5 +147,5 @@ def imperfect_arms(
 def _half_range(env_id: str) -> np.ndarray:
     scale = np.array(HALF_RANGE[: EnvSpec.parse(env_id).state_dim])
     if EnvSpec.parse(env_id).task == "obstacle":  # it does not move, and nobody measures how fast
-        scale[8:] = 0.0
+        scale[6:] = 0.25, 0.25, 0.0, 0.0
     return scale

@@ -13,9 +13,8 @@ from torch import Tensor
 from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, closest_gap
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.exploitation import NEAR
-from tsmlib.evaluation.futures import HORIZON, SampledFutures
+from tsmlib.evaluation.futures import HORIZON, Coded, SampledFutures
 from tsmlib.models.base import rollout
-from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
 from tsmlib.trajectory import Trajectories, windows
 
@@ -42,7 +41,7 @@ EVENTS = ("object", "wall")  # the arm touches the object, the object touches a 
 
 @torch.no_grad()
 def windows_before_contact(
-    model: TSM, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0
+    model: Coded, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0
 ) -> tuple[SampledFutures, np.ndarray]:
     """The windows of figure 9, which begin LEAD steps before the first touch of an episode, and whose they are.
 

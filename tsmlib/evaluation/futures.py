@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from tsmlib.evaluation.prediction import sample_states
+from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.trajectory import Segment, Trajectories, Window, windows
 
+Coded = TSM | RecurrentTSM  # one code for H steps: ``decode``, ``code_len``, ``latent_dim``
 STARTS = (10, 40, 70)  # steps at which the windows begin; with HORIZON they hold every step of an episode once
 HORIZON = 30
 
@@ -37,7 +39,7 @@ class SampledFutures:
 
 
 def sample_futures(
-    model: TSM, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
+    model: Coded, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
 ) -> SampledFutures:
     """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
     drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)

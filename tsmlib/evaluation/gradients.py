@@ -55,7 +55,7 @@ def of_return(task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0
     net: Any = deepcopy(model).double().requires_grad_()
     prior = deepcopy(prior).double().requires_grad_()
     past = Segment(*(part.double() for part in task.past(net.past_len)))
-    predict = model_predictor(net, past, samples=2, seed=seed)
+    predict = model_predictor(net, past, samples=2 if net.stochastic else 0, seed=seed)
     draw = torch.Generator().manual_seed(seed)
 
     def errors(space: SearchSpace, parts: dict[str, list[Tensor]]) -> dict[str, float]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tsmlib.evaluation import prediction, scoring
-from tsmlib.evaluation.futures import SampledFutures
+from tsmlib.evaluation.futures import Coded, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
@@ -35,13 +35,13 @@ def active_units(mean: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def total_effects(model: TSM, window: Window, generator: torch.Generator) -> Tensor:
+def total_effects(model: Coded, window: Window, generator: torch.Generator) -> Tensor:
     """Total effect of each dimension of the code on the next segment, (dz,), in deviations of the data.
 
     The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, mean over features, steps and windows. Says what
     the decoder does with a code however it was trained; the encoder has no part in it.
     """
-    past, actions = window.past, window.future.actions[:, : model.segment_len]
+    past, actions = window.past, window.future.actions[:, : model.code_len]
     z, again = (standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2))
     states = model.decode(past, actions, z)
     moved = []
@@ -58,7 +58,7 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
 
     ``posterior``: drawn from Q(Z | X+), which has seen the segment; ``prior``: drawn from N(0, I); ``zero``: z = 0.
     """
-    future = Segment(*(part[:, : model.segment_len] for part in window.future))
+    future = Segment(*(part[:, : model.code_len] for part in window.future))
     mean, log_variance = model.encode(future.states)
     codes = {
         "posterior": sample_posterior(mean, log_variance, generator),
@@ -119,7 +119,7 @@ def window_at(seen: SampledFutures, features: Features, quantile: float) -> Wind
 
 
 @torch.no_grad()
-def decode_codes(model: TSM, window: Window, codes: Tensor, steps: int) -> Tensor:
+def decode_codes(model: Coded, window: Window, codes: Tensor, steps: int) -> Tensor:
     """Futures of codes (n, dz) for one window: states (n, T, dx). One code, then the mode (z = 0) in later segments.
 
     window: N = 1. steps: T, at most as long as its future.

@@ -47,3 +47,4 @@ from .style import use_style as use_style
 from .video import embed as embed
 from .video import save_video as save_video
 from .video import side_by_side as side_by_side
+from .video import stacked as stacked

@@ -287,29 +287,40 @@ def plan_actions(data: np.ndarray, latent: np.ndarray, direct: np.ndarray, metho
 @styled
 def plan_strip(
     draw: Callable[[Axes, np.ndarray, np.ndarray], object],
-    predicted_states: np.ndarray,
-    true_states: np.ndarray,
+    rollouts: Mapping[Method, tuple[np.ndarray, np.ndarray]],
     target: np.ndarray,
     times: Sequence[int],
     dt: float = 0.02,
+    notes: Mapping[Method, str] | None = None,
 ) -> Figure:
-    """A filmstrip: the predicted rollout above, the executed plan below, at the steps ``times``.
+    """A filmstrip of one target: for each method the predicted rollout above, the executed plan below, at ``times``.
 
-    draw(ax, state (dx,), target (2,)) paints one scene; predicted_states and true_states: (T, dx), row k the
-    state after k + 1 steps of dt seconds.
+    draw(ax, states (k, dx) until then, target (2,)) paints one scene; rollouts: method -> predicted and executed
+    states, (T, dx) each, row k the state after k + 1 steps of dt seconds; notes: method -> words below its last
+    picture.
     """
-    predicted = shaped("predicted_states", predicted_states, "T dx")
-    true = shaped("true_states", true_states, f"{len(predicted)} {predicted.shape[1]}")
-    if not len(times) or any(not 0 <= step < len(true) for step in times):
-        raise ValueError(f"times {list(times)} must be steps between 0 and {len(true) - 1}")
-    width = min(WIDTH, 1.4 * len(times) + 0.2)
-    size = (width, 2 * width / len(times) + 0.15)
-    figure, grid = plt.subplots(2, len(times), figsize=size, squeeze=False, layout="compressed")
-    for row, states, title in zip(grid, (predicted, true), ("predicted", "executed"), strict=True):
-        for ax, step in zip(row, times, strict=True):
-            draw(ax, states[step], np.asarray(target))
-            style.scene(ax)
-            ax.set(xlabel="", ylabel="")
-            ax.set_title(f"{(step + 1) * dt:.2f} s" if states is predicted else "", fontsize=7)
-        row[0].set_ylabel(title, fontsize=7.5)
+    if not rollouts:
+        raise ValueError("rollouts hold no method: nothing to draw")
+    checked, size = {}, np.shape(next(iter(rollouts.values()))[0])
+    for method, (told, done) in rollouts.items():
+        told = shaped(f"predicted states of {method.label}", told, "T dx")
+        checked[method] = told, shaped(f"executed states of {method.label}", done, f"{size[0]} {size[1]}")
+    if not len(times) or any(not 0 <= step < size[0] for step in times):
+        raise ValueError(f"times {list(times)} must be steps between 0 and {size[0] - 1}")
+    width, rows = min(WIDTH, 1.4 * len(times) + 0.3), 2 * len(checked)
+    inches = (width, rows * (width - 0.3) / len(times) + 0.2 + 0.12 * len(notes or ()))
+    figure, grid = plt.subplots(rows, len(times), figsize=inches, squeeze=False, layout="compressed")
+    for i, (method, states) in enumerate(checked.items()):
+        for row, path, title in zip(grid[2 * i :], states, ("predicted", "executed"), strict=False):
+            for ax, step in zip(row, times, strict=True):
+                draw(ax, path[: step + 1], np.asarray(target))
+                style.scene(ax)
+                ax.set(xlabel="", ylabel="")
+            colour = method.look.colour if len(checked) > 1 else DARK
+            name = f"{method.look.name}\n" if len(checked) > 1 else ""
+            row[0].set_ylabel(name + title, fontsize=7.5, color=colour)
+        if notes and method in notes:
+            grid[2 * i + 1, -1].set_xlabel(notes[method], fontsize=6.5, color=style.NOTE, labelpad=2)
+    for ax, step in zip(grid[0], times, strict=True):
+        ax.set_title(f"{(step + 1) * dt:.2f} s", fontsize=7)
     return figure

@@ -1,8 +1,9 @@
-"""Films of an arm: two of them side by side, an mp4 file, and that file inside a notebook."""
+"""Films of an arm: several of them side by side and one above another, an mp4 file, and that file inside a notebook."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,22 +26,37 @@ def _frames(field: str, frames: np.ndarray) -> np.ndarray:
     return frames
 
 
-def side_by_side(left: np.ndarray, right: np.ndarray, labels: tuple[str, str]) -> np.ndarray:
-    """Two films as one, (T, H + strip, W1 + W2, 3), a label above each; the shorter one waits on its last frame."""
-    left, right = _frames("left", left), _frames("right", right)
-    if left.shape[1] != right.shape[1]:
-        raise ValueError(f"left is {left.shape[1]} pixels high and right {right.shape[1]}; render both at one height")
-    length, height = max(len(left), len(right)), max(20, left.shape[1] // 14)
-    halves = []
-    for film, label in zip((left, right), labels, strict=True):
-        held = film[np.minimum(np.arange(length), len(film) - 1)]
+def side_by_side(films: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Films as one, (T, H + strip, W1 + W2 + ..., 3), its label above each; a shorter one waits on its last frame."""
+    films = {label: _frames(label, film) for label, film in films.items()}
+    if len(heights := {label: film.shape[1] for label, film in films.items()}) == 0 or len({*heights.values()}) > 1:
+        found = ", ".join(f"{label} {pixels}" for label, pixels in heights.items()) or "no film"
+        raise ValueError(f"films of one height are expected, found pixels: {found}; render all at one height")
+    length, height = max(map(len, films.values())), max(20, max(heights.values()) // 14)
+    parts = []
+    for label, film in films.items():
+        held = _waiting(film, length)
         banner = Figure(figsize=(film.shape[2] / 100, height / 100), dpi=100, facecolor="white")
         banner.text(0.5, 0.45, label, ha="center", va="center", fontsize=0.5 * height, family="DejaVu Sans")
         canvas = FigureCanvasAgg(banner)
         canvas.draw()
         strip = np.asarray(canvas.buffer_rgba())[..., :3]
-        halves.append(np.concatenate([np.broadcast_to(strip, (length, *strip.shape)), held], axis=1))
-    return np.concatenate(halves, axis=2)
+        parts.append(np.concatenate([np.broadcast_to(strip, (length, *strip.shape)), held], axis=1))
+    return np.concatenate(parts, axis=2)
+
+
+def stacked(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+    """Two films as one, (T, H1 + H2, W, 3); the shorter one waits on its last frame."""
+    above, below = _frames("above", above), _frames("below", below)
+    if above.shape[2] != below.shape[2]:
+        raise ValueError(f"above is {above.shape[2]} pixels wide and below {below.shape[2]}; render both at one width")
+    length = max(len(above), len(below))
+    return np.concatenate([_waiting(above, length), _waiting(below, length)], axis=1)
+
+
+def _waiting(film: np.ndarray, length: int) -> np.ndarray:
+    """``film`` with its last frame repeated until it has ``length`` frames."""
+    return film[np.minimum(np.arange(length), len(film) - 1)]
 
 
 def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from tsmlib.models.base import Step, predict_segment
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Features
+from tsmlib.models.layers import chunked
+from tsmlib.models.recurrence import Recurrent
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Window, states_before
 
@@ -89,25 +91,19 @@ class LSTM(Configured):
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Warm the hidden state up on the past (B, L, .), then carry it. There is nothing to draw."""
-        h = c = past.states.new_zeros(len(past.states), self.hidden)
-        for x, u in zip(past.states[:, :-1].unbind(1), past.actions[:, 1:].unbind(1), strict=True):
-            h, c = self.recur(x, u, h, c)
-        x = past.states[:, -1]
+        return self._recurrent().begin(past)
 
-        def step(u: Tensor) -> Tensor:
-            nonlocal x, h, c
-            h, c = self.recur(x, u, h, c)
-            x = x + self.features.step_std * self.out(h)
-            return x
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
+        return chunked(self._decode, *past, actions)
 
-        return step
+    def _decode(self, states: Tensor, before: Tensor, actions: Tensor) -> Tensor:
+        recurrent, u = self._recurrent(), actions.transpose(0, 1)
+        states, _ = recurrent.run(states[:, -1], recurrent.read(Segment(states, before)), u, u[..., :0])
+        return states.transpose(0, 1)  # (B, K, dx)
 
-    def recur(self, x: Tensor, u: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """The next hidden state h and cell c, (B, hidden) each."""
-        gates = self.cell(torch.cat([self.features(x), u, h], dim=-1))
-        forget, write, read, candidate = gates.chunk(4, dim=-1)
-        c = forget.sigmoid() * c + write.sigmoid() * candidate.tanh()
-        return read.sigmoid() * c.tanh(), c
+    def _recurrent(self) -> Recurrent:
+        return Recurrent.of(self.features, self.cell, self.out)
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error of the states over the whole future, on the model's own predictions."""

@@ -59,5 +59,11 @@ class Features(nn.Module):
         return (predicted - true)[..., self.moving] / self.step_std[self.moving]
 
     def _raw(self, states: Tensor) -> Tensor:
-        angles = states[..., self.angles]
-        return torch.cat([angles.cos(), angles.sin(), states[..., self.others]], dim=-1)
+        angles = states[..., _columns(self.angles)]
+        return torch.cat([angles.cos(), angles.sin(), states[..., _columns(self.others)]], dim=-1)
+
+
+def _columns(index: list[int]) -> slice | list[int]:
+    """An index of columns, as a slice where they lie side by side: a view, and no scattered gradient."""
+    side_by_side = bool(index) and index == list(range(index[0], index[-1] + 1))
+    return slice(index[0], index[-1] + 1) if side_by_side else index

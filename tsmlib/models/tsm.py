@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
+from tsmlib.models.energy import energy_score
 from tsmlib.models.features import Features
 from tsmlib.models.layers import (
     CausalDecoder,
@@ -55,7 +56,7 @@ class TSM(Configured):
         **decoder: Unpack[DecoderOptions],
     ) -> None:
         super().__init__()
-        self.segment_len = self.past_len = segment_len
+        self.segment_len = self.past_len = self.code_len = segment_len  # a code is held for a segment
         self.latent_dim = latent_dim
         self.beta = beta
         self.features = Features(state_dim, tuple(angles))
@@ -124,22 +125,19 @@ class TSM(Configured):
     def energy_loss(self, window: Window, generator: Noise) -> Tensor:
         """Energy score of two free-running samples with codes from the prior, beyond the paper.
 
-        E|X - x| - |X - X'| / 2 over each whole segment, a strictly proper score: its minimum is the true conditional
-        distribution. The encoder is not used.
+        The sum over whole segments, see ``models.energy``. The encoder is not used.
         """
         actions, truth = window.future.actions, self.features(window.future.states)
-        samples, loss = [], truth.new_zeros(())
+        samples = []
         past = Segment(*(torch.cat([part, part]) for part in window.past))
         for segment_actions in actions.split(self.segment_len, dim=1):
             u = torch.cat([segment_actions, segment_actions])
             states = self.predict_segment(past, u, generator=generator)
             past = past.then(Segment(states, u)).last(self.past_len)
             samples.append(states)
-        first, second = self.features(torch.cat(samples, dim=1)).chunk(2)
-        for a, b, x in zip(*(s.split(self.segment_len, dim=1) for s in (first, second, truth)), strict=True):
-            distances = [_norm(a - x), _norm(b - x), _norm(a - b)]
-            loss = loss + ((distances[0] + distances[1] - distances[2]) / 2).mean()
-        return loss
+        drawn = self.features(torch.cat(samples, dim=1)).unflatten(0, (2, -1))  # (2, B, K, .)
+        pieces = (part.split(self.segment_len, dim=-2) for part in (drawn, truth))
+        return torch.stack([energy_score(*piece) for piece in zip(*pieces, strict=True)]).sum()
 
     def _posterior_code(self, past: Segment, future: Segment, generator: Noise) -> tuple[Tensor, Tensor]:
         """z ~ Q(Z | X+), or Q(Z | X+, X-, U-, U+), and its KL divergence from N(0, I): (B, dz), (B,)."""
@@ -172,7 +170,3 @@ class TSM(Configured):
     def _segments(self, future: Segment) -> list[Segment]:
         parts = zip(*(part.split(self.segment_len, dim=1) for part in future), strict=True)
         return [Segment(*part) for part in parts]
-
-
-def _norm(difference: Tensor) -> Tensor:
-    return (difference.flatten(1).square().sum(1) + 1e-8).sqrt()

@@ -9,9 +9,19 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from tsmlib.models.base import Model
 from tsmlib.rewards import Reward
+from tsmlib.trajectory import Segment
 
 Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
+
+
+class Judge(Protocol):
+    """What candidates are judged by: ``model_predictor`` for the mode, ``partial(model_predictor, samples=2)``, ..."""
+
+    def __call__(self, model: Model, past: Segment, /, *, seed: int) -> Predictor:
+        """The predictor through ``model`` from ``past`` (B, L, .); what is drawn is a function of ``seed``."""
+        ...
 
 
 class SearchSpace(Protocol):

@@ -17,9 +17,9 @@ from tsmlib import rewards
 from tsmlib.collection import Controller, collect, open_loop
 from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.models.base import DynamicsModel
-from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
+from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.planners import reevaluate
-from tsmlib.planning.predictors import model_predictor, simulator_predictor
+from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment
@@ -75,16 +75,20 @@ def mpc(
     *,
     every: int = 10,  # steps executed before the next plan
     plan: Plan | None = None,
-    samples: int = 2,
+    judge: Judge = model_predictor,
     seed: int = 0,
     progress: str = "",
 ) -> Trial:
     """Closed loop (model predictive control): plan to the end of the episode, execute ``every`` steps, observe, repeat.
 
+    The horizon shrinks: T, T - every, T - 2 every, ... steps. Each plan starts from what is left of the one before it
+    (``SearchSpace.after``), and is never worse than that by its own prediction.
+
     model: what plans are made through, from the true observed past; None is the true simulator. space: of the whole
-    episode. planner: ``partial(cem, iterations=4)`` for example; later plans start from what is left of the one before
-    (``SearchSpace.after``). plan: the first one, if it is already there, so that closed and open loop begin alike.
-    samples: of the model that a plan is made with; its predicted return comes from 32 others.
+    episode. planner: with the budget of each plan, ``partial(cem, candidates=96, iterations=4)`` for example. plan: the
+    first one, if it is already there, so that closed and open loop begin alike.
+    judge: what candidates are judged by, by default the model's mode. The predicted return of each plan comes from
+    samples that had no part in choosing it (``fresh_predictor``).
 
     Of the trial's plan, ``predicted_return`` is the first plan's, ``curve`` (plans, B) every plan's for the whole
     episode, the return executed until then included, and ``states`` (1, B, T, dx) the part of every predicted rollout
@@ -93,7 +97,7 @@ def mpc(
     if every < 1:
         raise ValueError(f"every is {every}, expected a positive number of steps")
     began, horizon, past_len = time.perf_counter(), task.horizon, 1 if model is None else model.past_len
-    planning = _Replanning(task, model, planner, every, samples, seed, space, start=len(task), plan=plan)
+    planning = _Replanning(task, model, planner, every, judge, seed, space, start=len(task), plan=plan)
     env = gymnasium.make_vec(task.env, num_envs=len(task))
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
@@ -120,7 +124,7 @@ class _Replanning:
     model: DynamicsModel | None
     planner: Planner
     every: int
-    samples: int
+    judge: Judge
     seed: int
     space: SearchSpace  # of the rest of the episode, as are start and plan
     start: Tensor | int
@@ -132,9 +136,9 @@ class _Replanning:
     def __call__(self, past: Segment) -> Tensor:
         """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
         reward = _whole_episode(self.task.reward, Segment(*(part[:, part.shape[1] - self.done :] for part in past)))
-        predict, judge = self._predictors(past)
+        predict, fresh = self._predictors(past)
         plan, self.plan = self.plan or self.planner(predict, reward, self.space, self.start), None
-        judged = reevaluate(plan, judge, reward)
+        judged = reevaluate(plan, fresh, reward)
         self.returns.append(judged.predicted_return)
         self.rollouts.append(judged.states[:1, :, : self.every])
         steps = min(self.every, self.task.horizon - self.done)
@@ -145,15 +149,12 @@ class _Replanning:
         return plan.actions[:, :steps]
 
     def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
-        """What a plan is made with, and what it is judged by."""
+        """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
             simulator = simulator_predictor(self.task.env, past.states[:, -1].numpy())
             return simulator, simulator
         recent, seed = past.last(self.model.past_len), self.seed + 2 * self.done
-        return (
-            model_predictor(self.model, recent, samples=self.samples, seed=seed),
-            model_predictor(self.model, recent, samples=32, seed=seed + 1),
-        )
+        return self.judge(self.model, recent, seed=seed), fresh_predictor(self.model, recent, seed=seed + 1)
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from tsmlib.models.layers import BLOCK
 from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.rewards import Reward, rewarded
 
@@ -231,8 +232,10 @@ def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
 
 
 @torch.no_grad()
-def evaluate(predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor, *, rows: int = 1600) -> Tensor:
-    """Expected return (C, B) of parameters (C, B, *shape), about ``rows`` at a time, which fit in a cache."""
+def evaluate(
+    predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK
+) -> Tensor:
+    """Expected return (C, B) of parameters (C, B, *shape), up to ``rows`` at a time: what models decode at once."""
     returns = []
     for chunk in parameters.split(max(1, rows // parameters.shape[1])):
         actions = space.decode(chunk)

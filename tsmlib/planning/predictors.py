@@ -8,17 +8,27 @@ import torch
 from torch import Tensor
 
 from tsmlib.collection import collect, open_loop
-from tsmlib.models.base import Model, rollout
+from tsmlib.models.base import Model, as_dynamics, rollout
 from tsmlib.planning.base import Predictor
 from tsmlib.sampling import SharedNoise
 from tsmlib.trajectory import Segment
 
+FRESH = 32  # samples behind a predicted return that is reported
 
-def model_predictor(model: Model, past: Segment, *, samples: int = 1, seed: int = 0) -> Predictor:
-    """Predict by rolling out ``model`` from ``past`` (B, L, .), with the same noise for every candidate and call.
 
-    samples: S model samples per candidate; 0 rolls out the mode (z = 0) instead.
+def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
+    """Predict by rolling out ``model`` from ``past`` (B, L, .): its mode, or samples of it.
+
+    samples: 0 rolls out the mode (z = 0) of every candidate, S = 1; n draws n samples of each, S = n, with the same
+    noise, a function of ``seed``, for every candidate and call. ValueError for samples of a deterministic model.
     """
+    if samples < 0:
+        raise ValueError(f"samples is {samples}, expected 0 (the mode) or a positive number of samples")
+    if samples and not as_dynamics(model).stochastic:
+        raise ValueError(
+            f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
+            "mode, samples=0"
+        )
     draws = max(samples, 1)
 
     def predict(actions: Tensor) -> Tensor:
@@ -30,6 +40,14 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 1, seed: int 
         return states.unflatten(0, (n, draws, n_targets)).transpose(0, 1)
 
     return predict
+
+
+def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FRESH) -> Predictor:
+    """What the return of a finished plan is predicted with: samples that had no part in choosing it.
+
+    ``seed`` must not be the planner's. A deterministic model has no samples: its one rollout predicts.
+    """
+    return model_predictor(model, past, samples=samples if as_dynamics(model).stochastic else 0, seed=seed)
 
 
 def simulator_predictor(env_id: str, start: np.ndarray) -> Predictor:

@@ -16,7 +16,8 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 
-TOLERANCE = 0.03  # metres: a trial that ends within it is a success
+HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
+TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class Task:
     target: Tensor
     reward_for: Callable[[Tensor], Reward]
     position: slice
-    horizon: int = 50
-    tolerance: float = TOLERANCE
+    horizon: int = HORIZON["reach"]
+    tolerance: float = TOLERANCE["reach"]
 
     @classmethod
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
         """The paper's task of an environment: to push the object to the target, or to reach it where there is none."""
         if EnvSpec.parse(env).task == "push":
-            return cls("push", env, start, target, rewards.push, rewards.BLOCK)
+            return cls("push", env, start, target, rewards.push, rewards.BLOCK, HORIZON["push"], TOLERANCE["push"])
         return cls("reach", env, start, target, rewards.reach, rewards.TIP)
 
     def __post_init__(self) -> None:

@@ -136,7 +136,7 @@ def learn_policy(
         policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
         reward=getattr(reward, "__name__", "reward"), seed=seed,
     )  # fmt: skip
-    state = TrainingState(policy, optimizer, LearningCurve(), o.iterations, identity, checkpoint)
+    state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), o.iterations, identity, checkpoint)
     learner = _Learner(policy, model, reward, draw, measure, o, seed, state)
     purpose = f"learning a policy, seed {seed}"
     with resumable(state, purpose=purpose, progress=progress) as bar, _frozen(model):

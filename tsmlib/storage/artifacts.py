@@ -44,6 +44,14 @@ class Model(Protocol):
 M = TypeVar("M", bound=torch.nn.Module)
 
 
+class Misfit(StoreError):
+    """A sound file of something else than was asked for. found: what it is of, such as ``found["env"]``."""
+
+    def __init__(self, message: str, found: Mapping[str, Json]) -> None:
+        super().__init__(message)
+        self.found = found
+
+
 # Arrays with a header ------------------------------------------------------------------------------------------------
 
 
@@ -177,7 +185,7 @@ def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = Non
         fingerprint = {**about["header"].get("fingerprint", {}), **fields}
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
         raise StoreError(f"{path} holds no usable trajectories: {error}. {remedy(path)}") from error
-    _require_fit(path, fingerprint, expect, about["schema"])
+    require_fit(path, fingerprint, expect, about["schema"])
     return found
 
 
@@ -217,7 +225,7 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
         differs = [f"{error!r:.500}"]
     if differs:
         raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_OTHER}")
-    _require_fit(path, fingerprint, expect, about["schema"])
+    require_fit(path, fingerprint, expect, about["schema"])
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
     return model
@@ -255,9 +263,10 @@ def _sizes(value: Json) -> Iterator[int]:
 # Comparison ----------------------------------------------------------------------------------------------------------
 
 
-def _require_fit(path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int) -> None:
+def require_fit(path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int = SCHEMA) -> None:
+    """Misfit naming both sides of every field of ``expect`` that ``found``, from the file, does not hold."""
     if differs := differences(found, expect or {}, only_stated=schema == 1):
-        raise StoreError(f"{path} does not fit: {'; '.join(differs)}. {_OTHER}")
+        raise Misfit(f"{path} does not fit: {'; '.join(differs)}. {_OTHER}", found)
 
 
 def differences(found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False) -> list[str]:

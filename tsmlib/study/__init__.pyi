@@ -14,6 +14,7 @@ from .models import schedule as schedule
 from .models import train_all as train_all
 from .parallel import precompute as precompute
 from .plans import along_the_way as along_the_way
+from .plans import as_judged as as_judged
 from .plans import plan as plan
 from .plans import precompute_plans as precompute_plans
 from .plans import trial as trial

@@ -1,6 +1,8 @@
 """Data sets at a run's scale, collected where they are missing."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import cast
 
 import gymnasium
@@ -9,9 +11,9 @@ from tqdm.auto import tqdm
 
 import tsmlib.envs
 from tsmlib.collection import collect, open_loop, smooth_torques
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import EnvSpec, gone
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json
+from tsmlib.storage.files import Json, StoreError
 from tsmlib.study.parallel import precompute
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import Run
@@ -40,7 +42,8 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     n = sizes(run, env)[split]
     path = run.folder(f"data/{EnvSpec.parse(env).name}") / f"{split}.safetensors"
     if path.exists():
-        return artifacts.load_trajectories(path, expect=fingerprint(env))
+        with remade_by(f"python -m tsmlib run collect --scale {run.scale} --seed {run.seed}", path):
+            return artifacts.load_trajectories(path, expect=fingerprint(env))
     if run.seed in HELD_OUT_SEED.values():
         raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
     seed = HELD_OUT_SEED.get(split, run.seed)
@@ -65,6 +68,17 @@ def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajector
     data = collect(copies, open_loop(torques), horizon=horizon, seed=seed)
     copies.close()
     return data
+
+
+@contextmanager
+def remade_by(command: str, path: Path) -> Iterator[None]:
+    """Of a file at ``path`` for an environment that is gone: StoreError with the reason, and what makes a new one."""
+    try:
+        yield
+    except artifacts.Misfit as misfit:
+        if reason := gone(str(misfit.found.get("env"))):
+            raise StoreError(f"{path} does not fit: {reason}. Delete it and make a new one: {command}") from misfit
+        raise
 
 
 def fingerprint(env: str) -> dict[str, Json]:

@@ -1,15 +1,18 @@
 """What a notebook shows: figures, tables, and films and strips of executed plans."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pandas as pd
 from IPython.display import Markdown, display
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tsmlib import figures
+from tsmlib import figures, rewards
 from tsmlib.envs.render import draw_scene
+from tsmlib.figures.method import Method
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
 from tsmlib.study.results import table
@@ -45,21 +48,41 @@ def film(task: Task, trial: Trial, target: int) -> np.ndarray:
         predicted, executed = trial.observed[target].numpy(), trial.states[target].numpy()
     else:
         predicted, executed = _rollouts(trial, target)
+    return figures.side_by_side(dict(zip(titles, _filmed(task, target, predicted, executed), strict=True)))
+
+
+def compared_film(task: Task, trials: Mapping[Method, Trial], target: int) -> np.ndarray:
+    """Frames of one target: a column for each method, its predicted rollout above, the executed one below."""
+    rows: tuple[dict[str, np.ndarray], ...] = {}, {}
+    for method, trial in trials.items():
+        films = _filmed(task, target, *_rollouts(trial, target))
+        for row, word, frames in zip(rows, ("predicted", "executed"), films, strict=True):
+            row[f"{method.look.name}: {word}"] = frames
+    return figures.stacked(*map(figures.side_by_side, rows))
+
+
+def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: int = 6) -> Figure:
+    """The same as a filmstrip, with the way of what has to arrive, and where it ends."""
+    rollouts = {method: _rollouts(trial, target) for method, trial in trials.items()}
+    ends = {method: 1000 * float(trial.final_distance[target]) for method, trial in trials.items()}
+    notes = {method: f"ends {end:.0f} mm off" for method, end in ends.items()}
+    times = [round(step) for step in np.linspace(0, task.horizon - 1, frames)]
+    way = "block_path" if task.position == rewards.BLOCK else "tip_path"
+
+    def draw(ax: Axes, states: np.ndarray, goal: np.ndarray) -> None:
+        paths: dict[str, Any] = {way: states[:, task.position]}
+        draw_scene(ax, states[-1], task.env, goal, **paths)
+
+    return figures.plan_strip(draw, rollouts, task.target[target].numpy(), times, notes=notes)
+
+
+def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
+    """A film of each rollout (T, dx)."""
     env: Any = gymnasium.make_vec(task.env, num_envs=1).unwrapped
     goal = task.target[target].numpy()
-    left, right = (np.stack([env.image(state, goal) for state in states]) for states in (predicted, executed))
+    films = [np.stack([env.image(state, goal) for state in states]) for states in rollouts]
     env.close()
-    return figures.side_by_side(left, right, titles)
-
-
-def strip(task: Task, trial: Trial, target: int, *, frames: int = 6) -> Figure:
-    """The same as a filmstrip."""
-    predicted, executed = _rollouts(trial, target)
-    times = [round(step) for step in np.linspace(0, len(executed) - 1, frames)]
-    goal = task.target[target].numpy()
-    return figures.plan_strip(
-        lambda ax, state, goal: draw_scene(ax, state, task.env, goal), predicted, executed, goal, times
-    )
+    return films
 
 
 def _rollouts(trial: Trial, target: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from tsmlib.models.base import DynamicsModel
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import StoreError
 from tsmlib.study import zoo
-from tsmlib.study.data import dataset, fingerprint
+from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.parallel import precompute
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.training.fit import TrainingOptions, fit
@@ -60,14 +60,16 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     for path in [own, run.shipped / folder / file] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
             header = artifacts.read_header(path)
-            planned = _plain(schedule(replace(run, scale=str(header.get("scale", run.scale))), env, model))
+            trained_at = replace(run, scale=str(header.get("scale", run.scale)))
+            planned = [stage.stated() for stage in schedule(trained_at, env, model)]
             if header.get("model") != model:
                 raise StoreError(f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it")
-            if (found := header.get("schedule", planned)) != planned:
+            net = _load(path, env, model)
+            if (found := zoo.stated(header.get("schedule", planned))) != planned:
                 raise StoreError(
                     f"{path} was trained by another schedule: {found}, expected {planned}. Restore or delete it"
                 )
-            return Trained(_load(path, env, model), header)
+            return Trained(net, header)
     return train(run, env, model, own)
 
 
@@ -119,11 +121,12 @@ def _trained_on(env: str, model: str) -> str:
     """The environment; of the prior, since equally many episodes hold the same torques, one with as many."""
     if zoo.find(model).group != "prior":
         return env
-    return "tsm/ReacherPush-v0" if EnvSpec.parse(env).has_block else "tsm/Reacher-v0"
+    return "tsm/ReacherObstacle-v0" if EnvSpec.parse(env).has_block else "tsm/Reacher-v0"
 
 
 def _load(path: Path, env: str, model: str) -> TrainedModel:
-    return cast(TrainedModel, artifacts.load_model(path, zoo.find(model).load(), expect=fingerprint(env)))
+    with remade_by(f"python -m tsmlib run train -p env={env} -p models={model}", path):
+        return cast(TrainedModel, artifacts.load_model(path, zoo.find(model).load(), expect=fingerprint(env)))
 
 
 def train(run: Run, env: str, model: str, path: Path) -> Trained:
@@ -132,22 +135,24 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves = schedule(run, env, model), {}
-    checkpoints = {stage.loss: path.with_name(f"{model}-{stage.loss}.checkpoint") for stage in stages}
-    for stage in stages:
+    checkpoints = {key: path.with_name(f"{model}-{key}.checkpoint") for key in zoo.keys(stages)}
+    for (key, checkpoint), stage in zip(checkpoints.items(), stages, strict=True):
         curve = fit(
             cast(torch.nn.Module, net), getattr(net, stage.loss), data, held_out,
             TrainingOptions(
                 past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr, bf16=stage.bf16,
+                muon=stage.muon, weight_decay=stage.weight_decay, patience=stage.patience, span=stage.span,
                 batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
                 validate_every=run.pick(smoke=10, laptop=250, paper=250),
             ),
-            seed=run.seed, device=run.device, checkpoint=checkpoints[stage.loss],
-            progress=f"{name} {model}: {stage.loss}",
+            seed=run.seed, device=run.device, checkpoint=checkpoint,
+            progress=f"{name} {model}: {key}",
         )  # fmt: skip
-        curves[stage.loss] = asdict(curve)
+        curves[key] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "schedule": _plain(stages), "bf16": [stage.loss for stage in stages if stage.bf16],
+        "schedule": [stage.stated() for stage in stages],
+        "bf16": [key for key, curve in curves.items() if any(curve["bf16"])],  # as the processor had it
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"),
         "seconds": sum(curve["seconds"][-1] for curve in curves.values()),  # of the CPU
@@ -157,11 +162,6 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     for checkpoint in checkpoints.values():
         shutil.rmtree(checkpoint)
     return Trained(net, artifacts.read_header(path))
-
-
-def _plain(stages: list[zoo.Updates]) -> list[dict[str, Any]]:
-    """A schedule as it stands in a model's header."""
-    return [{name: value for name, value in asdict(stage).items() if name != "bf16"} for stage in stages]
 
 
 def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:

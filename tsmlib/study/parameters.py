@@ -17,8 +17,8 @@ from typing import Any, TypeAlias
 from tsmlib.study import zoo
 
 SCALES = ("smoke", "laptop", "paper")
-ENVS = tuple(f"tsm/{arm}-v0" for arm in ("Reacher", "ReacherObstacle", "ReacherPush",
-                                         "PymunkReacher", "PymunkObstacle", "PymunkPush"))  # fmt: skip
+ENVS = tuple(f"tsm/{arm}" for arm in ("Reacher-v0", "ReacherObstacle-v0", "ReacherPush-v1",
+                                      "PymunkReacher-v0", "PymunkObstacle-v0", "PymunkPush-v1"))  # fmt: skip
 LONGEST = 1000  # characters
 Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)

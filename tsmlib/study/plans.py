@@ -19,7 +19,7 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi, plan_at, reevaluate, sampled_starts
-from tsmlib.planning.predictors import model_predictor, simulator_predictor
+from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import artifacts
@@ -30,7 +30,15 @@ from tsmlib.study.predictions import RESULTS
 from tsmlib.study.runs import Run
 
 VERSION = 2  # of planners and kept plans; others are made again
-KEPT = 4  # samples of the predicted states, of the 32 behind a predicted return
+CANDIDATES = {"smoke": 8, "laptop": 96, "paper": 96}  # of each iteration of cem and mppi, and for adam+starts
+ITERATIONS = {  # of an open-loop plan
+    "cem": {"smoke": 2, "laptop": 8, "paper": 10}, "adam": {"smoke": 3, "laptop": 100, "paper": 100},
+}  # fmt: skip
+AGAIN = {  # of each later plan of a closed loop, which starts from what is left of the one before
+    "cem": {"smoke": 1, "laptop": 3, "paper": 4}, "adam": {"smoke": 2, "laptop": 20, "paper": 20},
+}  # fmt: skip
+SAMPLES = 0  # by which a candidate is judged: its mode (benchmarks/settings, section 3)
+KEPT = 4  # samples of the predicted states, of those behind a predicted return
 TORQUES: dict[str, Callable[[Task], Tensor]] = {"random": random_torques, "zero": zero_torques}
 
 Methods = Sequence[Method] | Mapping[str, Sequence[Method]]  # for every task, or by the name of the task
@@ -111,7 +119,21 @@ def plan(run: Run, task: Task, method: Method, *, iterations: int = 0, every: in
 def along_the_way(run: Run, task: Task, method: Method, *, iterations: int, at: Iterable[int]) -> dict[int, Trial]:
     """Predicted and executed returns along a long optimisation: iteration -> trial (``planners.plan_at``)."""
     whole, problem = plan(run, task, method, iterations=iterations), _Problem.of(run, task, method, iterations, 0)
-    return {i: execute(task, plan_at(whole, i, problem.judge(), task.reward, problem.space())) for i in at}
+    _, fresh = problem.predictors()
+    return {i: execute(task, plan_at(whole, i, fresh, task.reward, problem.space())) for i in at}
+
+
+def as_judged(run: Run, task: Task, method: Method, trial: Trial) -> Trial:
+    """The trial of an open-loop plan with the rollout that its planner saw in place of fresh samples: the mode's.
+
+    For films; the predicted return stays that of the fresh samples.
+    """
+    if trial.plan is None:
+        raise ValueError("these actions were not planned, so there is no predicted rollout")
+    predict, _ = _Problem.of(run, task, method, 0, 0).predictors()
+    with torch.no_grad():
+        seen = predict(trial.plan.actions[None])[:, 0]
+    return replace(trial, plan=replace(trial.plan, states=seen))
 
 
 POSED = ("version", "task", "env", "horizon", "every")  # of what a plan is made from, what says which task it is for
@@ -135,17 +157,14 @@ class _Problem:
         """With its models, trained where they are missing, and the scale's budget."""
         prior = load_prior(run, task.env) if method.search_space == "latent" else None
         model = None if method.model == "oracle" else load_or_train(run, task.env, method.model).model
-        if method.planner in ("cem", "mppi"):
-            usual = run.pick(smoke=1, laptop=3, paper=4) if every else run.pick(smoke=2, laptop=8, paper=10)
-        else:
-            usual = run.pick(smoke=2, laptop=20, paper=20) if every else run.pick(smoke=3, laptop=100, paper=100)
-        candidates = run.pick(smoke=8, laptop=96, paper=96)
-        return _Problem(run, task, method, model, prior, candidates, iterations or usual, every)
+        usual = (AGAIN if every else ITERATIONS)["adam" if method.planner.startswith("adam") else "cem"][run.scale]
+        return _Problem(run, task, method, model, prior, CANDIDATES[run.scale], iterations or usual, every)
 
     def made_from(self) -> dict[str, Json]:
         """All that the plan is a function of."""
         nets = {"prior": self.prior, "model": self.model}
-        return {
+        judge: dict[str, Json] = {} if self.model is None else {"samples": SAMPLES}
+        return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
             "every": self.every, "seed": self.run.seed, "candidates": self.candidates, "iterations": self.iterations,
             "weights": {word: artifacts.digest(net.state_dict()) for word, net in nets.items() if net is not None},
@@ -156,19 +175,14 @@ class _Problem:
             return DirectActions(self.task.horizon)
         return LatentActions(self.prior.to(self.run.device), self.task.horizon)
 
-    def predictor(self, samples: int, seed: int) -> Predictor:
+    def predictors(self) -> tuple[Predictor, Predictor]:
+        """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
-            return simulator_predictor(self.task.env, self.task.start)
-        net = self.model.to(self.run.device)
-        return model_predictor(net, self.task.past(net.past_len), samples=self.draws(samples), seed=seed)
-
-    def draws(self, samples: int) -> int:
-        """The samples to draw; those of a deterministic model are all the same."""
-        return samples if self.model is None or self.model.stochastic else 1
-
-    def judge(self) -> Predictor:
-        """What the return of a plan is predicted with: samples that the planner did not see."""
-        return self.predictor(32, self.run.seed + 1)
+            simulator = simulator_predictor(self.task.env, self.task.start)
+            return simulator, simulator
+        net, seed = self.model.to(self.run.device), self.run.seed
+        past = self.task.past(net.past_len)
+        return model_predictor(net, past, samples=SAMPLES, seed=seed), fresh_predictor(net, past, seed=seed + 1)
 
     def planner(self, progress: str = "") -> Planner:
         word, seed, candidates = self.method.planner, self.run.seed, self.candidates
@@ -187,14 +201,14 @@ class _Problem:
     def search(self) -> Plan:
         """Open loop."""
         began = time.perf_counter()
-        space, predict, task = self.space(), self.predictor(2, self.run.seed), self.task
+        space, (predict, fresh), task = self.space(), self.predictors(), self.task
         start = torch.zeros(1, len(task), *space.shape)
         if self.method.planner == "adam+starts":
             n, seed = self.candidates, self.run.seed
             start = sampled_starts(predict, task.reward, space, len(task), candidates=n, keep=2, seed=seed)
         found = self.planner(self.title())(predict, task.reward, space, start)
         found = replace(found, seconds=time.perf_counter() - began)
-        return found if self.model is None else reevaluate(found, self.judge(), task.reward)
+        return found if self.model is None else reevaluate(found, fresh, task.reward)
 
     def closed_loop(self) -> Plan:
         """``execution.mpc`` from the kept open-loop plan on; seconds of both."""
@@ -202,7 +216,7 @@ class _Problem:
         net = None if self.model is None else self.model.to(self.run.device)
         done = mpc(
             self.task, net, self.space(), self.planner(), every=self.every, plan=first,
-            samples=self.draws(2), seed=self.run.seed, progress=self.title(),
+            judge=partial(model_predictor, samples=SAMPLES), seed=self.run.seed, progress=self.title(),
         ).plan  # fmt: skip
         assert done is not None
         return replace(done, seconds=first.seconds + done.seconds)

@@ -8,13 +8,13 @@ import pandas as pd
 from tsmlib import study
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
+from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL
-from tsmlib.study.claims.query import OURS, PAPERS
 from tsmlib.study.notebooks import require
 from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import planning as planning_results
@@ -22,6 +22,7 @@ from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import table
 from tsmlib.study.runs import ROOT, Run
+from tsmlib.study.zoo import OURS, PAPERS
 
 README = ROOT / "README.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
@@ -140,8 +141,9 @@ kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
 
 {scores}
 
-**Planning.** Training seed {seed}, frozen targets, T = 50 steps, the cross-entropy method through each
-model, executed open loop; means over targets, returns in metres summed over steps.
+**Planning.** Training seed {seed}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
+pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
+over steps.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 

@@ -5,11 +5,11 @@ Trained, scored, planned with and drawn it is by its word alone: every other fil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from importlib import import_module
 from itertools import product
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES, Look, Method
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from tsmlib.envs.spec import EnvSpec
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
-    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 290.0,
-    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 60.0,
+    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 1160.0,
+    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 240.0,
 }  # fmt: skip
 
 
@@ -30,7 +30,9 @@ class Stage:
 
     rate: updates per second on one core of the machine that the published models were trained on, on the plain arm and
     where there is a block. future_len: steps ahead, 2 H. lr: the best of 1e-3, 2e-3 and 4e-3 for every baseline, on
-    validation. bf16: whether products in bfloat16 are faster: not where a gated stack is run step by step.
+    validation. bf16: whether products in bfloat16 are faster, on a processor that has them (``training.precision``;
+    elsewhere float32): not where a gated stack is run step by step. muon, weight_decay, patience and span: of
+    ``TrainingOptions``; stages that share one schedule have spans that follow each other, as (0, 0.6) and (0.6, 1) do.
     """
 
     loss: str
@@ -40,17 +42,27 @@ class Stage:
     lr: float = 4e-3
     batch: int = 256
     bf16: bool = True
+    muon: float = 0.0
+    weight_decay: float = 0.0
+    patience: int = 0
+    span: tuple[float, float] = (0.0, 1.0)
 
     def within(self, seconds: float, block: bool) -> Updates:
         """The stage in its share of a budget: updates in tens, and never fewer than 20."""
         rate = self.rate[block] if isinstance(self.rate, tuple) else self.rate
         steps = max(20, 10 * round(seconds * self.share * rate / 10))
-        return Updates(self.loss, steps, self.future_len, self.lr, self.batch, self.bf16)
+        return Updates(
+            self.loss, steps, self.future_len, self.lr, self.batch, self.bf16, self.muon, self.weight_decay,
+            self.patience, self.span,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Updates:
-    """A stage of a training with its number of updates; but for ``bf16`` it stands so in the header of a model."""
+    """A stage of a training with its number of updates.
+
+    Fields with a default came later: models whose headers do not have them were trained by the default.
+    """
 
     loss: str
     steps: int
@@ -58,6 +70,24 @@ class Updates:
     lr: float
     batch: int
     bf16: bool
+    muon: float = 0.0
+    weight_decay: float = 0.0
+    patience: int = 0
+    span: tuple[float, float] = (0.0, 1.0)
+
+    def stated(self) -> dict[str, Any]:
+        """The stage as it stands in the header of a model: without ``bf16``, which holds where it is native."""
+        return _as_json({name: value for name, value in asdict(self).items() if name != "bf16"})
+
+
+def stated(schedule: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The schedule in the header of a model, complete: what came later is at its default."""
+    later = {field.name: field.default for field in fields(Updates) if field.default is not MISSING}
+    return [{**_as_json(later), **stage} for stage in schedule]
+
+
+def _as_json(stage: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in stage.items()}
 
 
 @dataclass(frozen=True)
@@ -66,8 +96,9 @@ class ModelSpec:
 
     cls: ``module:Class``, imported when first used. arguments: of the class, beyond the sizes of states and actions.
     budget: seconds of training of its own, in place of the environment's. group: dynamics models are compared
-    everywhere; an ablation takes something away from TSM, a choice changes one of the paper's; the prior is the prior.
-    planned: whether figure 6 plans with it.
+    everywhere; an ablation is TSM with a part put in or taken away, a choice changes one of the paper's; the prior is
+    the prior.
+    planned: whether figure 6 plans with it. pushing: share of the budget there; all but one model have had half so far.
     """
 
     word: str
@@ -78,6 +109,7 @@ class ModelSpec:
     group: Literal["dynamics", "ablation", "choice", "prior"] = "dynamics"
     budget: float | None = None
     planned: bool = False
+    pushing: float = 0.5
 
     def load(self) -> type[torch.nn.Module]:
         """The class."""
@@ -87,6 +119,7 @@ class ModelSpec:
     def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
         """How the model is trained in a share of its budget, on an imperfect arm as on the plain one."""
         seconds = share * (BUDGET[env.arm.name] if self.budget is None else self.budget)
+        seconds *= self.pushing if env.task == "push" and self.budget is None else 1.0
         return [stage.within(seconds, env.has_block) for stage in self.stages]
 
 
@@ -100,6 +133,11 @@ def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> 
 
 TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
 LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10)
+RECURRENT = (  # the mode first, since a sample costs less than two; at last over longer windows
+    replace(_free("point_loss", 17, 0.5), muon=0.006, span=(0.0, 0.5)),
+    replace(_free("loss", 11, 0.35), muon=0.006, span=(0.5, 0.85)),
+    replace(_free("loss", 7.5, 0.15), muon=0.006, span=(0.85, 1.0), future_len=30),
+)
 PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
 
 
@@ -121,18 +159,23 @@ def _choice(word: str, name: str, colour: str, **arguments: object) -> ModelSpec
 
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any colour vision --------
 
-_TSM, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
+_TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
     f"tsmlib.models.{name}"
-    for name in ("tsm:TSM", "baselines:OneStep", "baselines:LSTM", "ensemble:Ensemble", "action_prior:ActionPrior")
-)
+    for name in (
+        "tsm:TSM", "recurrent:RecurrentTSM", "baselines:OneStep", "baselines:LSTM", "ensemble:Ensemble",
+        "action_prior:ActionPrior",
+    )
+)  # fmt: skip
 _MODELS = (
     ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True),
+    ModelSpec("rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT, planned=True, pushing=1.0),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy", Look("TSM + energy", "#56B4E9", "D"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
+        "ablation",
     ),
     ModelSpec(  # the same with the state skip, and more teacher forcing
-        "tsm+energy+direct", Look("TSM + energy + skip", "#003C8F", "*"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
-        _skip, planned=True,
+        "tsm+energy+direct", Look("TSM + energy + skip", "#4F7FBF", "8"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
+        _skip, "ablation",
     ),
     ModelSpec(
         "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "p"), _TSM, (replace(TEACHER, share=1.0),), _wide,
@@ -171,6 +214,8 @@ _MODELS = (
     ),
 )  # fmt: skip
 ZOO = {spec.word: spec for spec in _MODELS}
+PAPERS, OURS = "tsm", "rtsm"  # the model of the paper, and the one that goes beyond it
+CODED = ("TSM", "RecurrentTSM")  # classes whose predictions are a function of codes; the first has an encoder too
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method
     "ppo": Look("PPO", "#999933"), "trpo": Look("TRPO", "#7B4B2A"), "oracle": Look("oracle", "#111111"),
     "random": Look("random torques", "#7A7A7A"), "zero": Look("zero torque", "#B0B0B0"),
@@ -181,10 +226,16 @@ LOOKS = {  # of what is run and drawn beside the models; greys for what is no me
 }  # fmt: skip
 
 
-def words(*groups: str, cls: str = "") -> tuple[str, ...]:
-    """The models of some groups, or of all, in the order of ZOO; cls: of one class alone, ``TSM`` for example."""
+def keys(stages: Sequence[Stage | Updates]) -> list[str]:
+    """A word for each stage of a training: its loss, numbered from the second time on that it is minimised."""
+    losses = [stage.loss for stage in stages]
+    return [f"{loss}-{n}" if (n := 1 + losses[:i].count(loss)) > 1 else loss for i, loss in enumerate(losses)]
+
+
+def words(*groups: str, cls: Sequence[str] = ()) -> tuple[str, ...]:
+    """The models of some groups, or of all, in the order of ZOO; cls: of some classes alone, CODED for example."""
     named = ((word, spec) for word, spec in ZOO.items() if not groups or spec.group in groups)
-    return tuple(word for word, spec in named if cls in ("", spec.cls.partition(":")[2]))
+    return tuple(word for word, spec in named if not cls or spec.cls.partition(":")[2] in cls)
 
 
 def find(word: str) -> ModelSpec:

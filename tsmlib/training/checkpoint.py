@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError, writer_lock
 from tsmlib.storage.provenance import provenance
+from tsmlib.training.precision import native_bf16
 
 KEPT = 2  # generations
 
@@ -47,17 +48,17 @@ C = TypeVar("C", bound=Curve)
 
 
 class TrainingState(Generic[C]):
-    """All that a run needs to continue: weights, Adam's moments, the step, the best weights and the curve so far.
+    """All that a run needs to continue: weights, moments, the step, the best weights and the curve so far.
 
-    total: steps of the whole run. identity: what the run is, as JSON, its lr among it; a checkpoint of another run is
-    refused. folder: of the checkpoints; none without.
+    optimizers: by the name of their moments in a checkpoint. total: steps of the whole run. identity: what the run is,
+    as JSON, its lr among it; a checkpoint of another run is refused. folder: of the checkpoints; none without.
     """
 
     def __init__(
-        self, model: nn.Module, optimizer: torch.optim.Optimizer, curve: C,
+        self, model: nn.Module, optimizers: Mapping[str, torch.optim.Optimizer], curve: C,
         total: int, identity: Mapping[str, Json], folder: Path | None = None,
     ) -> None:  # fmt: skip
-        self.model, self.optimizer, self.curve, self.total = model, optimizer, curve, total
+        self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
         self.identity, self.folder = identity, folder
         self.step, self.seconds = 0, 0.0
         self.keep(math.inf)
@@ -84,10 +85,11 @@ class TrainingState(Generic[C]):
         """Write the next generation."""
         if self.folder is None:
             return
-        adam = self.optimizer.state_dict()["state"]
         tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
         tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
-        tensors |= {f"adam.{i}.{name}": tensor for i, moments in adam.items() for name, tensor in moments.items()}
+        for name, optimizer in self.optimizers.items():
+            for i, moments in optimizer.state_dict()["state"].items():
+                tensors |= {f"{name}.{i}.{moment}": tensor for moment, tensor in moments.items()}
         header = dict[str, Json](
             identity=self.identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
             made_by=self._made_by(), best_step=self.best_step, best_loss=self.best_loss,
@@ -97,14 +99,15 @@ class TrainingState(Generic[C]):
     def load(self) -> None:
         """Go on from the newest whole generation, if there is one.
 
-        Says and records what differs in code, libraries, CPU, threads or device. StoreError for another run's.
+        Says and records what differs in code, libraries, CPU, its bfloat16, threads or device. StoreError for another
+        run's.
         """
         if self.folder is None or (found := load_generation(self.folder)) is None:
             return
         path, tensors, header = found[0], found[1], cast(dict[str, Any], found[2])
         anew = f"Delete {self.folder} to start anew, or go back to those settings"
-        groups: dict[str, dict[str, Tensor]] = {"model": {}, "best": {}, "adam": {}}
-        moments: dict[int, dict[str, Tensor]] = {}
+        groups: dict[str, dict[str, Tensor]] = {name: {} for name in ("model", "best", *self.optimizers)}
+        moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.optimizers}
         try:
             if differs := artifacts.differences(header["identity"], self.identity):
                 raise StoreError(f"{path} is the checkpoint of another run: {'; '.join(differs)}. {anew}")
@@ -115,9 +118,10 @@ class TrainingState(Generic[C]):
             for group in ("model", "best"):
                 if differs := artifacts.differences(artifacts.layout(groups[group]), planned):
                     raise StoreError(f"{path} holds the weights of another model: {'; '.join(differs[:3])}. {anew}")
-            for name, tensor in groups["adam"].items():
-                index, _, moment = name.partition(".")
-                moments.setdefault(int(index), {})[moment] = tensor
+            for group, held in moments.items():
+                for name, tensor in groups[group].items():
+                    index, _, moment = name.partition(".")
+                    held.setdefault(int(index), {})[moment] = tensor
             curve, made_by = type(self.curve)(**header["curve"]), {"device": "cpu", **header["made_by"]}
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
@@ -126,7 +130,8 @@ class TrainingState(Generic[C]):
                 raise
             raise StoreError(f"{path} is no checkpoint of this tsmlib: {error!r:.200}. {anew}") from error
         self.model.load_state_dict(groups["model"])
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": moments[name]})
         self.best, self.best_step, self.best_loss = groups["best"], best_step, best_loss
         self.step, self.seconds, self.curve = step, seconds, curve
         self._note_changes(made_by)
@@ -144,7 +149,8 @@ class TrainingState(Generic[C]):
 
     def _made_by(self) -> dict[str, Json]:
         device = next(self.model.parameters()).device
-        return {**provenance(), "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type}
+        name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+        return {**provenance(), "device": name, "native_bf16": native_bf16(device)}
 
 
 @contextmanager

@@ -1,9 +1,10 @@
 """Training: one flat loop for every model and the prior."""
 
+import ctypes
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from torch import Tensor, nn
 
 from tsmlib.storage.artifacts import digest
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
+from tsmlib.training.muon import Muon, matrices
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
@@ -22,7 +25,10 @@ Loss = Callable[[Window, torch.Generator], Tensor]
 class TrainingOptions:
     """Windows and schedule of a training.
 
-    past_len, future_len: steps of a window. patience: validations without improvement before stopping early; 0: never.
+    past_len, future_len: steps of a window. muon: peak learning rate of Muon for the weight matrices (``matrices``),
+    beside Adam for all else; 0: Adam for everything. weight_decay: of the matrices, decoupled, per unit of their
+    learning rate. span: the part of one cosine schedule, from 0 to 1, that this training covers, where several follow
+    each other; warm-up where it begins at 0. patience: validations without improvement before stopping early; 0: never.
     """
 
     past_len: int
@@ -32,10 +38,13 @@ class TrainingOptions:
     lr: float = 1e-3  # Adam's default, appendix A
     lr_final: float = 1e-5  # end of the cosine schedule
     warmup: int = 100  # steps
+    muon: float = 0.0  # follows the schedule of lr, and ends at the same share of its peak
+    weight_decay: float = 0.0
+    span: tuple[float, float] = (0.0, 1.0)
     clip: float = 1.0  # gradient norm: windows with contact have heavy tails
     validate_every: int = 250  # steps; a checkpoint is written as often
     patience: int = 0
-    bf16: bool = False  # matrix products in bfloat16, weights in float32
+    bf16: bool = False  # matrix products in bfloat16 where they are native; weights are in float32
 
     def __post_init__(self) -> None:
         if min(self.steps, self.batch_size, self.validate_every) < 1:
@@ -43,15 +52,26 @@ class TrainingOptions:
                 f"steps {self.steps}, batch_size {self.batch_size}, validate_every {self.validate_every}: "
                 "expected positive"
             )
+        if not (0 < self.lr < math.inf and 0 <= self.lr_final < math.inf):
+            raise ValueError(f"lr {self.lr}, lr_final {self.lr_final}: expected lr above zero, lr_final zero or above")
+        for name in ("muon", "weight_decay", "warmup", "patience"):
+            if not 0 <= (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"{name} {value}: expected zero or above")
+        if not 0 <= self.span[0] < self.span[1] <= 1:
+            raise ValueError(f"span {self.span}: expected two numbers from 0 to 1, the first below the second")
 
 
 @dataclass
 class TrainingHistory(Curve):
-    """Record of a ``fit`` at each validation: optimiser step, training loss since the last one, validation loss."""
+    """Record of a ``fit`` at each validation: optimiser step, training loss since the last one, validation loss.
+
+    bf16: whether matrix products were in bfloat16.
+    """
 
     step: list[int] = field(default_factory=list)
     train: list[float] = field(default_factory=list)
     validation: list[float] = field(default_factory=list)
+    bf16: list[bool] = field(default_factory=list)
 
 
 @torch.enable_grad()  # an interrupt within torch.no_grad, in a notebook, may leave gradients off
@@ -67,7 +87,7 @@ def fit(
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
 ) -> TrainingHistory:
-    """Minimise ``loss`` over random windows with Adam; leave the weights with the best validation loss in ``model``.
+    """Minimise ``loss`` over random windows; leave the weights with the best validation loss in ``model``.
 
     Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint``, a folder, continues
     as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
@@ -83,20 +103,21 @@ def fit(
         seed=seed, loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
         data=[_digest(data) for data in (train, validation)],
     )  # fmt: skip
+    bf16 = o.bf16 and native_bf16(device)
+    keep_freed_memory()
     with _trained_on(device, model):
-        optimizer = torch.optim.Adam(model.parameters(), lr=o.lr, fused=True)
-        state = TrainingState(model, optimizer, TrainingHistory(), o.steps, identity, checkpoint)
+        state = TrainingState(model, optimizers(model, o), TrainingHistory(), o.steps, identity, checkpoint)
         with resumable(state, purpose=f"training, seed {seed}", progress=progress) as bar:
             began, losses = time.process_time() - state.seconds, []
             for step in range(state.step, o.steps):
                 if o.patience and step - state.best_step >= o.patience * o.validate_every:
                     break
                 generator.manual_seed(seed * 1_000_003 + step)
-                losses.append(_update(state, loss, draw, generator, step, o))
+                losses.append(_update(state, loss, draw, generator, step, o, bf16))
                 bar.update()
                 if (step + 1) % o.validate_every == 0 or step + 1 == o.steps:
                     state.step, state.seconds = step + 1, time.process_time() - began
-                    _record(state, sum(losses) / len(losses), validate(loss, held_out, seed))
+                    _record(state, sum(losses) / len(losses), validate(loss, held_out, seed), bf16)
                     state.save()
                     bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
                     losses = []
@@ -104,32 +125,65 @@ def fit(
     return state.curve
 
 
+def keep_freed_memory() -> None:
+    """Let the process keep what it frees, where its allocator is glibc's.
+
+    Otherwise the large tensors of an update go back to the system after it and are fetched anew, page by page, for the
+    next, which takes a tenth of the time.
+    """
+    trim_threshold, mmap_max = -1, -4  # in malloc.h
+    with suppress(OSError, TypeError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(mmap_max, 0)
+        mallopt(trim_threshold, 2**31 - 1)
+
+
+def optimizers(model: nn.Module, o: TrainingOptions) -> dict[str, torch.optim.Optimizer]:
+    """Adam, and Muon where it has a learning rate and the model a matrix."""
+    inside = matrices(model) if o.muon or o.weight_decay else []
+    known = {id(weight) for weight in inside}
+    others = [weight for weight in model.parameters() if id(weight) not in known]
+    held = [{"params": others, "weight_decay": 0.0}]
+    if not o.muon:
+        held.append({"params": inside, "weight_decay": o.weight_decay})
+    made: dict[str, torch.optim.Optimizer] = {}
+    if held := [group for group in held if group["params"]]:
+        made["adam"] = torch.optim.AdamW(held, lr=o.lr, fused=True)
+    if o.muon and inside:
+        made["muon"] = Muon(inside, lr=o.muon, weight_decay=o.weight_decay)
+    return made
+
+
 def _update(
     state: TrainingState[TrainingHistory], loss: Loss, draw: Iterator[Window], generator: torch.Generator,
-    step: int, o: TrainingOptions,
+    step: int, o: TrainingOptions, bf16: bool,
 ) -> float:  # fmt: skip
-    """One step of Adam; the loss before it."""
-    for group in state.optimizer.param_groups:
-        group["lr"] = schedule(step, o.steps, o.lr, o.lr_final, o.warmup)
+    """One step of the optimisers; the loss before it."""
+    lr = schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span)
+    for name, optimizer in state.optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = lr if name == "adam" else lr / o.lr * o.muon
     window = next(draw)
     torch.clear_autocast_cache()  # which one left on would never clear
-    with torch.autocast(window.past.states.device.type, torch.bfloat16, enabled=o.bf16):
+    with torch.autocast(window.past.states.device.type, torch.bfloat16, enabled=bf16):
         value = loss(window, generator)
     _require_finite(state, "training loss", value.item(), step)
-    state.optimizer.zero_grad(set_to_none=True)
+    state.model.zero_grad(set_to_none=True)
     value.backward()
     norm = nn.utils.clip_grad_norm_(state.model.parameters(), o.clip)
     _require_finite(state, "gradient", norm.item(), step)  # before it reaches the weights
-    state.optimizer.step()
+    for optimizer in state.optimizers.values():
+        optimizer.step()
     return value.item()
 
 
-def _record(state: TrainingState[TrainingHistory], train: float, validation: float) -> None:
+def _record(state: TrainingState[TrainingHistory], train: float, validation: float, bf16: bool) -> None:
     _require_finite(state, "validation loss", validation, state.step)
     state.curve.step.append(state.step)
     state.curve.seconds.append(state.seconds)
     state.curve.train.append(train)
     state.curve.validation.append(validation)
+    state.curve.bf16.append(bf16)
     if validation < state.best_loss:
         state.keep(validation)
 
@@ -156,11 +210,16 @@ def _digest(data: Trajectories) -> str:
     return digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})[:16]
 
 
-def schedule(step: int, steps: int, lr: float, lr_final: float, warmup: int) -> float:
-    """Linear warm-up, then half a cosine from ``lr`` to ``lr_final``."""
+def schedule(
+    step: int, steps: int, lr: float, lr_final: float, warmup: int, span: tuple[float, float] = (0.0, 1.0)
+) -> float:
+    """Linear warm-up, then half a cosine from ``lr`` to ``lr_final``; or the part of it that ``span`` covers."""
+    first, last = span
+    warmup = 0 if first else warmup  # which the training before it had
     if step < warmup:
         return lr * (step + 1) / warmup
-    return lr_final + (lr - lr_final) * 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+    done, of = step - warmup, max(1, steps - warmup)
+    return lr_final + (lr - lr_final) * 0.5 * (1 + math.cos(math.pi * (first * of + (last - first) * done) / of))
 
 
 def fixed_windows(data: Trajectories, past_len: int, future_len: int, n_windows: int = 2000) -> Window:

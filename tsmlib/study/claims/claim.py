@@ -20,8 +20,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from tsmlib.study.claims.query import PAPERS, Check, Checks, Query
+from tsmlib.study.claims.query import Check, Checks, Query
 from tsmlib.study.claims.shown import Shown
+from tsmlib.study.zoo import PAPERS
 
 VERSION = 2  # raise it when verdicts are reached in another way: those that are stored are void then
 REPLICATED, DEPENDENT, INCONCLUSIVE, FAILED, UNTESTABLE, DEFINITIONAL = VERDICTS = (

@@ -18,6 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.planning.tasks import HORIZON
+from tsmlib.study.zoo import PAPERS
+
 # Models, places and readings -----------------------------------------------------------------------------------------
 
 
@@ -37,18 +41,22 @@ class Place(NamedTuple):
     table: str = ""
 
     @property
+    def horizon(self) -> int:
+        """Steps of the task."""
+        return HORIZON["push" if EnvSpec.parse(self.env).task == "push" else "reach"]
+
+    @property
     def name(self) -> str:
         """ReacherPush, Reacher noise."""
         imperfect = " noise" * bool(self.noise) + " delay" * bool(self.delay)
-        return self.env.removeprefix("tsm/").removesuffix("-v0") + imperfect
+        return self.env.removeprefix("tsm/").rpartition("-")[0] + imperfect
 
 
-PAPERS, OURS = "tsm", "tsm+energy+direct"  # the model of the paper, and the one that is judged in its place
 TSM, LAP = Model(PAPERS), Model(PAPERS, "latent")  # without and with its latent action prior
 ONE_STEP, MULTI_STEP, LSTM = Model("onestep"), Model("multistep"), Model("lstm")
 ONE_STEPS, BASELINES = (ONE_STEP, MULTI_STEP), (ONE_STEP, MULTI_STEP, LSTM)
 
-REACHER, OBSTACLE, PUSH = (Place(f"tsm/{name}-v0") for name in ("Reacher", "ReacherObstacle", "ReacherPush"))
+REACHER, OBSTACLE, PUSH = map(Place, ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v1"))
 CLEAN = REACHER._replace(table="06_robustness")
 NOISE, DELAY = CLEAN._replace(noise=0.25), CLEAN._replace(delay=5)
 TASKS, ARMS = (REACHER, PUSH), (REACHER, OBSTACLE, PUSH)
@@ -243,8 +251,9 @@ class Query:
 
     def plans(self, metric: str, model: Model, place: Place, *, planner: str = "", trials: bool = True) -> Number:
         """Of plans that were executed open loop, one by one; without ``trials`` of all at once."""
-        return self._ask("05_control", metric, model.word, place, trials=trials, planner=planner or self.planner,
-                         search_space=model.space, horizon=50, execution="open loop", iteration="")  # fmt: skip
+        return self._ask("05_control", metric, model.word, place, trials=trials,
+                         planner=planner or self.planner, search_space=model.space, horizon=place.horizon,
+                         execution="open loop", iteration="")  # fmt: skip
 
     def gap(self, model: Model, place: Place) -> Number:
         """Predicted minus executed return, plan by plan."""
@@ -282,7 +291,7 @@ class Query:
 
     def random_return(self, place: Place) -> Number:
         """The executed return of random torques."""
-        return self._ask("05_control", "return_true", "none", place, planner="random", horizon=50)
+        return self._ask("05_control", "return_true", "none", place, planner="random", horizon=place.horizon)
 
     def data(self, metric: str, place: Place, *, lag: float | str = "") -> Number:
         """A property of the training data."""

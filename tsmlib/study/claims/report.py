@@ -21,7 +21,7 @@ def counts(verdicts: Sequence[Verdict]) -> str:
 def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "") -> str:
     """The ledger as a Markdown table. The deciding check is the one that is furthest from holding.
 
-    ours: the same claims with ``query.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
+    ours: the same claims with ``zoo.OURS`` for TSM. root: path from the reader to the repository, '' or with a /.
     """
     lines = []
     for verdict, other in zip(verdicts, ours, strict=True):

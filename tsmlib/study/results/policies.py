@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 
 from tsmlib.figures.method import Method
-from tsmlib.planning.tasks import TOLERANCE
 from tsmlib.study.results import table
+from tsmlib.study.results.planning import ARRIVED
 from tsmlib.study.results.table import Row
 
 UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
@@ -196,7 +196,7 @@ def plateaus_table(found: pd.DataFrame) -> str:
 def policies_table(curves: Mapping[str, Mapping[Method, Curves]]) -> str:
     """The end of every learning curve in Markdown: means over copies and seeds, with half 95 % intervals."""
     shown = {"return_true": "executed return", "return_predicted": "predicted return",
-             "final_distance": "final distance (m)", "success": f"within {TOLERANCE} m",
+             "final_distance": "final distance (m)", "success": ARRIVED,
              "within_data": "steps within the data"}  # fmt: skip
     counts = {"iterations": "iterations", "samples": "environment steps", "seconds": "seconds"}
     lines = [

@@ -5,6 +5,7 @@ An imperfect arm's rows have the plain arm's name as ``env``; what is imperfect 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -118,7 +119,8 @@ def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float
     """Share of a policy's gain over random torques on the clean arm that ``arm`` (noise or delay) takes away."""
     ends = _ends(found, last, "return_true")
     mean = ends[ends["method"] == method].groupby("world")["value"].mean()
-    return float((mean["clean"] - mean[arm]) / (mean["clean"] - random))
+    clean, here = (mean.get(world, math.nan) for world in ("clean", arm))
+    return float((clean - here) / (clean - random))
 
 
 def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Method, dict[str, np.ndarray]]]:

@@ -154,9 +154,13 @@ def markdown(table: pd.DataFrame) -> str:
 
 
 def thresholds(lines: Iterable[tuple[str, str, float, float, str]]) -> pd.DataFrame:
-    """Thresholds: of what, "at most" or "at least", bound, measured and format, with whether it was."""
+    """Thresholds: of what, "at most" or "at least", bound, measured and format, with whether it was reached.
+
+    NaN: what was not measured, which reaches nothing.
+    """
     found = [
-        {"what": what, "threshold": f"{word} {form.format(bound)}", "measured": form.format(value),
+        {"what": what, "threshold": f"{word} {form.format(bound)}" if bound == bound else "not measured",
+         "measured": form.format(value) if value == value else "not measured",
          "reached": bool(value <= bound if word == "at most" else value >= bound)}
         for what, word, bound, value, form in lines
     ]  # fmt: skip

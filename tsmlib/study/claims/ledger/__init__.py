@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from tsmlib.study.claims.claim import Claim
 from tsmlib.study.claims.ledger import introduction, latent, method, results
-from tsmlib.study.claims.query import PAPERS
+from tsmlib.study.zoo import PAPERS
 
 _FOUND = [value for part in (introduction, method, results, latent) for value in vars(part).values()]
 LEDGER = sorted({value for value in _FOUND if isinstance(value, Claim)}, key=lambda claim: claim.id)

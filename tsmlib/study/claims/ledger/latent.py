@@ -29,7 +29,7 @@ def c46(q: Query) -> Checks:
 @Claim("C47", "section 5.3.4", CODES_USED,
        statistic="spread of samples with noise minus without; coverage of the 80 % interval",
        why={FAILED: "Squared error and KL leave noise out of the codes, so that samples spread little. The energy "
-                    "score puts it there: `tsm+energy+direct` has the coverage that is asked for."})
+                    "score puts it there."})
 def c47(q: Query) -> Checks:
     """Where the world is noisy, samples spread reasonably."""
     yield q.latent("spread", NOISE) - q.latent("spread", REACHER) > 0
