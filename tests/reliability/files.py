@@ -212,7 +212,7 @@ def _malice() -> Outcome:
                 path.write_bytes(hostile)
                 began = time.process_time()
                 good, said = named(kind, path, load, name)
-                found.count(good and time.process_time() - began < 2 and not (place / "canary").exists(), said)
+                found.count(good and time.process_time() - began < 10 and not (place / "canary").exists(), said)
             path.write_bytes(data)
         found.count(seen == ["listening"], f"events: {seen[:5]}")
         found.note = f"{len(kinds)} files under the names of {found.of // len(kinds)} artefacts"
@@ -548,7 +548,7 @@ def greedy(place: Path) -> Outcome:
                 found.count(good, f"{type(model).__name__}, {name} {huge!r:.30}: {grown:.0f} MB, {said}")
     began = time.process_time()
     said = ask(models[3], members=10_000, layers=10_000)
-    found.count("larger than its file" in said and time.process_time() - began < 2, said)
+    found.count("larger than its file" in said and time.process_time() - began < 10, said)
     return found
 
 
