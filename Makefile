@@ -4,12 +4,14 @@ PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
+PIP := $(PY) -m pip --disable-pip-version-check install --progress-bar on
 TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
-.PHONY: help collect train predict latent control robustness action_prior claims test reliability bench lint clean
+.PHONY: help quickstart collect train predict latent control robustness action_prior claims test reliability bench docs lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
+	@echo "make quickstart   the whole method in a minute (notebooks/00_quickstart.ipynb)"
 	@echo "make collect   collect data      (notebooks/01_collect.ipynb)"
 	@echo "make train     train the models  (notebooks/02_train.ipynb)"
 	@echo "make predict   score predictions (notebooks/03_predict.ipynb)"
@@ -20,10 +22,11 @@ help:
 	@echo "make test      all tests, then all notebooks cut down"
 	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"
 	@echo "make bench     speed of everything against references, and docs/speed.md"
+	@echo "make docs      the documentation, into docs/_build/html"
 	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
-collect train predict latent control robustness action_prior claims: $(READY)
+quickstart collect train predict latent control robustness action_prior claims: $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)
@@ -36,6 +39,11 @@ reliability: $(READY)
 bench: $(READY)
 	$(PY) -m tsmlib bench
 	$(PY) -m tsmlib bench table
+
+# RUN=runs/laptop/seed0 shows the notebooks as that run executed them.
+docs: $(READY)
+	$(PY) -c 'import myst_nb, furo, sphinx_copybutton' 2>/dev/null || $(PY) -m pip install -qq -r docs/requirements.lock
+	TSM_DOCS_RUN=$(RUN) OMP_NUM_THREADS=1 $(PY) -m sphinx -b html -n -W --keep-going docs docs/_build/html
 
 lint: $(READY)
 	$(PY) -m ruff check .
@@ -51,9 +59,15 @@ clean:
 $(READY): environment.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "tsmlib needs Python 3.11 or newer, found `$(PYTHON) --version 2>&1`. Name another: make PYTHON=python3.12" >&2; exit 1; }
-	@echo "Building $(VENV) from environment.lock: about a minute, once."
+	@echo "Building $(VENV) from environment.lock, once. To fetch: about 500 MB, and some 3 GB more where the package index"
+	@echo "has torch for CUDA; 1.7 GB on disk without that. Two to ten minutes, most of it the network's and the disk's."
+	@echo "pip says what it fetches, how large that is and how far it has come."
 	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install -qq `grep '^torch==' environment.lock`
-	$(PY) -m pip install -qq -r environment.lock
-	$(PY) -m pip install -qq --no-deps --no-build-isolation -e .
+	@echo "1 of 3: torch, the largest part"
+	@$(PIP) `grep '^torch==' environment.lock`
+	@echo "2 of 3: everything else"
+	@$(PIP) -r environment.lock
+	@echo "3 of 3: tsmlib itself"
+	@$(PIP) -q --no-deps --no-build-isolation -e .
 	@touch $@
+	@echo "$(VENV) is ready."

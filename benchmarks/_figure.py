@@ -10,16 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from tsmlib.figures.checks import finite
-from tsmlib.figures.style import BLUE, DARK, PALE, entry, legend, panels, styled
+from tsmlib.figures.style import BLUE, ORANGE, PALE, RED, entry, legend, panels, styled
 
-LOOKS: dict[str, dict[str, Any]] = {  # the model's blues and a grey; black is the true simulator
+LOOKS: dict[str, dict[str, Any]] = {  # a colour for each; black is the true simulator
     "train": dict(color=BLUE, marker="o"),
-    "imagine": dict(color=DARK, marker="s"),
-    "plan": dict(color="#003C8F", marker="^"),
-    "score": dict(color=BLUE, marker="D"),
-    "learn": dict(color=BLUE, marker="v"),
+    "imagine": dict(color=RED, marker="s"),
+    "plan": dict(color="#009E73", marker="^"),
+    "score": dict(color="#882255", marker="D"),
+    "learn": dict(color=ORANGE, marker="v"),
     "simulate": dict(color="#111111", marker="x"),
 }
+UNCLEAR = 0.5  # spread of exponents over rounds from which on none is printed
 UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
 WORDS = {
     "train": "training update", "imagine": "imagining", "plan": "planning iteration", "score": "scoring",
@@ -39,8 +40,8 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Cost against size, both logarithmic, one panel per size; cost is relative to that of the smallest size.
 
     curves: panel -> what is done, one of LOOKS -> sizes and seconds. Marks are medians over rounds, bars reach from the
-    lowest to the highest; each line's exponent stands in the panel, with its spread over rounds. Grey: linear growth,
-    or for threads a cost that falls in proportion.
+    lowest to the highest; each line's exponent stands in the panel, with its spread over rounds, unless that is more
+    than UNCLEAR. Grey: linear growth, or for threads a cost that falls in proportion.
     """
     figure, axes = panels(len(curves), 4, 1.65)
     for ax, (title, lines) in zip(axes, curves.items(), strict=True):
@@ -57,9 +58,9 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
             bars = np.stack([middle - relative.min(0), relative.max(0) - middle])
             ax.errorbar(sizes, middle, bars, **LOOKS[word], ms=3, lw=1, elinewidth=0.7, zorder=3)
             found = exponents(sizes, seconds)
-            notes.append(
-                (f"exponent {np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})", LOOKS[word]["color"])
-            )
+            spread = f"{np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})"
+            told = f"exponent {spread}" if np.ptp(found) < UNCLEAR else "rounds differ too much"
+            notes.append((told, LOOKS[word]["color"]))
         unit = f" ({UNITS[title]})" if title in UNITS else ""
         ax.set(xscale="log", yscale="log", title=title.capitalize() + unit)
         ax.set_xticks(every, [f"{size:g}" for size in every])
@@ -73,7 +74,7 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         for i, (note, shade) in enumerate(reversed(notes) if slope > 0 else notes):
             y, anchor = (0.02 + 0.09 * i, "bottom") if slope > 0 else (0.98 - 0.09 * i, "top")
             ax.text(1.0, y, note.replace("-", "\u2212"), transform=ax.transAxes, ha="right", va=anchor, color=shade,
-                    fontsize=6 if slope > 0 else 5.2)  # fmt: skip
+                    fontsize=6)  # fmt: skip
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]

@@ -60,31 +60,32 @@ def by_code(model: TSM, seen: Window) -> Tensor:
 
 TSM_LOSSES = (("loss", ()), ("teacher_forced_loss", ()), ("energy_loss", ("encoder",)))
 SAME = dict(losses=TSM_LOSSES, recall=by_code)
+ANGLES = (0, 1)  # as the arm's
 SMALL = dict(channels=8, segment_len=10, beta=0.1)
 
 MODELS = {
-    "tsm": Case(lambda dx: TSM(dx, DU, **SMALL), **SAME),
-    "tsm, push": Case(lambda dx: TSM(dx, DU, head_channels=16, **SMALL), state_dim=10, **SAME),
+    "tsm": Case(lambda dx: TSM(dx, DU, angles=ANGLES, **SMALL), **SAME),
+    "tsm, push": Case(lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL), state_dim=10, **SAME),
     "tsm, obstacle": Case(
-        lambda dx: TSM(dx, DU, head_channels=16, **SMALL), state_dim=10, constant=(6, 7, 8, 9), **SAME
+        lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL), state_dim=10, constant=(6, 7, 8, 9), **SAME
     ),
-    "tsm, state skip": Case(lambda dx: TSM(dx, DU, state_skip=16, **SMALL), **SAME),
+    "tsm, state skip": Case(lambda dx: TSM(dx, DU, angles=ANGLES, state_skip=16, **SMALL), **SAME),
     "onestep": Case(
-        lambda dx: OneStep(dx, DU, hidden=16, layers=2), stochastic=False,
+        lambda dx: OneStep(dx, DU, angles=ANGLES, hidden=16, layers=2), stochastic=False,
         losses=(("loss", ()), ("multi_step_loss", ())),
     ),
-    "lstm": Case(lambda dx: LSTM(dx, DU, hidden=16, segment_len=10), stochastic=False),
+    "lstm": Case(lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False),
     "rtsm": Case(
-        lambda dx: RecurrentTSM(dx, DU, hidden=16, segment_len=20, mode_weight=0.5),
+        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20, mode_weight=0.5),
         losses=(("loss", ()), ("point_loss", ("codes",))),
     ),
     "rtsm, obstacle": Case(
-        lambda dx: RecurrentTSM(dx, DU, hidden=16, segment_len=20), state_dim=10, constant=(6, 7, 8, 9),
+        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20), state_dim=10, constant=(6, 7, 8, 9),
         losses=(("loss", ()), ("point_loss", ("codes",))),
     ),
-    "ensemble": Case(lambda dx: Ensemble(dx, DU, hidden=16, layers=2, segment_len=10)),
+    "ensemble": Case(lambda dx: Ensemble(dx, DU, angles=ANGLES, hidden=16, layers=2, segment_len=10)),
     "ensemble+mse, obstacle": Case(
-        lambda dx: Ensemble(dx, DU, gaussian=False, hidden=16, layers=2, segment_len=10), state_dim=10,
+        lambda dx: Ensemble(dx, DU, angles=ANGLES, gaussian=False, hidden=16, layers=2, segment_len=10), state_dim=10,
         constant=(6, 7, 8, 9),
     ),
 }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from untrained import in_units
 
 from tsmlib.models.base import rollout
 from tsmlib.models.baselines import LSTM, OneStep
@@ -44,7 +45,7 @@ def trained(model: OneStep | LSTM | Ensemble, loss: str, seen: Window, steps: in
 @pytest.fixture(scope="module")
 def gaussian() -> Ensemble:
     torch.manual_seed(0)
-    ensemble = Ensemble(DX, DU, angles=(), hidden=32, layers=1)
+    ensemble = Ensemble(DX, DU, hidden=32, layers=1)
     trained(ensemble, "loss", window(1, 20, noise=NOISE))
     return ensemble
 
@@ -60,7 +61,7 @@ def test_each_state_is_paired_with_the_action_taken_in_it() -> None:
 
 def test_a_one_step_model_has_no_memory() -> None:
     torch.manual_seed(0)
-    model, (past, future) = OneStep(DX, DU, angles=()), window(10, 5)
+    model, (past, future) = in_units(OneStep(DX, DU)), window(10, 5)
     forgotten = Segment(past.states.clone(), torch.zeros_like(past.actions))
     forgotten.states[:, :-1] = 0
     assert torch.equal(rollout(model, past, future.actions), rollout(model, forgotten, future.actions))
@@ -68,7 +69,7 @@ def test_a_one_step_model_has_no_memory() -> None:
 
 def test_over_one_step_both_losses_of_the_one_step_model_agree_but_for_units() -> None:
     torch.manual_seed(0)
-    model, seen = OneStep(DX, DU, angles=()), window(1, 1)
+    model, seen = OneStep(DX, DU), window(1, 1)
     model.features.fit(world(64, 30).states)
     model.features.std.copy_(model.features.step_std)  # the same units in both
     generator = torch.Generator()
@@ -77,7 +78,7 @@ def test_over_one_step_both_losses_of_the_one_step_model_agree_but_for_units() -
 
 def test_a_multi_step_loss_is_the_error_of_a_rollout() -> None:
     torch.manual_seed(0)
-    for model, loss in ((OneStep(DX, DU, angles=()), "multi_step_loss"), (LSTM(DX, DU, angles=()), "loss")):
+    for model, loss in ((OneStep(DX, DU), "multi_step_loss"), (LSTM(DX, DU), "loss")):
         past, future = seen = window(10, 20)
         model.features.fit(future.states)
         error = (rollout(model, past, future.actions) - future.states) / model.features.std
@@ -88,7 +89,7 @@ def test_a_multi_step_loss_is_the_error_of_a_rollout() -> None:
 
 def test_an_lstm_remembers_the_past_that_its_last_state_does_not_show() -> None:
     torch.manual_seed(0)
-    model, (past, future) = LSTM(DX, DU, angles=(), hidden=16), window(10, 5)
+    model, (past, future) = in_units(LSTM(DX, DU, hidden=16)), window(10, 5)
     other = Segment(past.states.clone(), past.actions)
     other.states[:, :-1] += 1.0
     assert (rollout(model, past, future.actions) != rollout(model, other, future.actions)).any()
@@ -102,7 +103,7 @@ def test_an_lstm_learns_what_one_state_does_not_tell() -> None:
     parts = [part.split([4, 10], 1) for part in (late, actions)]
     seen = Window(Segment(parts[0][0], parts[1][0]), Segment(parts[0][1], parts[1][1]))
     errors = {}
-    for model in (LSTM(DU, DU, angles=(), hidden=32, past_len=4), OneStep(DU, DU, angles=(), hidden=32)):
+    for model in (LSTM(DU, DU, hidden=32, past_len=4), OneStep(DU, DU, hidden=32)):
         trained(model, "loss", seen, steps=200)
         predicted = rollout(model, seen.past, seen.future.actions)
         errors[type(model)] = (predicted - seen.future.states).square().mean()
@@ -118,14 +119,14 @@ def futures(ensemble: Ensemble, n: int = 200) -> Tensor:
 
 def test_an_ensemble_of_squared_errors_has_as_many_futures_as_members() -> None:
     torch.manual_seed(0)
-    ensemble = Ensemble(DX, DU, angles=(), gaussian=False, members=4, hidden=16, layers=1)
+    ensemble = in_units(Ensemble(DX, DU, gaussian=False, members=4, hidden=16, layers=1))
     distinct = futures(ensemble).mul(1e4).round().unique(dim=0)
     assert len(distinct) == 4  # one member from the first step to the last
 
 
 def test_every_member_gets_its_share_of_samples() -> None:
     torch.manual_seed(0)
-    ensemble = Ensemble(DX, DU, angles=(), gaussian=False, members=4, hidden=16, layers=1)
+    ensemble = in_units(Ensemble(DX, DU, gaussian=False, members=4, hidden=16, layers=1))
     _, counts = futures(ensemble, 4000).mul(1e4).round().unique(dim=0, return_counts=True)
     assert (counts > 4000 / 4 * 0.85).all()
 

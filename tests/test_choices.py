@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from untrained import in_units
 
 from tsmlib import study
 from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.planning.execution import execute
 from tsmlib.planning.search_spaces import DirectActions
+from tsmlib.planning.tasks import zero_torques
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
@@ -71,13 +74,13 @@ def test_a_run_is_held_against_the_published_seeds_that_are_not_its_own(
     assert "1 not compared" in capsys.readouterr().out
 
 
-def test_returns_are_those_of_plans_and_of_policies_when_they_are_learned(tmp_path: Path) -> None:
-    path, earned = tmp_path / "own.csv", dict(metric="return_true")
-    assert not table(path, (1, -4.0), **earned, iteration=3)
-    assert not table(path, (1, -4.0), **earned, model="oracle", planner="cem")
+def test_returns_are_those_of_plans_and_of_policies_when_they_are_lreturns(tmp_path: Path) -> None:
+    path, returns = tmp_path / "own.csv", dict(metric="return_true")
+    assert not table(path, (1, -4.0), **returns, iteration=3)
+    assert not table(path, (1, -4.0), **returns, model="oracle", planner="cem")
     rows = [
         dict(env="e", sim="mujoco", task="", model="tsm", planner="policy", search_space="latent", n=1,
-             iteration=updates, execution="policy", unit="", scale="paper", seed=1, value=value, copy=copy, **earned)
+             iteration=updates, execution="policy", unit="", scale="paper", seed=1, value=value, copy=copy, **returns)
         for updates, copy, value in ((0, 0, -9.0), (0, 1, -9.0), (20, 0, -4.0), (20, 1, -2.0))
     ]  # fmt: skip
     tables.save(path, rows, extra=["copy"])
@@ -118,6 +121,9 @@ def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path
     assert [row["closed"] for row in found] == 5 * ["0", "1"]
     mode, other = (np.array(found[i]["costs"].split(), float) for i in (0, 2))
     assert float(found[2]["more_than_mode"]) == pytest.approx(float((other - mode).mean()), rel=0.01, abs=1e-3)
+    (zero,) = judge.reference("zero", task, space, way)
+    still = execute(task, zero_torques(task))
+    assert [float(cost) for cost in zero["costs"].split()] == pytest.approx((-still.executed_return).tolist(), abs=1e-3)
     (tmp_path / "judge.csv").write_text("model,judge\nrtsm,mode\n")
     with pytest.raises(ValueError, match="has no columns .*; name another table with --out"):
         judge.read(tmp_path / "judge.csv")
@@ -125,7 +131,7 @@ def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path
 
 def test_fresh_samples_are_common_to_a_population_and_new_in_the_next() -> None:
     torch.manual_seed(0)
-    model, past = RecurrentTSM(10, 2, hidden=8), initial_past(torch.zeros(2, 10), 10, 2)
+    model, past = in_units(RecurrentTSM(10, 2, hidden=8)), initial_past(torch.zeros(2, 10), 10, 2)
     fresh = judge.judged_by("fresh mean of 2", 3)(model, past, seed=0)
     actions = torch.zeros(1, 2, 20, 2)
     start, *first = (fresh(actions) for _ in range(5))  # the start, three candidates and their mean

@@ -297,10 +297,11 @@ def test_a_changed_rule_makes_older_verdicts_void() -> None:
     assert elsewhere.sha256 == rule.sha256
 
 
-def test_the_readme_and_what_is_stored_are_what_the_shipped_rows_say() -> None:
+def test_what_is_written_and_what_is_stored_are_what_the_shipped_rows_say() -> None:
     papers, ours = publish.shipped_verdicts(PAPERS), publish.shipped_verdicts(OURS)
-    again = "the claims in README are not those of data/results; run: python -m tsmlib publish --claims"
-    assert publish.readme_claims(papers, ours) in (ROOT / "README.md").read_text(), again
+    again = "what is written of the claims is not what data/results says; run: python -m tsmlib publish --claims"
+    assert publish.readme_claims(papers, ours) in publish.README.read_text(), again
+    assert publish.claims_page(papers, ours) in publish.CLAIMS_PAGE.read_text(), again
     shipped = tables_storage.load(evaluate.RESULTS / "08_claims.csv")
     stored = set(shipped[["model", "claim", "verdict", "sha256"]].itertuples(index=False, name=None))
     assert stored == {(v.claim.subject, v.claim.id, v.word, v.claim.sha256) for v in papers + ours}, again
@@ -308,7 +309,8 @@ def test_the_readme_and_what_is_stored_are_what_the_shipped_rows_say() -> None:
 
 def test_only_publishing_edits_what_ships() -> None:
     cells = json.loads((NOTEBOOKS / "08_claims.ipynb").read_text())["cells"]
-    assert not [cell for cell in cells if cell["cell_type"] == "code" and "publish" in "".join(cell["source"])]
+    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    assert not re.search(r"publish[.(]|import.*publish", code)
 
 
 def test_judging_draws_nothing() -> None:
@@ -385,7 +387,7 @@ def test_swapping_the_labels_of_two_models_turns_every_check_that_compares_them(
 
 def test_every_choice_that_the_paper_leaves_open_is_stated_once() -> None:
     page = (ROOT / "docs" / "deviations.md").read_text()
-    assert re.findall(r"^\| (A\d+) \|", page, re.MULTILINE) == [f"A{i}" for i in range(1, 32)]
+    assert re.findall(r"^\| (A\d+) \|", page, re.MULTILINE) == [f"A{i}" for i in range(1, 34)]
 
 
 def test_a_reading_says_which_claims_it_turns() -> None:

@@ -1,4 +1,4 @@
-"""Collecting, executing, posing tasks: what is recorded is what happened; a gap is what was promised too much."""
+"""Collecting, executing, posing tasks: records are what happened; the gap is predicted minus executed return."""
 
 from __future__ import annotations
 
@@ -186,14 +186,14 @@ def test_a_reward_has_a_finite_slope_at_its_target() -> None:
 def test_the_gap_is_predicted_minus_true() -> None:
     task = some_task()
     actions = random_torques(task)
-    promised = torch.tensor([-1.0, -2.0, 0.0, 5.0])
+    predicted = torch.tensor([-1.0, -2.0, 0.0, 5.0])
     plan = Plan(
-        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted_return=promised,
-        curve=promised[None], seconds=1.0,
+        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted_return=predicted,
+        curve=predicted[None], seconds=1.0,
     )  # fmt: skip
     trial, plain = execute(task, plan), execute(task, actions)
     torch.testing.assert_close(trial.executed_return, plain.executed_return)
-    torch.testing.assert_close(trial.gap, promised - plain.executed_return)
+    torch.testing.assert_close(trial.gap, predicted - plain.executed_return)
     with pytest.raises(ValueError, match="not planned"):
         _ = plain.gap
 

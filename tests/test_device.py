@@ -1,4 +1,4 @@
-"""``--device``: models are trained, rolled out, planned with and learned in on an accelerator as on the processor."""
+"""``--device``: models are trained, rolled out, planned with and lassessed in on an accelerator as on the processor."""
 
 from __future__ import annotations
 
@@ -188,14 +188,14 @@ def test_it_finds_the_same_plan(planner: Planner, over: str, device: str) -> Non
 
 
 @pytest.mark.parametrize("through", ["codes", "actions"])
-def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: str) -> None:
+def test_a_policy_lassessed_there_is_the_same_and_acts_here(through: str, device: str) -> None:
     seen = motion(MODELS["tsm"], 8, 20)
     starts = seen.states[:, 0].float()
 
     def reward(target: Tensor) -> Reward:
         return lambda states, actions: -(states[..., :2] - target[:, None]).square().sum(-1)
 
-    def learned(place: str) -> tuple[Any, Tensor]:
+    def lassessed(place: str) -> tuple[Any, Tensor]:
         if through == "codes":
             policy: Any = SegmentPolicy(6, new_prior().float(), channels=8, copies=2)
         else:
@@ -209,7 +209,7 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
         past = Segment(*(part[:4, :10].float() for part in seen))
         return policy, controller(policy, torch.zeros(4, 2))(past)
 
-    (there, act), (here, expected) = on(device, learned), on(PROCESSOR, learned)
+    (there, act), (here, expected) = on(device, lassessed), on(PROCESSOR, lassessed)
     assert agree(act, expected, device)
     for a, b in zip(there.cpu().parameters(), here.parameters(), strict=True):
         assert agree(a, b, device)
@@ -237,10 +237,10 @@ def test_what_study_makes_there_is_what_it_makes_here(
         assert later is not None
         policy, header = study.learn(run, task, study.method("onestep", "direct", "policy"), study.Budget(2, 1))
         assert header["device"] == place
-        earned = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
+        assessed = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
         return (
             *(plan.actions for plan in plans), *(plan.predicted_return for plan in (*plans, later)),
-            *study.scores(run, REACHER, "onestep").values.values(), *earned.values(),
+            *study.scores(run, REACHER, "onestep").values.values(), *assessed.values(),
         )  # fmt: skip
 
     for there, here in zip(on(device, made), on(PROCESSOR, made), strict=True):

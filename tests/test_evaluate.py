@@ -13,7 +13,9 @@ from torch import Tensor
 
 from tsmlib.evaluation import contacts, prediction, scoring
 from tsmlib.evaluation.scoring import Fitted
+from tsmlib.models.base import Adapted, Step
 from tsmlib.models.features import Features
+from tsmlib.models.tsm import TSM
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Trajectories, Window
 
@@ -77,6 +79,7 @@ def predictive_variance() -> Tensor:
 
 OPEN = dict(horizon=HORIZON, starts=(PAST,))
 FEATURES = Features(2, ())
+FEATURES.step_std.fill_(1.0)
 
 
 def draw(model: Linear, data: Trajectories, samples: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -128,6 +131,23 @@ def gaussian(error: Tensor, variance: Tensor) -> Tensor:
 
 
 # What is drawn -------------------------------------------------------------------------------------------------------
+
+
+class Strays(Mode):
+    """A model that goes astray by 0.1 where it is asked step by step."""
+
+    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
+        step = Adapted(self).begin(past)
+        return lambda u: step(u) + 0.1
+
+
+def test_two_ways_of_running_a_model_that_disagree_are_told() -> None:
+    past = Segment(torch.zeros(4, PAST, 2), torch.zeros(4, PAST, 2))
+    window = Window(past, Segment(torch.zeros(4, 8, 2), torch.zeros(4, 8, 2)))  # at rest, and no torque
+    assert prediction.ways_apart(Strays(), window)["steps"] == pytest.approx(0.1)
+    apart = prediction.ways_apart(TSM(2, 2, angles=(), channels=8, segment_len=8), window)
+    assert list(apart) == ["steps", "teacher forcing"]
+    assert max(apart.values()) < 1e-5
 
 
 def test_without_noise_the_prediction_is_the_truth() -> None:

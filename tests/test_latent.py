@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from untrained import in_units
 
 from tsmlib import study
 from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
@@ -52,6 +53,7 @@ class Shifts:
 
     def __init__(self) -> None:
         self.features = Features(3, ())
+        self.features.step_std.fill_(1.0)
 
     def decode(self, past: Segment, actions: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         return (past.states[:, -1] + self.reach * z)[:, None].expand(-1, actions.shape[1], -1)
@@ -70,6 +72,11 @@ def still_window(n: int, steps: int = 10) -> Window:
         Segment(torch.zeros(n, 10, 3), torch.zeros(n, 10, 2)),
         Segment(torch.zeros(n, steps, 3), torch.zeros(n, steps, 2)),
     )
+
+
+def moving() -> Features:
+    """Statistics of ten dimensions that all move."""
+    return in_units(SimpleNamespace(features=Features(10, ()))).features
 
 
 def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> SampledFutures:
@@ -179,7 +186,10 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     size[:25, 6:] = 0.1
     seen = SampledFutures(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
     net: Any = SimpleNamespace(
-        code_len=10, latent_dim=1, features=Features(10, ()), decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10)
+        code_len=10,
+        latent_dim=1,
+        features=moving(),
+        decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10),
     )
     rows = latent_results.code_rows(net, seen, rng(), model="rtsm", seed=0, scale="smoke")
     value = {(row["metric"], row.get("subset", "")): row["value"] for row in rows}
@@ -194,7 +204,7 @@ def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> N
     seen, draw = scene(8), rng()
     still = torch.zeros(8, 1)
     net: Any = SimpleNamespace(
-        code_len=10, latent_dim=1, features=Features(10, ()), encode=lambda states: (still, still),
+        code_len=10, latent_dim=1, features=moving(), encode=lambda states: (still, still),
         decode=lambda past, u, z: past.states + noise * torch.randn(past.states.shape, generator=draw),
     )  # fmt: skip
     rows = latent_results.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
@@ -213,6 +223,25 @@ def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> N
     assert true[0].nonzero().flatten().tolist() == [4]
     assert not samples.any()
     assert contacts.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
+
+
+def test_episodes_that_hit_a_wall_are_spaced_by_how_far_the_object_goes(model: TSM, test_data: Trajectories) -> None:
+    seen = scene(6, steps=10)
+    reach, way = 0.21 - 0.15, torch.linspace(0, 1, 10)
+    seen.window.future.states[:4, :, 7] = 0.15 + reach * way  # up to the wall
+    seen.window.future.states[:4, :, 6] += torch.tensor([0.03, 0.01, 0.02, 0.04])[:, None] * way  # and along it
+    assert contacts.into_a_wall(seen, n=4).tolist() == [1, 2, 0, 3]
+    assert contacts.into_a_wall(seen, n=2).tolist() == [1, 3]
+
+
+def test_the_first_episode_with_and_without_a_touch_are_told_apart(test_data: Trajectories) -> None:
+    found = contacts.first_episodes(test_data, after=10)
+    near = closest_gap(found["contact"].states, PUSH)[0] < 0.001
+    assert near.any()
+    assert not near[:11].any()
+    assert closest_gap(found["free"].states, PUSH).min() >= 0.001
+    assert [len(episode) for episode in found.values()] == [1, 1]
+    assert list(contacts.first_episodes(study.random_data("tsm/Reacher-v0", 2, seed=0), after=10)) == ["free"]
 
 
 def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
@@ -288,6 +317,26 @@ def test_the_directions_that_move_an_outcome_are_found() -> None:
     torch.testing.assert_close(found.abs(), torch.eye(6)[[2, 4]], atol=0.01, rtol=0)
     assert explained > 0.99
     assert latent.directions(codes, torch.randn(500, 2, generator=rng(2)))[1] < 0.1
+
+
+def test_codes_are_held_in_a_plane_and_keep_what_lies_beside_it() -> None:
+    plane = torch.linalg.qr(torch.randn(8, 2, generator=rng()))[0].T
+    codes, at = torch.randn(50, 8, generator=rng(1)), torch.tensor([1.5, -2.0])
+    held = latent.held(codes, plane, at)
+    torch.testing.assert_close(held @ plane.T, at.expand(50, 2))
+    beside = torch.eye(8) - plane.T @ plane
+    torch.testing.assert_close(held @ beside, codes @ beside)
+
+
+def test_a_map_of_codes_lies_in_the_plane_that_moves_the_object(model: TSM, test_data: Trajectories) -> None:
+    past, future = futures.sample_futures(model, test_data.take(slice(1)), samples=1).window
+    window = Window(*(Segment(*(part[:1] for part in side)) for side in (past, future)))
+    found = latent.code_map(model, window, n=200)
+    z, y = (part - part.mean(0) for part in (found.codes, found.ways[:, -1]))
+    slope = torch.linalg.lstsq(z, y).solution
+    torch.testing.assert_close(found.plane.T @ (found.plane @ slope), slope, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(found.at, found.codes @ found.plane.T)
+    assert 0 < found.told <= 1
 
 
 def test_the_plane_of_largest_variance_is_found() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from io import BytesIO
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from PIL import Image
 
 from tsmlib import figures
 from tsmlib.envs.render import draw_scene
@@ -75,7 +77,7 @@ EVERY: dict[str, Callable[[], Figure]] = {
     "walk": lambda: figures.walk(DRAW, START, fan(9), {9: 0.02, 17: 0.01, 33: 0.005}),
     "embedding": wheel,
     "code_grid": lambda: figures.code_grid(START, fan(3, 3), PATH, (-1, 0, 1), TSM, radius=0.03),
-    "one_code": lambda: figures.one_code(DRAW, START, PATH, fan(6), PATH, TSM),
+    "code_fan": lambda: figures.code_fan(DRAW, START, fan(9), PATH, TSM)(fan(6)),
     "figure10": ten,
     "spectra": lambda: figures.spectra(
         {"reach": {method("data"): SPECTRUM, method("tsm", "direct", "adam"): SPECTRUM}}
@@ -128,7 +130,8 @@ def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
     figure = ten(0.25)
     mains = [to_hex(ax.lines[1].get_color()).upper() for ax in figure.axes]
     assert mains == [method(word).look.colour for word in ("data", "prior", "tsm", "tsm")]
-    assert "0.25" in figure.axes[0].texts[0].get_text()
+    assert [bool(ax.texts) for ax in figure.axes] == [False, True, True, True]  # the data need no comparison
+    assert "0.25" in figure.axes[1].texts[0].get_text()
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -149,10 +152,33 @@ def test_a_turned_knob_draws_the_picture_anew() -> None:
         figure.text(0.1, 0.5, f"{a} {b}")
         return figure
 
-    first, second, picture = figures.slider_panel(draw, a=(-3.0, 3.0, 0.25), b=(1.0, 2.0, 0.5)).children
+    panel = figures.slider_panel(draw, {"one way": (-3.0, 3.0, 0.25), "the other": (1.0, 2.0, 0.5)})
+    first, second, picture = panel.children
+    assert (first.description, second.description) == ("one way", "the other")
     before = picture.value
     first.value = 1.25
     second.value = 2.0
     assert seen == [(0.0, 1.0), (1.25, 1.0), (1.25, 2.0)]
     assert before[:4] == picture.value[:4] == b"\x89PNG"
     assert before != picture.value
+
+
+def test_sliders_and_picture_fit_a_small_screen_together_and_are_not_stretched() -> None:
+    picture_of = figures.code_fan(DRAW, START, fan(9), PATH, TSM)
+    panel = figures.slider_panel(lambda a, b: picture_of(fan(6)), {"a": (-3.0, 3.0, 0.25), "b": (-3.0, 3.0, 0.25)})
+    first, _, picture = panel.children
+    with Image.open(BytesIO(picture.value)) as shown:
+        assert picture.width == str(shown.width)  # a pixel of it is a pixel of the screen
+        assert shown.height + 2 * 40 < 900 - 250  # what JupyterLab has above and below a notebook of 900 pixels
+    assert panel.layout.align_items == "flex-start"
+    assert first.layout.width == f"{shown.width}px"
+
+
+def test_a_slider_moves_the_whole_fan_and_leaves_the_rest() -> None:
+    picture_of = figures.code_fan(DRAW, START, fan(9), PATH, TSM)
+    still = [artist.get_zorder() for artist in picture_of(fan(6)).axes[0].get_children()]
+    (ax,) = picture_of(fan(6) + 0.01).axes
+    moved = ax.collections[-1].get_segments()
+    np.testing.assert_allclose([way[1:] for way in moved], fan(6) + 0.01)
+    np.testing.assert_allclose([way[0] for way in moved], [START[6:8]] * 6)
+    assert [artist.get_zorder() for artist in ax.get_children()] == still  # nothing was drawn twice

@@ -152,9 +152,9 @@ def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) ->
     task = study.task("tsm/Reacher-v0", "validation").take(5)
     runs = [list(model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0)) for _ in range(2)]
     assert [record["steps"] for record in runs[0]] == [0, 250, 500]
-    earned = [[record["return_true"] for record in found] for found in runs]
-    assert earned[0] == earned[1]
-    assert len(set(earned[0])) == 3
+    returns = [[record["return_true"] for record in found] for found in runs]
+    assert returns[0] == returns[1]
+    assert len(set(returns[0])) == 3
     seconds = [record["seconds"] for record in runs[0]]
     assert seconds == sorted(seconds)
 

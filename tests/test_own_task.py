@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from untrained import in_units
 
 from tsmlib import rewards, study
 from tsmlib.models.action_prior import ActionPrior
@@ -120,7 +121,7 @@ def test_a_reward_that_is_no_number_is_refused_before_anything_is_planned() -> N
 def test_a_reward_that_is_no_number_somewhere_stops_every_planner() -> None:
     task = posed(lambda states, actions: arc(states, actions) + 0 * (0.1 - states[..., 0].abs()).log())
     torch.manual_seed(0)
-    model = TSM(6, 2, channels=8)
+    model = in_units(TSM(6, 2, channels=8))
     through = model_predictor(model, task.past(10), samples=1)
     for plan in (adam, cem, mppi):
         with pytest.raises(FloatingPointError, match=r"the reward is nan .* although the state there is finite"):
@@ -130,7 +131,13 @@ def test_a_reward_that_is_no_number_somewhere_stops_every_planner() -> None:
 def test_a_slope_that_is_no_number_stops_adam() -> None:
     task = posed(lambda states, actions: arc(states, actions) - (0 * states).sum(-1).abs().sqrt())
     with pytest.raises(FloatingPointError, match="the gradient of the return is not finite at the start"):
-        adam(model_predictor(TSM(6, 2, channels=8), task.past(10)), task.reward, DirectActions(T), N, iterations=2)
+        adam(
+            model_predictor(in_units(TSM(6, 2, channels=8)), task.past(10)),
+            task.reward,
+            DirectActions(T),
+            N,
+            iterations=2,
+        )
 
 
 # Rewards without a gradient ------------------------------------------------------------------------------------------
@@ -146,7 +153,7 @@ def test_a_slope_that_is_no_number_stops_adam() -> None:
 )
 def test_adam_refuses_a_reward_without_a_gradient_and_the_others_do_not(flat: Reward) -> None:
     task = posed(flat)
-    predict, space = model_predictor(TSM(6, 2, channels=8), task.past(10)), DirectActions(T)
+    predict, space = model_predictor(in_units(TSM(6, 2, channels=8)), task.past(10)), DirectActions(T)
     with pytest.raises(ValueError, match=r"not a differentiable function of the states.*plan with cem or mppi"):
         adam(predict, task.reward, space, N, iterations=2)
     mppi(predict, task.reward, space, N, iterations=1, candidates=4)

@@ -293,9 +293,9 @@ def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
 
 
 def outcome(way: Any, seconds: float, true: list[float]) -> Any:
-    earned = torch.tensor(true)
-    trial = Trial(torch.zeros(len(true), 4, 2), torch.zeros(len(true), 5, 10), earned, torch.zeros(len(true)))
-    return speed.Outcome(way, np.array([seconds, 2 * seconds]), trial, earned)
+    executed = torch.tensor(true)
+    trial = Trial(torch.zeros(len(true), 4, 2), torch.zeros(len(true), 5, 10), executed, torch.zeros(len(true)))
+    return speed.Outcome(way, np.array([seconds, 2 * seconds]), trial, executed)
 
 
 def test_only_what_earns_as_much_counts_as_faster(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from untrained import in_units
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import study
@@ -37,6 +39,7 @@ from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts, files
 from tsmlib.study import policies as study_policies
 from tsmlib.study import runs
+from tsmlib.training.callbacks import CsvCallback, Progress
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
 
@@ -81,7 +84,7 @@ def arrive(target: Tensor) -> Reward:
 
 def model(name: str) -> Any:
     torch.manual_seed(1)
-    made = MODELS[name]().double()
+    made = in_units(MODELS[name]()).double()
     made.features.step_std.fill_(0.1)
     return made
 
@@ -247,8 +250,8 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
     env = gymnasium.make_vec("tsm/Reacher-v0", num_envs=4)
     seen = collect(env, controller(actor, target), horizon=5, seed=0)
     start, _ = env.reset(seed=0)
-    dreamt = imagine(actor, World(env), torch.from_numpy(start).float(), target, horizon=5)  # type: ignore[arg-type]
-    torch.testing.assert_close(dreamt.actions, torch.from_numpy(seen.actions), rtol=1e-4, atol=1e-4)
+    rollout_of_policy = imagine(actor, World(env), torch.from_numpy(start).float(), target, horizon=5)  # type: ignore[arg-type]
+    torch.testing.assert_close(rollout_of_policy.actions, torch.from_numpy(seen.actions), rtol=1e-4, atol=1e-4)
     env.close()
 
 
@@ -355,6 +358,35 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
     with pytest.raises(files.StoreError, match="another run: horizon is 5 in the file, expected 6. Delete"):
         learn(anew, horizon=6, **settings)
+
+
+def test_a_callback_sees_every_record_of_learning_and_leaves_the_bits_alone() -> None:
+    alone, watched, seen = policy("onestep", copies=2), policy("onestep", copies=2), list[Progress]()
+    settings: dict[str, Any] = dict(measure=lambda _: {"asked": torch.tensor([1.0, 3.0])})
+    learn(alone, **settings)
+    curve = learn(watched, callback=seen.append, **settings)
+    assert same(weights(watched), weights(alone))
+    assert [one.step for one in seen] == curve.iteration == [0, 2, 4]
+    assert [one.values["predicted"] for one in seen] == [sum(copies) / 2 for copies in curve.predicted]
+    assert [one.values["asked"] for one in seen] == [2.0] * 3
+
+
+@KINDS
+def test_a_policy_whose_learning_was_stopped_has_every_record_once_in_its_table(kind: str, tmp_path: Path) -> None:
+    table = CsvCallback(tmp_path / "returns.csv")
+
+    def stop(progress: Progress) -> None:
+        table(progress)
+        if progress.step == 4:
+            raise KeyboardInterrupt
+
+    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy")
+    with pytest.raises(KeyboardInterrupt):
+        learn(policy(kind), callback=stop, **settings)
+    curve = learn(policy(kind), callback=table, **settings)
+    steps, returns = np.loadtxt(table.path, delimiter=",", skiprows=1, usecols=(0, 2), unpack=True)
+    assert steps.tolist() == curve.iteration == [0, 2, 4, 6, 8]
+    assert returns.tolist() == [value for (value,) in curve.predicted]
 
 
 def test_the_rate_decays_to_a_tenth_in_2200_iterations() -> None:

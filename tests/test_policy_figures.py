@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -127,10 +128,10 @@ def test_a_policy_through_the_prior_is_filled_and_one_of_torques_open() -> None:
     assert [to_hex(line.get_markerfacecolor()).upper() for line in curves] == [LATENT.look.colour, "#FFFFFF"]
 
 
-def test_references_are_lines_and_of_several_oracles_the_better_one() -> None:
+def test_references_are_lines_and_of_several_oracles_the_one_that_tables_divide_by() -> None:
     figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["iterations"])
     flat = {line.get_ydata()[0] for line in figure.axes[0].lines if len(set(line.get_ydata())) == 1}
-    assert flat == {-4.1, -12.0}
+    assert flat == {-4.2, -12.0}
     assert {"oracle", "zero torque"} <= set(legend(figure))
 
 
@@ -139,6 +140,27 @@ def test_a_policy_that_fails_far_off_does_not_squeeze_the_others_and_is_told_in_
     figure = figure7({"reach": rows}, against=["iterations"])
     assert figure.axes[0].get_ylim()[0] > -50
     assert "multi-step, direct to −900" in below(figure)
+
+
+def test_where_curves_begin_is_said_and_the_axis_shows_their_ends() -> None:
+    figure = figure7({"reach": {LATENT: learned(), RIVAL: learned(end=-5)}}, FLOORS, against=["iterations"])
+    low, high = figure.axes[0].get_ylim()
+    assert -7 < low < -5 < -4.2 < high
+    assert re.search("outside: curves begin at −1[12].*, zero torque −12", below(figure))
+
+
+def test_environment_steps_are_told_in_thousands() -> None:
+    ax = figure7({"reach": {PPO: model_free()}}, against=["samples"]).axes[0]
+    assert ax.xaxis.get_major_formatter()(300_000) == "300k"
+    assert ax.get_xlim()[1] > 310_000
+
+
+def test_policies_of_yours_are_diamonds() -> None:
+    mine = learned(k=1, end=-4.6)
+    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["iterations"], yours={"reach": {LATENT: mine}})
+    (own,) = (line for line in figure.axes[0].lines if line.get_marker() == "D")
+    assert own.get_ydata()[-1] == pytest.approx(mine["return_true"][0, -1])
+    assert "yours" in legend(figure)
 
 
 def wrong(**changed: Any) -> dict[str, Any]:

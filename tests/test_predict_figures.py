@@ -141,6 +141,30 @@ def test_environments_whose_scores_lie_apart_share_an_axis() -> None:
     assert low < points.min() < points.max() < high
 
 
+def test_one_seed_that_goes_astray_does_not_squeeze_the_others() -> None:
+    rows = curves(TSM, LSTM, MULTI_STEP)
+    rows[TSM][0, 4] = -300.0
+    figure = figures.against_horizon({"push": rows}, "nats")
+    assert figure.axes[0].get_ylim()[0] > -20
+    assert "outside: TSM to −9" in below(figure)
+
+
+def test_yours_are_hollow_diamonds_over_the_published_marks() -> None:
+    seeds, mine = scores(TSM), {TSM: np.array([0.05]), LSTM: np.array([0.1])}
+    drawn = figures.figure5({"": {"push": seeds}}, yours={"": {"push": mine}})
+    (ax,) = drawn.axes
+    points = {to_hex(line.get_color()).upper(): line.get_ydata()[0] for line in ax.lines if line.get_marker() == "D"}
+    assert points == {TSM.look.colour: 0.05, LSTM.look.colour: 0.1}
+    assert "yours" in [text.get_text() for text in drawn.legends[0].get_texts()]
+
+
+def test_yours_that_leave_the_axis_are_told_in_words() -> None:
+    figure = figures.figure5({"": {"push": scores(TSM, LSTM)}}, yours={"": {"push": {TSM: np.array([-1e5])}}})
+    assert "push, TSM, yours −10⁵" in below(figure)
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_position().width > 0.5  # what is outside leaves the layout alone
+
+
 def test_a_diverged_curve_ends_in_an_arrow_and_its_furthest_value_in_words() -> None:
     rows = curves(TSM, LSTM, MULTI_STEP) | {ONE_STEP: np.exp(np.arange(30.0))[None]}
     figure = figures.against_horizon({"push": rows}, "NRMSE")

@@ -1,4 +1,4 @@
-"""The repository keeps its promises: pins, layout, imports that point one way, commands that the README names."""
+"""The repository keeps its promises: pins, layout, imports that point one way."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ import yaml
 
 import tsmlib
 from tsmlib.storage import manifest
-from tsmlib.study import publish
 from tsmlib.study.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = sorted((ROOT / "tsmlib").rglob("*.py"))
 
 
-def pins() -> dict[str, str]:
-    lines = (ROOT / "environment.lock").read_text().splitlines()
+def pins(lock: str = "environment.lock") -> dict[str, str]:
+    lines = (ROOT / lock).read_text().splitlines()
     return dict(line.split("==") for line in lines if line and not line.startswith("#"))
 
 
@@ -41,7 +40,9 @@ def test_the_lock_covers_every_dependency() -> None:
     extras = PROJECT["optional-dependencies"].values()
     wanted = [*PROJECT["dependencies"], *(line for lines in extras for line in lines)]
     names = {re.split(r"[<>=!~\[ ]", line)[0].lower().replace("_", "-") for line in wanted}
-    assert names <= {name.lower().replace("_", "-") for name in pins()}
+    locked = pins() | pins("docs/requirements.lock")
+    assert names <= {name.lower().replace("_", "-") for name in locked}
+    assert not pins().keys() & pins("docs/requirements.lock").keys()
 
 
 def test_version_and_licence_are_stated_once_and_alike() -> None:
@@ -50,21 +51,6 @@ def test_version_and_licence_are_stated_once_and_alike() -> None:
     assert PROJECT["license"] == citation["license"] == "MIT"
     authors = [author["family-names"] for author in citation["preferred-citation"]["authors"]]
     assert authors == ["Mishra", "Abbeel", "Mordatch"]
-
-
-def test_the_readme_names_commands_and_files_that_exist() -> None:
-    readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
-    for target in re.findall(r"\bmake (\w+)", readme):
-        assert re.search(rf"^(\w+ )*{target}( \w+)*:", makefile, re.MULTILINE), target
-    for name in re.findall(r"\]\(([^)#:]+)\)", readme):
-        assert (ROOT / name).exists(), name
-
-
-def test_the_readme_program_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TSM_SCALE", "smoke")
-    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    exec(compile(program.replace(".take(10)", ".take(2)"), "README.md", "exec"), {})
 
 
 def imported(path: Path) -> set[str]:
@@ -112,10 +98,6 @@ def test_what_running_leaves_behind_is_ignored() -> None:
     made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12"]
     done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == made
-
-
-def test_the_results_in_the_readme_are_those_of_the_shipped_tables() -> None:
-    assert publish.readme_results() in (ROOT / "README.md").read_text()
 
 
 def test_importing_the_package_is_enough_to_make_an_environment() -> None:

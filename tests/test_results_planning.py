@@ -31,11 +31,11 @@ def some_task(env: str = PUSH, n: int = 10) -> Task:
     return dataclasses.replace(study.draw_task(env, seed=3, n=n), horizon=20)
 
 
-def dreamt(task: Task, torques: Any, promised: float = 0.0) -> Trial:
-    """A trial of torques whose model saw the truth coming, and promised so much more."""
+def foreseen(task: Task, torques: Any, gap: float = 0.0) -> Trial:
+    """A trial of torques whose predicted states are the executed ones; its predicted return is more by ``gap``."""
     seen = execute(task, torques)
     states = seen.states[None, :, 1:].clone()
-    plan = Plan(torques, torques, states, seen.executed_return + promised, seen.executed_return[None], seconds=1.0)
+    plan = Plan(torques, torques, states, seen.executed_return + gap, seen.executed_return[None], seconds=1.0)
     return dataclasses.replace(seen, plan=plan)
 
 
@@ -75,7 +75,7 @@ def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> 
 def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
     task = some_task()
     torques = random_torques(task)
-    sound, careless = dreamt(task, torques), dreamt(task, torques)
+    sound, careless = foreseen(task, torques), foreseen(task, torques)
     assert careless.plan is not None
     jump = torch.zeros(10)
     jump[3] = 0.05
@@ -94,7 +94,10 @@ def test_rough_torques_are_told_from_smooth_ones() -> None:
     task = some_task(REACHER)
     rough = 0.1 * torch.randn(10, 20, 2, generator=torch.Generator().manual_seed(0))
     trials = {
-        REACHER: {RANDOM: execute(task, random_torques(task)), zoo.method("tsm", "direct", "cem"): dreamt(task, rough)}
+        REACHER: {
+            RANDOM: execute(task, random_torques(task)),
+            zoo.method("tsm", "direct", "cem"): foreseen(task, rough),
+        }
     }
     rows, _ = planning_results.rows([task], trials, RUN)
     for metric in ("torque_change", "torque_fast", "torque_novelty"):
@@ -104,8 +107,8 @@ def test_rough_torques_are_told_from_smooth_ones() -> None:
 def test_plans_along_the_way_are_told_by_their_iteration() -> None:
     task = some_task(REACHER)
     rows = []
-    for iteration, promised in ((0, 0.0), (5, 0.5), (20, 2.0)):
-        trials = {REACHER: {TSM: dreamt(task, zero_torques(task), promised)}}
+    for iteration, gap in ((0, 0.0), (5, 0.5), (20, 2.0)):
+        trials = {REACHER: {TSM: foreseen(task, zero_torques(task), gap)}}
         rows += planning_results.rows([task], trials, RUN, iteration=iteration)[0]
     (curve,) = planning_results.along_the_way(tables.frame(rows), REACHER).values()
     np.testing.assert_array_equal(curve["iterations"], [0, 5, 20])
@@ -115,7 +118,7 @@ def test_plans_along_the_way_are_told_by_their_iteration() -> None:
 
 def test_how_soon_a_plan_was_nearly_done_is_counted_target_by_target() -> None:
     task = some_task(n=3)
-    plan = dreamt(task, zero_torques(task)).plan
+    plan = foreseen(task, zero_torques(task)).plan
     assert plan is not None
     curve = torch.arange(200.0)[:, None] * torch.tensor([0.0, 1.0, 1.0])
     curve[60:, 2] = 199
@@ -253,7 +256,7 @@ def test_films_are_of_targets_that_have_to_be_pushed_far_the_nearest_end_first()
 
 def test_a_film_of_two_methods_has_a_column_for_each_and_what_was_predicted_above() -> None:
     task = dataclasses.replace(some_task("tsm/PymunkPush-v1", 2), horizon=3)
-    sound = dreamt(task, random_torques(task))
+    sound = foreseen(task, random_torques(task))
     assert sound.plan is not None
     careless = dataclasses.replace(sound, plan=dataclasses.replace(sound.plan, states=sound.plan.states + 0.05))
     film = media.compared_film(task, {TSM: sound, LSTM: careless}, 1)

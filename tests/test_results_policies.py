@@ -21,7 +21,7 @@ TSM, PPO = zoo.method("tsm", "latent"), zoo.method("ppo")
 
 
 def header(seed: int = 0, copies: int = 2, records: int = 3, **changed: Any) -> dict[str, Any]:
-    """As ``study.learn`` gives it: record r of copy c earns -(r + c) - seed, and is promised 1 m more."""
+    """As ``study.learn`` gives it: record r of copy c returns -(r + c) - seed, and 1 m more is predicted."""
     true = [[-float(r + c + seed) for c in range(copies)] for r in range(records)]
     return {
         "fingerprint": {"env": "tsm/Reacher-v0"}, "made_from": {"task": "reach"}, "model": "tsm",
@@ -153,7 +153,7 @@ def test_the_table_has_one_line_per_policy_with_its_last_record() -> None:
 def test_references_are_the_oracles_and_zero_torque() -> None:
     found = tables.load(ROOT / "data" / "results" / "05_control.csv")
     references = policies_results.references(table.select(found, execution="open loop"))
-    assert references
+    assert set(references) == set(found["task"])
     for levels in references.values():
         assert max(levels.values()) > levels[zoo.method("none", planner="zero")]
         assert {method.model for method in levels} == {"oracle", "zero"}

@@ -50,10 +50,8 @@ AHEAD = {part: {TSM: precompute(0.1 + 0.02 * i), LSTM: precompute(0.15), KALMAN:
          for i, part in enumerate(PARTS)}  # fmt: skip
 NOW = {part: {KALMAN: 0.07, SMOOTHED: 0.15} for part in PARTS}
 RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
-MAP = {
-    "plain arm: minus one-step": np.array([[-1.24, 0.3], [2.0, 8.0]]),
-    "after contact: minus LSTM": np.array([[0.5, np.nan], [-3.0, 1.0]]),
-}
+ONE_STEP = method("onestep")
+MAP = {"noise 0, delay 5": {ONE_STEP: -1.24, LSTM: 8.0}, "obstacle, after contact": {LSTM: 0.5}}
 
 
 def episode(**changed: Any) -> Figure:
@@ -61,8 +59,8 @@ def episode(**changed: Any) -> Figure:
     return imperfect_episode(**given | changed)
 
 
-def grid(given: Any = MAP, noise: Any = (0.0, 0.25), delay: Any = (0, 5)) -> Figure:
-    return advantage_map(given, noise=noise, delay=delay, unit="nats per step")
+def grid(given: Any = MAP, yours: Any = None) -> Figure:
+    return advantage_map(given, unit="nats per step", yours=yours)
 
 
 def lines(ax: Axes, method: Method) -> list[Any]:
@@ -82,8 +80,8 @@ EVERY: dict[str, Callable[[], Figure]] = {
         {"angles": {TSM: precompute(0.1, k=1)}}, {"angles": {}}, {"angles": 0.25}
     ),
     "a map": grid,
-    "a map of nothing": lambda: grid({"plain arm: minus LSTM": np.full((2, 2), np.nan)}),
-    "a map of one cell without a difference": lambda: grid({"plain arm": np.zeros((1, 1))}, [0.0], [0]),
+    "a map of yours alone": lambda: grid({}, MAP),
+    "a map of one cell without a difference": lambda: grid({"plain arm": {LSTM: 0.0}}),
 }
 
 
@@ -96,7 +94,7 @@ def test_every_figure_is_laid_out_without_warnings_and_not_left_open(name: str) 
     assert min(text.get_fontsize() for text in figure.findobj(plt.Text) if text.get_text()) >= 6.5
 
 
-@pytest.mark.parametrize("name", ["figure 8", "an episode", "filtering", "a map"])
+@pytest.mark.parametrize("name", ["figure 8", "an episode", "filtering"])
 def test_titles_fit_beside_each_other(name: str) -> None:
     figure = EVERY[name]()
     figure.canvas.draw()
@@ -196,26 +194,20 @@ def test_a_model_that_is_far_off_is_told_in_words() -> None:
 # The map -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_map_has_noise_upwards_delay_to_the_right_and_zero_in_the_middle_of_its_colours() -> None:
+def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of_its_colours() -> None:
     figure = grid()
-    for ax, (title, values) in zip(figure.axes, MAP.items(), strict=False):
-        (image,) = ax.images
-        np.testing.assert_array_equal(image.get_array().filled(np.nan), values)
-        assert image.origin == "lower"
-        assert ax.get_title(loc="left") == title.replace(": ", ":\n")
-        assert [text.get_text() for text in ax.get_xticklabels()] == ["0", "5"]
-        assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
-    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["0", "0.25"]
-    assert figure.axes[0].get_ylabel() == "noise (half ranges)"
-    assert figure.axes[-1].get_ylabel() == "nats per step"
+    ax, bar = figure.axes
+    (image,) = ax.images
+    np.testing.assert_array_equal(image.get_array().filled(np.nan), [[-1.24, 8.0], [np.nan, 0.5]])
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["against one-step", "against LSTM"]
+    assert [text.get_text() for text in ax.get_yticklabels()] == list(MAP)
+    assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
+    assert bar.get_ylabel() == "ahead by (nats per step)"
 
 
-def test_every_cell_says_its_number_and_an_empty_one_nothing() -> None:
-    plain, contact = grid().axes[:2]
-    written = {ax: {text.get_position(): text.get_text() for text in ax.texts} for ax in (plain, contact)}
-    assert written[plain] == {(0, 0): "−1.2", (1, 0): "+0.3", (0, 1): "+2.0", (1, 1): "+8.0"}
-    assert written[contact] == {(0, 0): "+0.5", (1, 0): "", (0, 1): "−3.0", (1, 1): "+1.0"}
-    assert contact.patch.get_hatch()  # what shows through an empty cell
+def test_every_cell_says_its_number_and_yours_in_brackets() -> None:
+    ax = grid(yours={"noise 0, delay 5": {LSTM: 7.0}, "obstacle, after contact": {ONE_STEP: -3.0}}).axes[0]
+    assert [text.get_text() for text in ax.texts] == ["−1.2", "+8.0 (+7.0)", "(−3.0)", "+0.5"]
 
 
 # What cannot be drawn ------------------------------------------------------------------------------------------------
@@ -241,7 +233,6 @@ def test_every_cell_says_its_number_and_an_empty_one_nothing() -> None:
         (lambda: filtering_errors({"angles": {TSM: np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}),
          "angles, TSM: 10 of 10 values are not finite"),
         (lambda: grid({}), "nothing to draw"),
-        (lambda: grid(delay=(0, 5, 10)), r"minus one-step \(noise by delay\) has shape \(2, 2\), expected \(2, 3\)"),
     ],
 )  # fmt: skip
 def test_input_that_cannot_be_drawn_is_refused_in_words(call: Callable[[], Figure], message: str) -> None:

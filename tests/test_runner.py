@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import pty
+import re
 import shutil
 import signal
 import subprocess
@@ -175,6 +176,63 @@ def test_a_parameters_cell_holds_literals_only(place: Path, source: str) -> None
         parameters.declared(write_notebook(place / "03_bad.ipynb", parameters=source))
 
 
+def test_help_of_a_notebook_lists_its_parameters_with_defaults_and_comments(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = 'scale = ""  # how much\nseed = 0\nrun_dir = ""\nrate = 0.5  # per second, not "per # minute"'
+    write_notebook(place / "notebooks" / "01_first.ipynb", parameters=cell)
+    for words in (["run", "first", "--help"], ["run", "-h", "first"]):
+        assert main(words) == 0
+        text = capsys.readouterr().out
+        assert re.search(r"^  --scale '' +how much$", text, re.MULTILINE)
+        assert re.search(r'^  -p rate=0.5 +per second, not "per # minute"$', text, re.MULTILINE)
+        assert "fast" not in text
+    assert main(["run", "--help"]) == 0
+    assert "rate" not in capsys.readouterr().out
+    assert main(["run", "frist", "--help"]) == 2
+    assert untouched(place)
+
+
+def test_a_mistyped_parameter_is_refused_naming_the_closest(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "first", "-p", "rat=1"]) == 2
+    assert "no parameter 'rat'; the closest is rate, and it has scale, seed, run_dir, rate," in capsys.readouterr().err
+    assert main(["run", "first", "-p", "xyzzy=1"]) == 2
+    assert "no parameter 'xyzzy'; it has scale" in capsys.readouterr().err
+
+
+def test_notebooks_are_copied_out_and_a_changed_copy_is_never_replaced(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copies = [place / "mine" / name for name in ("01_first.ipynb", "02_second.ipynb")]
+    for _ in range(2):  # the second time there is nothing to do
+        assert main(["notebooks", str(place / "mine")]) == 0
+        assert capsys.readouterr().out.split() == list(map(str, copies))
+    assert [path.read_bytes() for path in copies] == [each.path.read_bytes() for each in runs.notebooks().values()]
+    copies[0].unlink()
+    copies[1].write_text("{}")
+    assert main(["notebooks", str(place / "mine")]) == 1
+    assert "mine holds 02_second.ipynb, changed since" in capsys.readouterr().err
+    assert copies[1].read_text() == "{}"
+    assert not copies[0].exists()
+
+
+def test_a_copy_is_named_by_its_path(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = write_notebook(place / "mine" / "01_first.ipynb", parameters="scale = ''\nseed = 0\nrun_dir = ''\nmine = 3")
+    assert main(["run", str(copy), "--help"]) == 0
+    assert "-p mine=3" in capsys.readouterr().out
+    assert main(["run", str(copy.with_name("02_none.ipynb"))]) == 2
+    assert "no notebook is called" in capsys.readouterr().err
+
+
+def test_without_the_tools_of_notebooks_a_run_names_what_to_install(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "papermill", None)
+    assert main(["run", "first"]) == 1
+    assert re.search(r"notebooks need papermill, .*pip install 'tsmlib\[study\]'", capsys.readouterr().err)
+    assert untouched(place)
+
+
 # Execution -----------------------------------------------------------------------------------------------------------
 
 
@@ -190,6 +248,14 @@ def test_a_notebook_runs_with_its_parameters_into_its_folder(place: Path, capsys
     assert not list(executed.parent.glob(".*.ipynb"))
     assert entry["provenance"]["torch"]
     assert (entry["scale"], entry["seed"]) == ("smoke", 3)
+
+
+def test_what_a_notebook_prints_is_told_as_it_comes(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_notebook(place / "notebooks" / "01_first.ipynb", "print('no model;', 'training it now')\nprint('done')")
+    assert main(["run", "first"]) == 0
+    told = capsys.readouterr()
+    assert "no model; training it now\ndone\n" in told.err
+    assert "training" not in told.out
 
 
 UNFINISHED = {
@@ -344,18 +410,63 @@ def test_other_papermill_commands_are_left_alone(place: Path) -> None:
         ["papermill"],
         ["papermill", "--help"],
         ["papermill", here, "out.ipynb"],
-        ["papermill", here, "-p", "seed", "3"],
+        ["papermill", here, "out.ipynb", "-p", "seed", "3", "--no-progress-bar"],
+        ["papermill", here, "-p", "seed"],
+        ["papermill", here, "-y", "seed: 3"],
         ["papermill", str(elsewhere)],
+        ["papermill", str(elsewhere), "-p", "sed", "3"],
         ["papermill", str(place / "notebooks" / "09_missing.ipynb")],
         ["pytest", here],
     ):
         before = list(argv)
-        papermill_plugin.add_output_path(argv)
+        papermill_plugin.check(argv, terminal=True)
         assert argv == before
+    papermill_plugin.check(argv := ["/bin/papermill", here], terminal=False)
+    assert argv == ["/bin/papermill", here]
     assert untouched(place)
-    papermill_plugin.add_output_path(argv := ["/bin/papermill", here])
+
+
+def test_papermill_puts_a_notebook_where_run_would(place: Path) -> None:
+    here = str(place / "notebooks" / "01_first.ipynb")
+    papermill_plugin.check(argv := ["/bin/papermill", here], terminal=True)
     assert argv[2].endswith("laptop/seed0/01_first.ipynb")
     assert "{{x}}" in argv[2]
+    papermill_plugin.check(argv := ["papermill", here, "-p", "scale", "smoke", "-p", "seed", "3"], terminal=True)
+    assert argv[-1].endswith("smoke/seed3/01_first.ipynb")
+    copy = write_notebook(place / "mine" / "01_first.ipynb", "import tsmlib")
+    papermill_plugin.check(argv := ["papermill", str(copy)], terminal=True)
+    assert argv[-1].endswith("laptop/seed0/01_first.ipynb")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["-p", "scal", "smoke"],
+        ["out.ipynb", "-p", "seed", "3", "--parameters", "scal", "smoke"],
+        ["out.ipynb", "-r", "scal", "smoke"],
+        ["out.ipynb", "--parameters_yaml", "{seed: 3, scal: smoke}"],
+        ["out.ipynb", "-b", "c2NhbDogc21va2U="],
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("terminal", [True, False])
+def test_papermill_refuses_a_parameter_that_the_notebook_does_not_have(
+    place: Path, words: list[str], terminal: bool
+) -> None:
+    argv = ["papermill", str(place / "notebooks" / "01_first.ipynb"), *words]
+    with pytest.raises(ParameterError, match="01_first has no parameter 'scal'; the closest is scale, and it has"):
+        papermill_plugin.check(argv, terminal=terminal)
+    assert untouched(place)
+
+
+def test_papermill_itself_refuses_before_it_runs_anything(clone: Path) -> None:
+    done = subprocess.run(
+        [PAPERMILL, "notebooks/01_tiny.ipynb", "out.ipynb", "-p", "scal", "smoke"],
+        cwd=clone, env={**os.environ, "PYTHONPATH": str(clone)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.strip().startswith("error: 01_tiny has no parameter 'scal'; the closest is scale,")
+    assert not (clone / "out.ipynb").exists()
 
 
 def test_the_installed_package_registers_the_entry_point() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from _figure import exponents, growth
+from _figure import LOOKS, exponents, growth
 
 SIZES = np.array([1, 2, 4, 8])
 
@@ -19,6 +19,16 @@ def test_each_panel_names_its_exponents() -> None:
     figure = growth({"batch": {"train": (SIZES, flat * SIZES)}, "threads": {"simulate": (SIZES, flat / SIZES)}})
     notes = [text.get_text() for ax in figure.axes for text in ax.texts]
     assert notes == ["exponent 1.00 (1.00 to 1.00)", "exponent −1.00 (−1.00 to −1.00)"]
+
+
+def test_an_exponent_that_differs_from_round_to_round_is_not_printed() -> None:
+    noisy = np.stack([SIZES**0.1, SIZES**4.0])
+    (note,) = growth({"threads": {"train": (SIZES, noisy)}}).axes[0].texts
+    assert note.get_text() == "rounds differ too much"
+
+
+def test_every_quantity_has_a_colour_of_its_own() -> None:
+    assert len({look["color"] for look in LOOKS.values()}) == len(LOOKS)
 
 
 def test_numbers_that_are_not_finite_are_refused() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,12 +16,16 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import rollout
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
+from tsmlib.training.callbacks import CsvCallback, Progress, TensorBoardCallback
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, optimizers, schedule
-from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches
+from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, initial_past
 
 H = 4
 SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
@@ -56,6 +62,21 @@ def new_rtsm(seed: int = 0) -> RecurrentTSM:
     model = RecurrentTSM(3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5)
     model.features.fit(torch.from_numpy(TRAIN.states))
     return model
+
+
+@pytest.mark.parametrize("made_for", [TSM, RecurrentTSM, OneStep, LSTM, Ensemble, ActionPrior])
+def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_decides(made_for: Any) -> None:
+    torch.manual_seed(5)
+    one, later, other = (made_for.for_data(TRAIN, seed=seed) for seed in (0, 0, 1))
+    assert torch.initial_seed() == 5  # the global generator is left alone
+    assert same(weights(one), weights(later))
+    assert not same(weights(one), weights(other))
+    if made_for is ActionPrior:
+        torch.testing.assert_close(one.std, torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0))
+    else:
+        assert one.features.angles == [0]
+        states = one.features(torch.from_numpy(TRAIN.states)).flatten(0, 1)
+        torch.testing.assert_close(states.std(0), torch.ones(4), atol=1e-3, rtol=0)
 
 
 def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
@@ -259,6 +280,88 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert same(weights(again), weights(whole))
 
 
+# Callbacks -----------------------------------------------------------------------------------------------------------
+
+
+def lines(path: Path) -> list[dict[str, float]]:
+    return [{name: float(text) for name, text in line.items()} for line in csv.DictReader(path.open(newline=""))]
+
+
+def test_a_callback_sees_every_record_and_leaves_the_bits_alone() -> None:
+    alone, watched, seen = new_tsm(), new_tsm(), list[Progress]()
+
+    def watch(progress: Progress) -> None:
+        torch.rand(3), np.random.default_rng().random(3)
+        seen.append(progress)
+
+    expected, curve = train(alone), train(watched, callback=watch)
+    assert same(weights(watched), weights(alone))
+    assert (curve.train, curve.validation) == (expected.train, expected.validation)
+    assert [(one.step, one.seconds) for one in seen] == list(zip(curve.step, curve.seconds, strict=True))
+    assert [one.values["train"] for one in seen] == curve.train
+    assert [one.values["validation"] for one in seen] == curve.validation
+
+
+@pytest.mark.parametrize("at", [3, 6, 13])
+def test_a_resumed_training_has_every_step_once_in_its_table(tmp_path: Path, at: int) -> None:
+    table, model, checkpoint = CsvCallback(tmp_path / "logs" / "losses.csv"), new_tsm(), tmp_path / "run"
+    with pytest.raises(Interrupted):
+        train(model, Faulty(model, at, interrupt), checkpoint=checkpoint, callback=table)
+    curve = train(new_tsm(), checkpoint=checkpoint, callback=CsvCallback(table.path))
+    assert list(lines(table.path)[0]) == ["step", "seconds", "train", "validation"]
+    assert [line["step"] for line in lines(table.path)] == curve.step == [5, 10, 15, 20]
+    assert [line["validation"] for line in lines(table.path)] == curve.validation
+
+
+def test_a_record_made_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    """A training that is stopped after a record and before its checkpoint."""
+    table, checkpoint = CsvCallback(tmp_path / "losses.csv"), tmp_path / "run"
+
+    def stop(progress: Progress) -> None:
+        table(progress)
+        if progress.step == 10:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        train(new_tsm(), checkpoint=checkpoint, callback=stop)
+    assert [line["step"] for line in lines(table.path)] == [5, 10]
+    curve = train(new_tsm(), checkpoint=checkpoint, callback=table)
+    assert [line["step"] for line in lines(table.path)] == curve.step
+    assert [line["train"] for line in lines(table.path)] == curve.train
+
+
+def test_a_table_of_other_columns_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.csv").write_text("name,value\na,1\n")
+    with pytest.raises(files.StoreError, match=r"mine.csv has the columns name, value; expected step, seconds, train"):
+        train(new_tsm(), callback=CsvCallback(tmp_path / "mine.csv"))
+    assert (tmp_path / "mine.csv").read_text() == "name,value\na,1\n"
+
+
+def test_tensorboard_shows_every_step_of_a_resumed_training_once(tmp_path: Path) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    board, checkpoint = TensorBoardCallback(tmp_path / "board"), tmp_path / "run"
+
+    def stop(progress: Progress) -> None:
+        board(progress)
+        if progress.step == 10:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        train(new_tsm(), checkpoint=checkpoint, callback=stop)
+    curve = train(new_tsm(), checkpoint=checkpoint, callback=TensorBoardCallback(tmp_path / "board"))
+    shown = accumulator.EventAccumulator(str(tmp_path / "board")).Reload()
+    assert set(shown.Tags()["scalars"]) == {"train", "validation", "seconds"}
+    assert [event.step for event in shown.Scalars("validation")] == curve.step
+    assert np.allclose([event.value for event in shown.Scalars("validation")], curve.validation)
+
+
+def test_without_tensorboard_its_callback_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
+    with pytest.raises(ImportError, match=r'pip install "tsmlib\[tensorboard\]"'):
+        TensorBoardCallback("board")
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [
@@ -381,3 +484,20 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: st
 def test_episodes_shorter_than_the_windows_are_refused() -> None:
     with pytest.raises(TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"):
         train(new_tsm(), future_len=36)
+
+
+def test_a_model_that_knows_no_statistics_takes_those_of_its_training_data_and_until_then_does_not_predict() -> None:
+    torch.manual_seed(0)
+    model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
+    past = initial_past(torch.from_numpy(HELD_OUT.states[:4, 0]), H, 2)
+    with pytest.raises(ValueError, match=r"features of this TSM were never fitted.*TSM\.for_data\(trajectories\)"):
+        rollout(model, past, torch.zeros(4, H, 2))
+    fit(model, model.loss, TRAIN, HELD_OUT, TrainingOptions(past_len=H, future_len=H, steps=2, batch_size=4))
+    found = TSM.for_data(TRAIN, segment_len=H, channels=8, dilations=(1, 2)).features.state_dict()
+    torch.testing.assert_close(model.features.state_dict(), found)
+    assert rollout(model, past, torch.zeros(4, H, 2)).isfinite().all()
+
+
+def test_actions_beyond_their_bounds_are_refused_with_what_to_do() -> None:
+    with pytest.raises(TrajectoryError, match=r"go up to 2; expected them within \[-1, 1\]. Divide them by the bound"):
+        replace(TRAIN, actions=np.full_like(TRAIN.actions, 2.0))

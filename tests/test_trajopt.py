@@ -11,6 +11,7 @@ import gymnasium
 import pytest
 import torch
 from torch import Tensor
+from untrained import in_units
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
@@ -328,7 +329,7 @@ def test_a_finished_plan_meets_futures_that_its_planner_did_not_see() -> None:
 @pytest.mark.parametrize("build", [OneStep, LSTM])
 def test_a_deterministic_model_has_no_samples_and_says_so(build: Any) -> None:
     torch.manual_seed(0)
-    model, past = build(6, 2, hidden=16), initial_past(torch.zeros(B, 6), 10, 2)
+    model, past = in_units(build(6, 2, hidden=16)), initial_past(torch.zeros(B, 6), 10, 2)
     with pytest.raises(ValueError, match=f"2 samples of {build.__name__} asked for, but it is deterministic"):
         model_predictor(model, past, samples=2)
     actions = torch.full((1, B, T, 2), 0.3)
@@ -343,7 +344,7 @@ def test_a_negative_number_of_samples_is_refused() -> None:
 
 def test_a_batch_of_candidates_and_samples_is_laid_out_as_stated() -> None:
     torch.manual_seed(0)
-    model = TSM(6, 2, channels=8)
+    model = in_units(TSM(6, 2, channels=8))
     start = torch.randn(B, 6)
     actions = torch.randn(4, B, 15, 2).clamp(-1, 1)
     states = model_predictor(model, initial_past(start, 10, 2), samples=0)(actions)
@@ -386,7 +387,7 @@ def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(prior: ActionP
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, planner: str) -> None:
     torch.manual_seed(0)
-    model, space = TSM(6, 2, channels=8).requires_grad_(False), LatentActions(prior, 20)
+    model, space = in_units(TSM(6, 2, channels=8)).requires_grad_(False), LatentActions(prior, 20)
     predict = model_predictor(model, initial_past(torch.zeros(B, 6), 10, 2), samples=2)
     task = rewards.reach(torch.tensor([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0]]))
     start = torch.zeros(1, B, *space.shape)
@@ -452,7 +453,7 @@ def test_every_planner_plans_through_every_model(prior: ActionPrior, name: str, 
 
 def test_a_rollout_keeps_one_member_of_the_ensemble_and_candidates_share_it() -> None:
     torch.manual_seed(0)
-    model, n = Ensemble(6, 2, hidden=16, gaussian=False).requires_grad_(False), 40
+    model, n = in_units(Ensemble(6, 2, hidden=16, gaussian=False)).requires_grad_(False), 40
     past = initial_past(torch.zeros(n, 6), 1, 2)
     actions = torch.full((3, n, 12, 2), 0.5)
     states = model_predictor(model, past, samples=2)(actions)  # (2, 3, n, 12, 6)

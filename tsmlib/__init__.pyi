@@ -17,6 +17,8 @@ from .planning.execution import mpc as mpc
 from .planning.planners import adam as adam
 from .planning.planners import cem as cem
 from .planning.planners import mppi as mppi
+from .planning.planners import reevaluate as reevaluate
+from .planning.predictors import fresh_predictor as fresh_predictor
 from .planning.predictors import model_predictor as model_predictor
 from .planning.predictors import simulator_predictor as simulator_predictor
 from .planning.search_spaces import DirectActions as DirectActions
@@ -28,8 +30,13 @@ from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy
 from .storage.artifacts import load_model as load_model
 from .storage.artifacts import save_model as save_model
+from .study.media import film as film
 from .study.models import load_pretrained as load_pretrained
 from .study.tasks import load_task as load_task
+from .training.callbacks import Callback as Callback
+from .training.callbacks import CsvCallback as CsvCallback
+from .training.callbacks import Progress as Progress
+from .training.callbacks import TensorBoardCallback as TensorBoardCallback
 from .training.fit import TrainingOptions as TrainingOptions
 from .training.fit import fit as fit
 from .trajectory import Segment as Segment

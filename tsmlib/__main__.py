@@ -1,6 +1,8 @@
-"""Command line: run, verify, bench and publish.
+"""Command line: run, notebooks, verify, bench and publish; ``tsmlib`` and ``python -m tsmlib`` are the same.
 
-``python -m tsmlib run NOTEBOOK`` executes a notebook, ``python -m tsmlib verify [PATH]`` hashes again.
+``python -m tsmlib run NOTEBOOK`` executes a notebook, ``run NOTEBOOK --help`` lists its parameters.
+``python -m tsmlib notebooks FOLDER`` copies the notebooks out, to be opened, changed and run by their paths.
+``python -m tsmlib verify [PATH]`` hashes again.
 ``python -m tsmlib bench [NAME]`` measures speed; ``bench table`` writes docs/speed.md from what was measured.
 ``python -m tsmlib publish`` copies a paper-scale run to what ships.
 
@@ -13,19 +15,28 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import tsmlib
+from tsmlib.storage import files
 from tsmlib.study import notebooks, parameters, runs
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tsmlib", description="Temporal segment models.")
+    parser = argparse.ArgumentParser(prog="tsmlib", description="Temporal segment models.")
+    parser.add_argument("--version", action="version", version=f"tsmlib {tsmlib.__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
     names = ", ".join(runs.notebooks())
-    run = commands.add_parser("run", help="execute a notebook into runs/<scale>/seed<k>/")
-    run.add_argument("notebook", help=f"{names}, or all")
+    run = commands.add_parser(
+        "run", help="execute a notebook into runs/<scale>/seed<k>/", add_help=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    run.add_argument("notebook", nargs="?", default="", help=f"{names}, all, or the path of a copy")
+    run.add_argument("-h", "--help", action="store_true", help="show this, and the parameters of NOTEBOOK, and end")
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
     run.add_argument("--device", default="", help="where to train, learn, plan and roll out: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
+    copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
+    copy.add_argument("folder", type=Path)
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
     bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
@@ -36,6 +47,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     try:
         match arguments.command:
+            case "run" if arguments.help:
+                return _help(run, arguments.notebook)
+            case "notebooks":
+                return _copy_notebooks(arguments.folder)
             case "verify":
                 return _verify(arguments.path)
             case "bench":
@@ -55,13 +70,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    present = runs.notebooks()
-    word = arguments.notebook
+def _chosen(word: str) -> list[runs.Notebook]:
+    """The notebooks that a word names: one that ships, all of these, or by its path a copy that was changed."""
+    present, path = runs.notebooks(), Path(word)
+    if path.suffix == ".ipynb" and path.is_file():
+        return [runs.Notebook(path.stem, path.resolve())]
     if word != "all" and word not in present:
-        raise parameters.ParameterError(
-            f"no notebook is called {word!r:.80}; there are {', '.join(present) or 'none'}, or all."
+        what = f"no notebook is called {word!r:.80}; there are" if word else "name a notebook:"
+        raise parameters.ParameterError(f"{what} {', '.join(present) or 'none'}, or all.")
+    return list(present.values()) if word == "all" else [present[word]]
+
+
+def _help(run: argparse.ArgumentParser, word: str) -> int:
+    """The usage of ``run``, and every parameter of the notebooks that ``word`` names."""
+    run.epilog = "\n\n".join(
+        f"parameters of {notebook.name}, at their defaults:\n{parameters.explained(notebook.path)}"
+        for notebook in (_chosen(word) if word else [])
+    )
+    run.print_help()
+    return 0
+
+
+def _copy_notebooks(folder: Path) -> int:
+    """Copy the notebooks that ship. Refused, before anything is written, where one would replace a changed one."""
+    there = {folder / notebook.path.name: notebook.path.read_bytes() for notebook in runs.notebooks().values()}
+    if changed := [path.name for path, data in there.items() if path.exists() and path.read_bytes() != data]:
+        raise runs.RunError(
+            f"{folder} holds {', '.join(changed)}, changed since or of another version. Name another folder, or move "
+            "or delete what is there."
         )
+    for path, data in there.items():
+        if not path.exists():
+            files.write_bytes(path, data)
+        print(path)
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    chosen = _chosen(arguments.notebook)
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")
@@ -70,7 +116,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 f"-p {item!r:.80}: expected NAME=VALUE, each name once, and --scale and --seed for these two."
             )
         given[name] = text
-    chosen = list(present.values()) if word == "all" else [present[word]]
+    notebooks.require_tools()
     scale, seed, device = arguments.scale, parameters.convert("seed", arguments.seed), arguments.device
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
     for execution in executions:  # all of them are checked before the first one starts
@@ -91,11 +137,17 @@ def _verify(path: Path) -> int:
 def _publish(seed: str, *, claims: bool) -> int:
     from tsmlib.study import publish
 
+    _require_checkout("publish")
     if claims:
         publish.publish_claims()
         return 0
     publish.publish(runs.resolve("publish", scale="paper", seed=parameters.convert("seed", seed)))  # type: ignore[arg-type]
     return 0
+
+
+def _require_checkout(command: str) -> None:
+    if runs.INSTALLED:
+        raise parameters.ParameterError(f"{command} works on the repository; this is an installed package: clone it.")
 
 
 def _benchmarks() -> dict[str, Path]:
@@ -105,6 +157,7 @@ def _benchmarks() -> dict[str, Path]:
 
 
 def _bench(name: str) -> int:
+    _require_checkout("bench")
     present, table = _benchmarks(), runs.ROOT / "benchmarks" / "_table.py"
     if name not in ("all", "table", *present):
         raise parameters.ParameterError(

@@ -57,7 +57,7 @@ class Trajectories:
 
     states: (N, T + 1, dx) float32, physical units, joint angles not wrapped; actions: (N, T, du) float32 in [-1, 1].
     env: the ``gymnasium.make`` id; dt: seconds per step; names, units: one word per state dimension.
-    angles: state dimensions that are angles in radians (models see their cosine and sine).
+    angles: state dimensions that are angles in radians (models see their cosine and sine); none unless they are named.
     Raises TrajectoryError where shapes disagree or a value is not finite.
     """
 
@@ -67,7 +67,7 @@ class Trajectories:
     dt: float
     names: tuple[str, ...]
     units: tuple[str, ...]
-    angles: tuple[int, ...] = (0, 1)
+    angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         states, actions = self.states, self.actions
@@ -90,6 +90,11 @@ class Trajectories:
                     f"{len(bad)} value(s) in {field} of {self.env} are not finite, the first in episode {episode}, "
                     f"step {step}, field '{name}': {array[episode, step, column]}. Collect this data again."
                 )
+        if (most := np.abs(actions).max(initial=0)) > 1 + 1e-6:
+            raise TrajectoryError(
+                f"actions of {self.env} go up to {most:g}; expected them within [-1, 1]. "
+                "Divide them by the bounds of the action space first: actions / env.action_space.high"
+            )
 
     def __len__(self) -> int:
         return len(self.states)

@@ -11,6 +11,7 @@ with --closed planning again every 10 steps too, from what is left of the plan b
 (``study.load_or_train``), so a missing one is trained first. gap is the return that the planner's judge (gap_judge) or
 32 fresh samples (gap_fresh) predict for the plan, minus the executed one; of a closed loop, for the first plan.
 ``costs`` are those of the single targets, for paired differences: of more_than_mode and its standard error too.
+Among --models, ``oracle`` is the true simulator in the model's place and ``zero`` no torque at all, both open loop.
 
     python benchmarks/settings/judge.py --models rtsm lstm --targets 100 --seeds 0 1 2 --closed
     python benchmarks/settings/judge.py --models rtsm --envs tsm/ReacherPush-noise0.25-v1 --judges mode "mean of 6"
@@ -37,9 +38,9 @@ from tsmlib.models.base import DynamicsModel, Model
 from tsmlib.planning.base import Judge, Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import cem, reevaluate
-from tsmlib.planning.predictors import fresh_predictor, model_predictor
+from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import LatentActions
-from tsmlib.planning.tasks import Task
+from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.rewards import Reward
 from tsmlib.study import plans, runs
 from tsmlib.study.models import load_prior
@@ -50,6 +51,7 @@ JUDGES = (
     "mode", "mean of 2", "fresh mean of 2", "mode and mean of 2", "mean of 6", "fresh mean of 6", "median of 6",
     "mean of 16", "median of 16",
 )  # fmt: skip
+REFERENCES = ("zero", "oracle")
 KEY = ("env", "model", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
 COLUMNS = (
     *KEY, "cpu_seconds", "cost", "cost_sem", "more_than_mode", "more_than_mode_sem", "within_5cm", "final_mean",
@@ -159,6 +161,23 @@ def measured(task: Task, model: DynamicsModel, space: SearchSpace, way: Way, *, 
     return rows
 
 
+def reference(word: str, task: Task, space: SearchSpace, way: Way) -> list[Row]:
+    """The line of zero torque or of the oracle."""
+    began = time.process_time()
+    if word == "zero":
+        trial = execute(task, zero_torques(task))
+    else:
+        simulator = simulator_predictor(task.env, task.start)
+        trial = execute(task, way.search(simulator, task.reward, space, len(task), iterations=way.iterations))
+    cost = -trial.executed_return
+    found = {
+        "cpu_seconds": time.process_time() - began, "cost": cost.mean(), "cost_sem": cost.std() / len(task) ** 0.5,
+        "within_5cm": (trial.final_distance < 0.05).float().mean(), "final_mean": trial.final_distance.mean(),
+    }  # fmt: skip
+    row = way.named(task, closed=False) | {name: f"{float(value):.4g}" for name, value in found.items()}
+    return [row | {"costs": " ".join(f"{value:.3f}" for value in cost.tolist())}]
+
+
 def with_differences(rows: list[Row]) -> list[Row]:
     """The table with each line's cost over that of the mode, open loop, paired by target."""
     plain = {_rest(row): row for row in rows if row["judge"] == "mode" and row["closed"] == "0"}
@@ -194,7 +213,7 @@ def write(path: Path, rows: list[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", default=["rtsm"], help="words of the zoo (default rtsm)")
+    parser.add_argument("--models", nargs="+", default=["rtsm"], help="words of the zoo, oracle, zero (default rtsm)")
     parser.add_argument("--envs", nargs="+", default=["tsm/ReacherPush-v1"], help="default tsm/ReacherPush-v1")
     parser.add_argument("--judges", nargs="+", choices=JUDGES, default=JUDGES, metavar="JUDGE", help="default all")
     parser.add_argument("--targets", type=int, default=25, help="of the 100 of validation (default 25)")
@@ -213,15 +232,19 @@ def main() -> None:
         task = study.load_task(env, "validation").take(arguments.targets)
         space = LatentActions(load_prior(run, env), task.horizon)
         for word in arguments.models:
-            model = study.load_or_train(run, env, word).model.eval()
-            for seed in arguments.seeds:
-                for judge in arguments.judges if model.stochastic else ("mode",):
+            model = None if word in REFERENCES else study.load_or_train(run, env, word).model.eval()
+            for seed in arguments.seeds if word != "zero" else (0,):
+                for judge in ("",) if model is None else arguments.judges if model.stochastic else ("mode",):
                     way = Way(judge, seed, arguments.candidates, arguments.iterations, arguments.again)
                     known, common = read(arguments.out), {"env": env, "model": word}
-                    wanted = common | way.named(task, closed=arguments.closed)
+                    wanted = common | way.named(task, closed=arguments.closed and model is not None)
                     if any(all(row[key] == value for key, value in wanted.items()) for row in known):
                         continue
-                    new = [common | row for row in measured(task, model, space, way, closed=arguments.closed)]
+                    if model is None:
+                        found = reference(word, task, space, way)
+                    else:
+                        found = measured(task, model, space, way, closed=arguments.closed)
+                    new = [common | row for row in found]
                     keys = [tuple(row[key] for key in KEY) for row in new]
                     kept = [row for row in known if tuple(row[key] for key in KEY) not in keys]
                     write(arguments.out, with_differences([*kept, *new]))

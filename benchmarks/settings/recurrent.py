@@ -9,6 +9,8 @@ where one segment ends and the next begins. All that is uncertain lives in the c
     energy score of S samples X_i:   mean_i |X_i - x| - mean_{i != j} |X_i - X_j| / 2     over each segment as a whole
 
 It is strictly proper: its minimum over all models is the true distribution of the future. No encoder is needed.
+
+The prototype behind ``successor.csv``, kept as it was; the package's is ``tsmlib.models.recurrent``.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tsmlib.envs.geometry import DT
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.trajectory import Window
 
 TRAITS = ("change", "centroid", "autocorrelation")  # of claim C51
 
@@ -44,6 +45,18 @@ def reconstruct(prior: ActionPrior, actions: Tensor) -> Tensor:
     segments = actions.unflatten(1, (-1, prior.segment_len))  # (B, K, H, du)
     codes, _ = prior.encode(segments.flatten(0, 1))
     return prior.plan(_rest(prior, len(actions)), codes.unflatten(0, segments.shape[:2]))
+
+
+@torch.no_grad()
+def rebuilt(prior: ActionPrior, window: Window) -> tuple[float, float]:
+    """Error of segments of torques that are decoded from their own mean codes, and from those of other segments.
+
+    Root mean squares, over the deviation of the training torques. window: its future is one segment of H steps.
+    """
+    past, true = window.past.actions, window.future.actions
+    z, _ = prior.encode(true)
+    off = (((prior.decode(past, codes) - true) / prior.std).square().mean().sqrt() for codes in (z, z.roll(7, 0)))
+    return float(next(off)), float(next(off))
 
 
 def _rest(prior: ActionPrior, n: int) -> Tensor:

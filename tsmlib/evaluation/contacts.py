@@ -33,6 +33,17 @@ def after_first(steps: Tensor) -> Tensor:
     return steps.cummax(1).values
 
 
+def first_episodes(test: Trajectories, *, after: int) -> dict[str, Trajectories]:
+    """The first episode in which the arm meets the block, but not in its first ``after`` steps ("contact"), and the
+    first in which it never does ("free"); where there is no block, or no such episode, only the other."""
+    touched = np.zeros((len(test), 1), dtype=bool)
+    if EnvSpec.parse(test.env).has_block:
+        touched = closest_gap(test.states, test.env) < 0.001
+    ever = touched.any(1)
+    chosen = {"contact": ever & ~touched[:, : after + 1].any(1), "free": ~ever}
+    return {kind: test.take(np.flatnonzero(among)[:1]) for kind, among in chosen.items() if among.any()}
+
+
 WITHIN = 2  # steps by which a predicted contact may be early or late
 LEAD = 5  # steps before the first touch at which the windows of figure 9 begin: the arm is about to swing
 AHEAD = 5  # steps after the touch at which a deflection is read
@@ -61,6 +72,18 @@ def windows_before_contact(
     generator = torch.Generator().manual_seed(seed)
     drawn = [rollout(model, window.past, window.future.actions, generator=generator) for _ in range(samples)]
     return SampledFutures(test.env, window, torch.stack(drawn)), episodes
+
+
+def into_a_wall(seen: SampledFutures, *, n: int = 4) -> np.ndarray:
+    """Up to ``n`` of those windows in which the object hits a wall, evenly spaced by how far it travels.
+
+    Of all windows where fewer than ``n`` of them do.
+    """
+    (past, future), (truth, _) = seen.window, contacts(seen)["wall"]
+    hits = truth.any(1) if truth.any(1).sum() >= n else torch.ones(len(truth), dtype=torch.bool)
+    far = (future.states[:, -1, BLOCK] - past.states[:, -1, BLOCK]).norm(dim=1)
+    among = np.flatnonzero(hits)[far[hits].argsort()]
+    return among[np.linspace(0, len(among) - 1, min(n, len(among))).astype(int)]
 
 
 def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:

@@ -7,6 +7,7 @@ Letters in shapes: S samples, N windows of test episodes, T steps, H segment len
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
 from tsmlib.models.tsm import TSM
+from tsmlib.rewards import BLOCK
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
 
@@ -132,6 +134,37 @@ def decode_codes(model: Coded, window: Window, codes: Tensor, steps: int) -> Ten
         return states
     past = past.then(Segment(states, actions[:, :first])).last(model.past_len)
     return torch.cat([states, rollout(model, past, actions[:, first:])], dim=1)
+
+
+@dataclass(frozen=True)
+class CodeMap:
+    """Codes for one moment, and what they do to the object (n codes, T steps).
+
+    codes (n, dz); ways (n, T, 2), of the object; plane (2, dz): the ``directions`` that move its end; told: the share
+    of the end's variance that is linear in the code.
+    """
+
+    codes: Tensor
+    ways: Tensor
+    plane: Tensor
+    told: float
+
+    @property
+    def at(self) -> Tensor:
+        """The codes in the plane, (n, 2)."""
+        return self.codes @ self.plane.T
+
+
+def code_map(model: Coded, window: Window, *, n: int = 600, seed: int = 0) -> CodeMap:
+    """Codes from N(0, I) for one window (N = 1), and the object's ways to the end of its future."""
+    codes = torch.randn(n, model.latent_dim, generator=torch.Generator().manual_seed(seed))
+    ways = decode_codes(model, window, codes, window.future.actions.shape[1])[..., BLOCK]
+    return CodeMap(codes, ways, *directions(codes, ways[:, -1]))
+
+
+def held(codes: Tensor, plane: Tensor, at: Tensor) -> Tensor:
+    """Codes (n, dz) whose part in a plane, orthonormal (2, dz), is replaced by ``at`` (2,): z - z P'P + at P."""
+    return codes - codes @ plane.T @ plane + at @ plane
 
 
 def principal(codes: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,10 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, generator_of, measure
-from tsmlib.models.base import DynamicsModel, as_dynamics, rollout
+from tsmlib.models.base import DynamicsModel, as_dynamics, predict_segment, rollout
 from tsmlib.models.features import Features
-from tsmlib.trajectory import Segment, Trajectories
+from tsmlib.models.tsm import TSM
+from tsmlib.trajectory import Segment, Trajectories, Window
 
 VERSION = 2  # raise it when a score changes: scores that are kept are found again only by the version that made them
 ROWS = 800  # samples times trajectories that are rolled out and scored at once
@@ -86,6 +87,23 @@ def score(
         parts.append((values, pit, outside))
     values = {metric: torch.cat([part[0][metric] for part in parts]) for metric in parts[0][0]}
     return Scores(values, torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts]), fitted)
+
+
+@torch.no_grad()
+def ways_apart(model: DynamicsModel, window: Window, *, seed: int = 0) -> dict[str, float]:
+    """How far apart the same prediction x is by two ways of computing it: at most, relative to 1 + |x|.
+
+    ``steps``: the mode of a whole segment, and one action at a time. ``teacher forcing``, of a TSM: a segment decoded
+    state by state, and all at once from what was decoded. window: its future is one segment.
+    """
+    past, actions = window.past, window.future.actions
+    step = model.begin(past)
+    both = {"steps": (predict_segment(model, past, actions), torch.stack([step(u) for u in actions.unbind(1)], dim=1))}
+    if isinstance(model, TSM):
+        z = torch.randn(len(actions), model.latent_dim, generator=torch.Generator().manual_seed(seed))
+        states = model.decode(past, actions, z)
+        both["teacher forcing"] = states, model.decode_teacher_forced(Window(past, Segment(states, actions)), z)
+    return {way: float(((x - again) / (1 + x.abs())).abs().max()) for way, (x, again) in both.items()}
 
 
 def _require_fit(features: Features, test: Trajectories, validation: Trajectories, samples: int) -> None:

@@ -12,13 +12,13 @@ from .diagrams import figure1 as figure1
 from .diagrams import figure2 as figure2
 from .diagrams import figure3 as figure3
 from .latent import around_touch as around_touch
+from .latent import code_fan as code_fan
 from .latent import code_grid as code_grid
 from .latent import code_use as code_use
 from .latent import contact_recall as contact_recall
 from .latent import deflection_intervals as deflection_intervals
 from .latent import embedding as embedding
 from .latent import figure9 as figure9
-from .latent import one_code as one_code
 from .latent import spread_against_error as spread_against_error
 from .latent import walk as walk
 from .method import Look as Look
@@ -43,7 +43,9 @@ from .rollouts import gallery as gallery
 from .rollouts import rollout_panels as rollout_panels
 from .sliders import slider_panel as slider_panel
 from .style import save as save
+from .style import stamp as stamp
 from .style import use_style as use_style
+from .video import animation as animation
 from .video import embed as embed
 from .video import save_video as save_video
 from .video import side_by_side as side_by_side

@@ -24,15 +24,17 @@ WALK = mpl.colormaps["viridis"]
 def figure10(plans: Mapping[Method, np.ndarray], dt: float, changes: Mapping[Method, float]) -> Figure:
     """Torques over time (paper, figure 10): method -> (T, 2) in [-1, 1], four to a row, all on one scale.
 
-    changes: method -> mean change of torque from step to step of all its plans, as a share of the data's.
+    changes: method -> mean change of torque from step to step of all its plans, as a share of the data's, which goes
+    without saying for the data.
     """
     plans = {method: shaped(method.label, actions, "T 2") for method, actions in plans.items()}
     figure, axes = panels(len(plans), 4, 1.25, sharex=True, sharey=True)
     limit = max(float(np.abs(actions).max()) for actions in plans.values())
     for ax, (method, actions) in zip(axes, plans.items(), strict=True):
         style.torques(ax, actions, dt, method.look.colour, limit=limit)
-        ax.set_title(method.label, fontsize=7)
-        style.note(ax, f"change {changes[method]:.2f} of the data's", 0.98, 0.02)
+        ax.set_title(f"{method.look.name}\n{', '.join(method.how)}", fontsize=7)
+        if method.model != "data":
+            style.note(ax, f"change: {changes[method]:.2f} × data's", 0.98, 0.02)
     style.torque_labels(figure)
     style.joint_legend(figure)
     return figure
@@ -67,7 +69,7 @@ def _line(method: Method) -> Props:
 def prior_walks(walks: np.ndarray, dt: float) -> Figure:
     """Torques decoded from codes: walks (m, n, T, 2), each from one code (dark) to another (light), from rest.
 
-    Shoulder above, elbow below.
+    Shoulder above, elbow below, a column for each walk.
     """
     walks = finite("walks", walks, "m n T 2")
     figure, grid = plt.subplots(2, len(walks), figsize=(WIDTH, 2.5), sharex=True, sharey=True, squeeze=False)
@@ -79,9 +81,13 @@ def prior_walks(walks: np.ndarray, dt: float) -> Figure:
                 ax.plot(seconds, way, color=shade, lw=0.9)
             ax.axhline(0, color="#DDDDDD", lw=0.5, zorder=0)
             ax.set_xlim(0, seconds[-1])
+    for i, ax in enumerate(grid[0]):
+        ax.set_title(f"walk {i + 1}")
     for ax, word in zip(grid[:, 0], style.JOINTS, strict=True):
         ax.set_ylabel(word)
     style.torque_labels(figure)
+    ends = {"the first code of a walk": shades[0], "between": shades[len(shades) // 2], "the last": shades[-1]}
+    legend(figure, [entry(word, color=shade) for word, shade in ends.items()])
     return figure
 
 
@@ -101,7 +107,10 @@ def cost_of_prior(values: Mapping[str, Mapping[str, np.ndarray]], labels: Mappin
             at = finite(f"{title}: {word}", found[word], str(len(lost)))
             ax.axhline(0, color="#999999", lw=0.7, zorder=1)
             ax.scatter(at, lost, s=8, c=np.where(lost > 0, style.RED, style.BLUE), linewidths=0, zorder=2)
-            ax.set(title=title if word == columns[0] else "", xlabel=labels[word])
+            ax.set(title=title, xlabel=labels[word])
             ax.locator_params(nbins=5)
     axes[0].set_ylabel("return lost in latent space (m)")
+    dots: Props = {"ls": "", "marker": "o", "ms": 3, "mew": 0}
+    legend(figure, [entry("one target, latent space loses", color=style.RED, **dots),
+                    entry("one target, it gains", color=style.BLUE, **dots)])  # fmt: skip
     return figure

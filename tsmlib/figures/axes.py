@@ -21,6 +21,7 @@ from tsmlib.figures.style import DASHED, Props, entry, legend, tint
 from tsmlib.statistics import interval
 
 REFERENCES = {"oracle": "-", "zero": "--", "random": ":"}  # models drawn as lines: none of them could gain or lose
+YOURS: Props = {"marker": "D", "ms": 3.4, "mfc": "white", "mew": 0.9, "ls": ""}  # the reader's own
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -46,8 +47,10 @@ def entries(look_of: Mapping[Method, Props], **more: Any) -> list[Line2D]:
 
 
 def references(values: Mapping[Method, float]) -> dict[Method, float]:
-    """The references among some methods, of several of one model the best."""
-    best = {method.model: method for method in sorted(values, key=lambda method: values[method])}
+    """The references among some methods; of several of one model that in the latent search space, which tables divide
+    by, else the best."""
+    ordered = sorted(values, key=lambda method: (method.search_space == "latent", values[method]))
+    best = {method.model: method for method in ordered}
     return {best[model]: values[best[model]] for model in REFERENCES if model in best}
 
 
@@ -148,6 +151,27 @@ def mark(ax: Axes, along: str, at: float, seeds: np.ndarray, look: Props, aside:
     for side in (side for side, beyond in out.items() if beyond):
         arrow(ax, along, at, side, look["color"])
     return [spell(mean) + (f" ± {spell(half)}" if half else "")] if any(out.values()) else []
+
+
+def diamonds(ax: Axes, along: str, at: np.ndarray, values: np.ndarray, method: Method) -> list[str]:
+    """The reader's own ``values`` of a method, hollow diamonds at ``at``; in words those outside the axis ``along``."""
+    low, high = ax.get_xlim() if along == "x" else ax.get_ylim()
+    seen = (values >= low) & (values <= high)
+    places = (values[seen], at[seen]) if along == "x" else (at[seen], values[seen])
+    if seen.any():
+        ax.plot(*places, **YOURS, color=method.look.colour, zorder=5, clip_on=False)
+    notes = []
+    for side, gone in ((-1, values < low), (1, values > high)):
+        if gone.any():
+            arrow(ax, along, at[gone.argmax()], side, method.look.colour)
+            notes.append(f"{method.label}, yours {'' if len(values) == 1 else 'to '}"
+                         f"{spell(side * (side * values).max())}")  # fmt: skip
+    return notes
+
+
+def yours_entry(*given: Mapping[Any, Any] | None) -> list[Line2D]:
+    """The line of a legend for the reader's own, where there are any."""
+    return [entry("yours", color="#4A4A4A", **YOURS)] if any(given) else []
 
 
 def wrapped(text: str, inches: float) -> str:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from tsmlib.figures import style
-from tsmlib.figures.axes import dimension, log_axis
+from tsmlib.figures.axes import dimension, log_axis, wrapped
 from tsmlib.figures.checks import shaped
 from tsmlib.figures.method import Method
 from tsmlib.figures.style import DARK, entry, legend, panels, styled, tint
@@ -95,7 +95,8 @@ def loss_curves(curves: Mapping[Method, Mapping[str, np.ndarray]]) -> Figure:
     curves: method -> {"seconds" or "step": (n,), "train": (n,), "validation": (n,)}; NaN where nothing was measured.
     ``vars(curve)`` of what ``training.fit`` returned is one.
     """
-    figure, axes = panels(len(curves), 4, 1.35)
+    across = min(len(curves), min((4, 3), key=lambda columns: -len(curves) % columns))  # few places stay empty
+    figure, axes = panels(len(curves), across, 1.5)
     for ax, (method, given) in zip(axes, curves.items(), strict=True):
         along = next((word for word in ("seconds", "step") if word in given), None)
         if along is None:
@@ -112,7 +113,8 @@ def loss_curves(curves: Mapping[Method, Mapping[str, np.ndarray]]) -> Figure:
         both = np.concatenate([train, held])
         if np.nanmin(both) > 0:
             log_axis(ax, float(np.nanmin(both)), float(np.nanmax(both)))
-        ax.set(title=method.label, xlabel="training time (s)" if along == "seconds" else "training steps")
+        title = wrapped(method.label, style.WIDTH / across - 0.3)
+        ax.set(title=title, xlabel="training time (s)" if along == "seconds" else "training steps")
     axes[0].set_ylabel("loss")
     legend(figure, [entry("training", color=tint(DARK), lw=0.8), entry("validation", color=DARK, lw=1.3),
                     entry("kept", color=DARK, ls="", marker="o", mec="white", ms=4.5)])  # fmt: skip

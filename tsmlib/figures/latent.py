@@ -234,29 +234,42 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
 
 @styled
 def embedding(codes: Mapping[str, tuple[np.ndarray, np.ndarray, tuple[str, str]]]) -> Figure:
-    """Codes in the plane, coloured by which way the object goes; grey where it stays.
+    """Codes in the plane, coloured by the way the object goes; grey where it hardly does. A compass shows the colours.
 
-    codes: title -> coordinates (N, 2); where the object goes (N, 2), in m, by less than a centimetre if it stays; names
-    of the two axes.
+    codes: title -> coordinates (N, 2); where the object goes (N, 2), in m, grey within a centimetre; names of the two
+    axes.
     """
     wheel = mpl.colormaps["twilight_shifted"]
-    figure, axes = panels(len(codes), len(codes), 2.55, width=min(WIDTH, 3 * len(codes) + 0.6), head=0)
+    figure, axes = panels(len(codes), len(codes), 2.9, width=min(WIDTH, 2.9 * len(codes) + 1.2), head=0.1)
     for ax, (title, (at, moved, labels)) in zip(axes, codes.items(), strict=True):
         at, moved = finite(f"points of {title}", at, "N 2"), finite(f"ways of {title}", moved, f"{len(at)} 2")
         way, still = np.arctan2(moved[:, 1], moved[:, 0]), np.linalg.norm(moved, axis=1) <= 0.01
         ax.plot(*at[still].T, ".", color="#C4C4C4", ms=2.5, mew=0, zorder=1, rasterized=True)
         x, y = at[~still].T
-        ax.scatter(x, y, c=way[~still], cmap=wheel, vmin=-np.pi, vmax=np.pi, s=9, linewidths=0.3,
+        ax.scatter(x, y, c=way[~still], cmap=wheel, vmin=-np.pi, vmax=np.pi, s=11, linewidths=0.3,
                    edgecolors="#444444", zorder=2, rasterized=True)  # fmt: skip
-        ax.set(title=title, xlabel=labels[0], ylabel=labels[1])
+        ax.set(title=title, xlabel=labels[0], ylabel=labels[1], box_aspect=1)
         ax.locator_params(nbins=5)
-    scale = figure.colorbar(
-        mpl.cm.ScalarMappable(mpl.colors.Normalize(-180, 180), wheel), ax=axes[-1], shrink=0.85, aspect=22,
-        ticks=(-180, -90, 0, 90, 180), label="direction of the object (degrees)",
-    )  # fmt: skip
-    scale.outline.set_visible(False)
-    legend(figure, [entry("the object stays", ls="", marker=".", color="#C4C4C4", ms=5)])
+    _compass(figure, axes[-1], wheel)
     return figure
+
+
+def _compass(figure: Figure, beside: Axes, wheel: mpl.colors.Colormap) -> None:
+    """A ring of the colours to the right of a panel: each stands where its direction points."""
+    room = figure.colorbar(mpl.cm.ScalarMappable(cmap=wheel), ax=beside, fraction=0.3, pad=0.04, aspect=1.2).ax
+    room.set_axis_off()
+    room.clear()
+    angle = np.linspace(-np.pi, np.pi, 181)
+    ring = room.inset_axes((0, 0.3, 1, 0.5), projection="polar")
+    ring.pcolormesh(angle, (0.62, 1), angle[None, :-1], cmap=wheel, vmin=-np.pi, vmax=np.pi, rasterized=True)
+    ring.set(xticks=(), yticks=(), ylim=(0, 1))
+    ring.spines[:].set_visible(False)
+    ring.grid(visible=False)
+    ring.plot(0, 0, ".", color="#C4C4C4", ms=5)
+    for x, word in enumerate(("the object goes\nthis way", "grey: by less\nthan 1 cm")):
+        room.annotate(word, (0.5, (0.82, 0.28)[x]), xycoords="axes fraction", ha="center", fontsize=6.5,
+                      va=("bottom", "top")[x], color=style.NOTE)  # fmt: skip
+    room.set_axis_off()
 
 
 @styled
@@ -293,18 +306,47 @@ def code_grid(
     return figure
 
 
+def code_fan(
+    draw: Draw, start: np.ndarray, every: np.ndarray, true: np.ndarray, method: Method
+) -> Callable[[np.ndarray], Figure]:
+    """A picture of the object's ways under some codes, over those under all: ways (S, T, 2) -> the figure.
+
+    It is one figure, drawn once, in which the ways are replaced, so that it follows a slider. draw paints the scene;
+    start (dx,): the last observed state; every (n, T, 2): the ways under all codes; true (T, 2): what happened.
+    """
+    figure = _code_scene(draw, start, every, true, method)
+    (ax,) = figure.axes
+    lines, (*_, ends) = ax.collections[-1], ax.lines
+
+    def drawn(ways: np.ndarray) -> Figure:
+        ways = _from(start, finite("ways", ways, f"S {every.shape[1]} 2"))
+        lines.set(segments=list(ways), alpha=float(np.clip(12 / len(ways), 0.25, 0.8)))
+        ends.set_data(*ways[:, -1].T)
+        return figure
+
+    return drawn
+
+
 @styled
-def one_code(
-    draw: Draw, start: np.ndarray, path: np.ndarray, fan: np.ndarray, true: np.ndarray, method: Method
-) -> Figure:
-    """The object's way under one code, path (T, 2), over those under many, fan (S, T, 2), and the true one (T, 2)."""
-    figure, ax = plt.subplots(figsize=(3.4, 3.4), layout="compressed")
-    main = method.look.colour
+def _code_scene(draw: Draw, start: np.ndarray, every: np.ndarray, true: np.ndarray, method: Method) -> Figure:
+    """What stays, and room for what moves: the last collection, and the last line for its ends."""
+    every, true = _from(start, finite("every", every, "n T 2")), _from(start, finite("true", true, "T 2"))
+    main, grey = method.look.colour, "#9A9A9A"
+    figure = plt.figure(figsize=(4.6, 4.85), dpi=100, layout="none")
+    ax = figure.add_axes((0.01, 0.01, 0.98, 0.98 * 4.6 / 4.85))
     draw(ax, start)
-    ways = list(finite("fan", fan, "S T 2"))
-    ax.add_collection(LineCollection(ways, colors=main, linewidths=0.6, alpha=0.18, zorder=6))
-    ax.plot(*finite("true", true, "T 2").T, color="black", lw=1.2, zorder=7)
-    ax.plot(*finite("path", path, "T 2").T, color=main, lw=2.2, zorder=8)
-    ax.plot(*path[-1], "o", color=main, ms=5, mec="white", zorder=8)
+    ax.add_collection(LineCollection(list(every), colors=grey, linewidths=0.6, alpha=0.35, zorder=6))
+    ax.plot(*true.T, color="black", lw=1.4, zorder=8)
+    ax.plot(*true[-1], "o", color="black", ms=4, zorder=8)
+    ax.add_collection(LineCollection([], colors=main, linewidths=1, zorder=7))
+    ax.plot([], [], ".", color=main, ms=5, mew=0, zorder=7.5)
     style.scene(ax)
+    seen = np.concatenate([every.reshape(-1, 2), true])
+    middle, span = (seen.max(0) + seen.min(0)) / 2, min(0.55, 1.1 * float(np.ptp(seen, axis=0).max()) + 0.08)
+    ax.set(xlim=middle[0] + np.array((-0.5, 0.5)) * span, ylim=middle[1] + np.array((-0.5, 0.5)) * span)
+    figure.legend(
+        handles=[entry("all codes", color=grey, lw=0.8), entry("codes at the sliders", color=main, lw=1.2),
+                 entry("what happened", color="black", marker="o", ms=4)],
+        loc="upper left", ncols=3, fontsize=8,
+    )  # fmt: skip
     return figure

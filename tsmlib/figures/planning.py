@@ -5,7 +5,8 @@ Letters in shapes: n targets, T steps, dx state size.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,13 +15,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from tsmlib.figures import style
-from tsmlib.figures.axes import REFERENCES, reference_look, references
+from tsmlib.figures.axes import YOURS, diamonds, foot, reference_look, references, yours_entry
 from tsmlib.figures.checks import finite, shaped
-from tsmlib.figures.method import Method
+from tsmlib.figures.method import PLANNERS, Method
 from tsmlib.figures.style import DARK, WIDTH, Props, entry, legend, panels, styled, tint
 from tsmlib.statistics import interval
 
 Results = Mapping[str, Mapping[Method, Mapping[str, np.ndarray | None]]]  # task -> method -> {"true", "predicted"}
+FLOORS = ("zero", "random")
 MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "D"}  # planner -> marker
 
 
@@ -37,8 +39,6 @@ def _returns(results: Results) -> dict[str, dict[Method, Returns]]:
             given = row.get("predicted")
             predicted = None if given is None else finite(f"{field} predicted returns", given, str(len(true)))
             checked[task][method] = true, predicted
-    if not any(checked.values()):
-        raise ValueError("results hold no task with a method: nothing to draw")
     return checked
 
 
@@ -51,72 +51,118 @@ def _heights(methods: Iterable[Method]) -> dict[Method, float]:
 
 
 @styled
-def figure6(results: Results) -> Figure:
+def figure6(results: Results, yours: Results | None = None) -> Figure:
     """Trajectory optimisation (paper, figure 6): the cost of the executed plans and how far the model misjudged it.
 
     results: task -> method -> {"true": (n,), "predicted": (n,) or None}, undiscounted returns per target. Points are
     means, bars 95 % t intervals over targets; of the cost, that of the difference to the oracle, target by target,
-    where there is one, since targets differ more than methods. Oracle, zero and random torques become reference lines
-    (of several oracles the better one), or words where they lie far off. Filled: latent search space; open: direct.
+    where there is one, since targets differ more than methods. Costs are divided by the oracle's on the same targets,
+    that of the latent search space where there are two, as in the tables; without an oracle they are in metres. Oracle,
+    zero and random torques are reference lines, or words where they lie far off. Filled: latent search space; open:
+    direct. yours: as results, of the same or of other targets; hollow diamonds below.
     """
-    checked = _returns(results)
-    heights = {task: _heights(m for m in rows if m.model not in REFERENCES) for task, rows in checked.items()}
+    published, own = (
+        {task: _Costs.of(rows) for task, rows in _returns(part).items()} for part in (results, yours or {})
+    )
+    tasks, none = list(dict.fromkeys([*published, *own])), _Costs.of({})
+    pairs = {task: (published.get(task, none), own.get(task, none)) for task in tasks}
+    if not any(part.lines or part.points for pair in pairs.values() for part in pair):
+        raise ValueError("results hold no task with a method: nothing to draw")
+    heights = {task: _heights({**first.points, **second.points}) for task, (first, second) in pairs.items()}
     lengths = [max(2.0, max(places.values(), default=0) + 1) for places in heights.values()]
-    size = (WIDTH, sum(0.17 * length + 0.42 for length in lengths) + 0.3)
-    figure, grid = plt.subplots(
-        len(checked), 2, figsize=size, squeeze=False, sharey="row", height_ratios=lengths
-    )  # fmt: skip
+    size = (WIDTH, sum((0.2 if own else 0.17) * length + 0.42 for length in lengths) + 0.3)
+    figure, grid = plt.subplots(len(tasks), 2, figsize=size, squeeze=False, sharey="row", height_ratios=lengths)
     used: dict[Method, None] = {}
-    for (cost, gap), (task, rows) in zip(grid, checked.items(), strict=True):
-        levels = references({method: float(true.mean()) for method, (true, _) in rows.items()})
-        far = _reference_costs(cost, levels, [-rows[method][0].mean() for method in heights[task]])
-        used |= dict.fromkeys(method for method in levels if method not in far)
-        oracle = next((rows[method][0] for method in levels if method.model == "oracle"), np.zeros(0))
-        _points(cost, gap, rows, heights[task], oracle)
-        _row_names(cost, heights[task])
+    for (cost, gap), (task, (first, second)) in zip(grid, pairs.items(), strict=True):
+        places, main = heights[task], first if first.points else second
+        far = _reference_costs(cost, main)
+        used |= dict.fromkeys(method for method in main.lines if method not in far)
+        gap.axvline(0, color="#999999", lw=0.6, zorder=1)
+        for ax, words, values, more in (
+            (cost, f"cost of the executed plan{f' / oracle{chr(39)}s' * main.divided}{' (m)' * (not main.divided)}",
+             "points", [*far.values()]),
+            (gap, "predicted − executed return (m)", "gaps", []),
+        ):  # fmt: skip
+            _points(ax, getattr(first, values), places)
+            notes = _own_points(ax, getattr(second, values), places, first.points)
+            foot(ax, words, [*more, *notes], WIDTH / 2 - 0.6)
+            for y in places.values():
+                ax.axhline(y, color=style.GRID, lw=0.6, zorder=0)
+            style.rows_only(ax)
+        _row_names(cost, places)
         cost.set(title=f"{task.capitalize()}: executed cost (lower is better)")
-        gap.set(title=f"{task.capitalize()}: gap (0 is best)", xlabel="predicted − executed return (m)")
-        cost.set_xlabel("\n".join(["−executed return (m)", *far.values()]))
+        gap.set(title=f"{task.capitalize()}: gap (0 is best)")
     handles = [entry(method.look.name, **reference_look(method)) for method in used]
+    planners = dict.fromkeys(method.planner for places in heights.values() for method in places)
+    marker = MARKERS.get(next(iter(planners), ""), "o")
     for face, word in ((DARK, "latent"), ("white", "direct")):
-        handles.append(entry(f"search space: {word}", color=DARK, ls="", marker="o", ms=4.2, mfc=face, mew=0.9))
-    legend(figure, handles)
+        handles.append(entry(f"search space: {word}", color=DARK, ls="", marker=marker, ms=4.2, mfc=face, mew=0.9))
+    if len(planners) > 1:
+        handles += [entry(PLANNERS.get(word, word), color=DARK, ls="", marker=MARKERS.get(word, "o"), ms=4.2)
+                    for word in planners]  # fmt: skip
+    legend(figure, [*handles, *yours_entry(own)])
     return figure
 
 
-def _reference_costs(ax: Axes, levels: Mapping[Method, float], costs: Sequence[float]) -> dict[Method, str]:
-    """Lines at the cost of each reference; in words those that would squeeze the methods' ``costs`` together."""
-    near = [*costs, *(-level for method, level in levels.items() if method.model == "oracle")]
-    far = max(near) + 2 * max(np.ptp(near), 0.1) if near else np.inf
+@dataclass(frozen=True)
+class _Costs:
+    """One task of ``figure6``: costs of references, and costs and gaps of the others, each with half its interval."""
+
+    lines: dict[Method, float]
+    points: dict[Method, tuple[float, float]]
+    gaps: dict[Method, tuple[float, float]]
+    divided: bool  # by the oracle's cost
+
+    @staticmethod
+    def of(rows: Mapping[Method, Returns]) -> _Costs:
+        levels = references({method: float(true.mean()) for method, (true, _) in rows.items()})
+        oracle = next((rows[method][0] for method in levels if method.model == "oracle"), np.zeros(0))
+        unit = -float(oracle.mean()) if len(oracle) else 1.0
+        others = {method: row for method, row in rows.items() if method not in levels and method.model not in FLOORS}
+        paired = {method: true - oracle if len(oracle) == len(true) else true for method, (true, _) in others.items()}
+        return _Costs(
+            {method: -level / unit for method, level in levels.items()},
+            {method: (-float(true.mean()) / unit, interval(paired[method])[1] / unit)
+             for method, (true, _) in others.items()},
+            {method: interval(told - true) for method, (true, told) in others.items() if told is not None},
+            bool(len(oracle)),
+        )  # fmt: skip
+
+
+def _reference_costs(ax: Axes, costs: _Costs) -> dict[Method, str]:
+    """Lines at the cost of each reference; in words those that would squeeze the methods' costs together."""
+    near = [value for value, _ in costs.points.values()]
+    near += [level for method, level in costs.lines.items() if method.model == "oracle"]
+    far = max(near) + 2 * max(np.ptp(near), 0.02 * abs(max(near))) if near else np.inf
     words = {}
-    for method, level in levels.items():
-        if -level > far:
-            words[method] = f"outside: {method.look.name} {-level:.1f}"
+    for method, level in costs.lines.items():
+        if level > far:
+            words[method] = f"{method.look.name} {level:.1f}"
         else:
-            ax.axvline(-level, **reference_look(method), zorder=1)
+            ax.axvline(level, **reference_look(method), zorder=1)
     return words
 
 
-def _points(
-    cost: Axes, gap: Axes, rows: Mapping[Method, Returns], heights: Mapping[Method, float], oracle: np.ndarray
-) -> None:
-    """Means of cost and gap with their intervals, of the cost that of its difference to the oracle's."""
-    gap.axvline(0, color="#999999", lw=0.6, zorder=1)
-    for method, y in heights.items():
-        (true, predicted), main = rows[method], method.look.colour
-        face = "white" if method.search_space == "direct" else main
-        look: Props = {"color": main, "marker": MARKERS.get(method.planner, "o"), "mfc": face, "ms": 4.2, "mew": 0.9,
-                       "elinewidth": 1.0, "capsize": 0, "ls": "", "zorder": 3}  # fmt: skip
-        paired = true - oracle if len(oracle) == len(true) else true
-        cost.errorbar(-true.mean(), y, xerr=interval(paired)[1], **look)
-        if predicted is not None:
-            mean, half = interval(predicted - true)
-            gap.errorbar(mean, y, xerr=half, **look)
-    for ax in (cost, gap):
-        for y in heights.values():
-            ax.axhline(y, color=style.GRID, lw=0.6, zorder=0)
-        style.rows_only(ax)
-        ax.margins(x=0.06)
+def _points(ax: Axes, values: Mapping[Method, tuple[float, float]], heights: Mapping[Method, float]) -> None:
+    """Means with their intervals."""
+    for method, (mean, half) in values.items():
+        face = "white" if method.search_space == "direct" else method.look.colour
+        ax.errorbar(mean, heights[method], xerr=half, color=method.look.colour, mfc=face, ms=4.2, mew=0.9, ls="",
+                    marker=MARKERS.get(method.planner, "o"), elinewidth=1.0, capsize=0, zorder=3)  # fmt: skip
+    ax.margins(x=0.06)
+
+
+def _own_points(
+    ax: Axes, values: Mapping[Method, tuple[float, float]], heights: Mapping[Method, float], shown: Collection[Method]
+) -> list[str]:
+    """The reader's own means as hollow diamonds, below ``shown`` ones; in words what lies far outside of these."""
+    means = {method: mean for method, (mean, _) in values.items()}
+    low, high = ax.get_xlim() if shown or not means else (min(means.values()), max(means.values()))
+    room = high - low or 1.0
+    near = [mean for mean in means.values() if low - room <= mean <= high + room]
+    ax.set_xlim(min([low, *(mean - 0.06 * room for mean in near)]), max([high, *(mean + 0.06 * room for mean in near)]))
+    places = {method: np.array([heights[method] + 0.34 * (method in shown)]) for method in means}
+    return [note for method in means for note in diamonds(ax, "x", places[method], np.array([means[method]]), method)]
 
 
 def _row_names(ax: Axes, heights: Mapping[Method, float]) -> None:
@@ -137,13 +183,22 @@ def _title(ax: Axes, method: Method) -> None:
 
 
 @styled
-def predicted_vs_true(results: Results) -> Figure:
+def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
     """Predicted against executed returns, one dot per target; the line to the diagonal is the gap.
 
-    results as in ``figure6``; methods without predictions are left out.
+    results and yours as in ``figure6``; methods without predictions are left out.
     """
-    checked = {task: {method: (true, told) for method, (true, told) in rows.items() if told is not None}
-               for task, rows in _returns(results).items()}  # fmt: skip
+    published, own = (
+        {task: {method: (true, told) for method, (true, told) in rows.items() if told is not None}
+         for task, rows in _returns(part).items()}
+        for part in (results, yours or {})
+    )  # fmt: skip
+    none = np.zeros(0), np.zeros(0)
+    checked = {
+        task: {method: (published.get(task, {}).get(method, none), own.get(task, {}).get(method, none))
+               for method in {**published.get(task, {}), **own.get(task, {})}}
+        for task in {**published, **own}
+    }  # fmt: skip
     checked = {task: rows for task, rows in checked.items() if rows}
     if not checked:
         raise ValueError("no method has predicted returns: nothing to compare with the executed ones")
@@ -152,73 +207,98 @@ def predicted_vs_true(results: Results) -> Figure:
     figure = plt.figure(figsize=(size * columns, 1.02 * size * sum(down) + 0.2 * len(down)))
     grid = figure.add_gridspec(sum(down), columns)
     for first, (task, rows) in zip(np.cumsum([0, *down]), checked.items(), strict=False):
-        every = np.concatenate([part for row in rows.values() for part in row])
+        every = np.concatenate([part for pair in rows.values() for row in pair for part in row])
         edge = 0.04 * np.ptp(every) + 1e-9
         limits = (every.min() - edge, every.max() + edge)
-        for i, (method, (true, predicted)) in enumerate(rows.items()):
+        for i, (method, ((true, predicted), (mine, told))) in enumerate(rows.items()):
             ax, main = figure.add_subplot(grid[first + i // columns, i % columns]), method.look.colour
             ax.plot(limits, limits, color="#999999", lw=0.7, zorder=1)
             ax.vlines(true, true, predicted, color=tint(main, 0.35), lw=0.6, zorder=2)
             ax.scatter(true, predicted, s=7, color=main, linewidths=0, zorder=3)
+            ax.plot(mine, told, **YOURS, color=DARK, zorder=4)
             _title(ax, method)
-            style.note(ax, f"mean gap {np.mean(predicted - true):+.2f}", 0.97, 0.05)
+            gaps = {"mean gap": predicted - true, "yours": told - mine}
+            words = [f"{word} {gap.mean():+.2f}" for word, gap in gaps.items() if len(gap)]
+            style.note(ax, "\n".join(words).replace("-", "−"), 0.97, 0.05)
             ax.set(xlim=limits, ylim=limits, aspect="equal",
                    xlabel="executed return" if i + columns >= len(rows) else "",
                    ylabel="" if i % columns else f"{task.capitalize()}: predicted return")  # fmt: skip
             ax.locator_params(nbins=5)
+    if any(own.values()):
+        legend(figure, yours_entry(own))
     return figure
 
 
 @styled
-def along_the_way(curves: Mapping[Method, Mapping[str, np.ndarray]]) -> Figure:
+def along_the_way(
+    curves: Mapping[Method, Mapping[str, np.ndarray]], yours: Mapping[Method, Mapping[str, np.ndarray]] | None = None
+) -> Figure:
     """Predicted and executed return along the iterations of the planner, one panel per method.
 
     curves: method -> {"iterations": (I,), "true": (I,), "predicted": (I,)}, mean returns of the plan so far, executed
-    open loop. Where the shaded gap grows, the planner exploits the model.
+    open loop. Where the shaded gap grows, the planner exploits the model. yours: as curves; hollow diamonds, those of
+    the predicted return small.
     """
-    if not curves:
+    yours = yours or {}
+    if not curves and not yours:
         raise ValueError("curves hold no method: nothing to draw")
-    figure, axes = panels(len(curves), 4, 1.45, sharey=True)
+    figure, axes = panels(len({**curves, **yours}), 4, 1.45, sharey=True)
     looks: dict[str, Props] = {"predicted": {"ls": style.DASHED, "lw": 0.9}, "true": {"marker": "o", "ms": 2.5}}
-    for i, (ax, (method, curve)) in enumerate(zip(axes, curves.items(), strict=True)):
+    for i, (ax, method) in enumerate(zip(axes, {**curves, **yours}, strict=True)):
+        _title(ax, method)
+        ax.set(xlabel="iterations", ylabel="" if i % 4 else "return (m)")
+        for word, size in (("true", 3.4), ("predicted", 2.2)) if method in yours else ():
+            own = yours[method]
+            ax.plot(own["iterations"], own[word], **{**YOURS, "ms": size}, color=method.look.colour, zorder=5)
+        if (curve := curves.get(method)) is None:
+            continue
         at = shaped(f"{method.label}: iterations", curve["iterations"], "I")
         found = {word: shaped(f"{method.label}: {word}", curve[word], str(len(at))) for word in looks}
         ax.fill_between(at, found["predicted"], found["true"], color=tint(method.look.colour, 0.25), lw=0)
         for word, look in looks.items():
             ax.plot(at, found[word], color=method.look.colour, **look)
-        _title(ax, method)
         style.note(ax, f"gap {found['predicted'][-1] - found['true'][-1]:+.2f}", 0.96, 0.06)
-        ax.set(xlabel="iterations", ylabel="" if i % 4 else "return (m)")
         ax.locator_params(nbins=4)
     words = {"predicted": "predicted return", "true": "executed return"}
-    legend(figure, [entry(words[word], color=DARK, **look) for word, look in looks.items()])
+    handles = [entry(words[word], color=DARK, **look) for word, look in looks.items()]
+    legend(figure, [*handles, *yours_entry(yours)])
     return figure
 
 
 @styled
-def final_distances(distances: Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]], tolerance: float) -> Figure:
+def final_distances(
+    distances: Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]],
+    tolerance: float,
+    yours: Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]] | None = None,
+) -> Figure:
     """Share of targets that end within a distance: solid in closed loop, dashed open loop.
 
-    distances: task -> method -> {"open" or "closed": (n,)} in m. tolerance: what counts as a success, m.
+    distances: task -> method -> {"open" or "closed": (n,)} in m. tolerance: what counts as a success, m. yours: as
+    distances; thin lines with hollow diamonds.
     """
-    if not any(distances.values()):
+    yours = yours or {}
+    distances = {task: distances.get(task, {}) for task in {**distances, **yours}}
+    if not any((*distances.values(), *yours.values())):
         raise ValueError("distances hold no task with a method: nothing to draw")
     figure, axes = panels(len(distances), len(distances), 2.5, width=3.5 * len(distances), head=0, sharey=True)
     looks: dict[str, Props] = {"open": {"ls": (0, (2, 1.2)), "lw": 0.8}, "closed": {"ls": "-", "lw": 1.3}}
     for ax, (task, rows) in zip(axes, distances.items(), strict=True):
-        for method, ways in rows.items():
-            for way, values in ways.items():
+        for mine, part in ((False, rows), (True, yours.get(task, {}))):
+            for method, way, values in ((m, way, values) for m, ways in part.items() for way, values in ways.items()):
                 if way not in looks:
                     raise ValueError(f"{task}, {method.label} has '{way}', expected open or closed")
                 end = np.sort(shaped(f"{task}, {method.label}, {way}", values, "n"))
                 share = np.arange(len(end) + 1) / len(end)
-                ax.step(1000 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **looks[way])
+                own = {**YOURS, "lw": 0.6, "markevery": (1, max(1, len(end) // 8))} if mine else {}
+                look = {**looks[way], **own, "ls": looks[way]["ls"]}
+                ax.step(1000 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **look)
         ax.axvline(1000 * tolerance, color="#999999", lw=0.6, zorder=1)
         ax.set(title=task.capitalize(), xlabel="final distance (mm)", xlim=(0, 250), ylim=(0, 102))
     axes[0].set_ylabel("targets reached (%)")
-    drawn = dict.fromkeys(method for rows in distances.values() for method in rows)
+    drawn = dict.fromkeys(method for part in (distances, yours) for rows in part.values() for method in rows)
     handles = [entry(method.label, color=method.look.colour) for method in drawn]
     handles += [entry(f"{way} loop", color=DARK, **looks[way]) for way in looks]
+    handles += yours_entry(*yours.values())
     legend(figure, handles, columns=2 * len(distances))
     return figure
 

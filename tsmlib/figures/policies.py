@@ -28,8 +28,9 @@ PREDICTED: Props = {"ls": DASHED, "lw": 0.7}
 
 @styled
 def figure7(
-    curves: LearningCurves, references: References | None = None, against: Sequence[str] = tuple(AXES)
-) -> Figure:
+    curves: LearningCurves, references: References | None = None, against: Sequence[str] = tuple(AXES),
+    yours: LearningCurves | None = None,
+) -> Figure:  # fmt: skip
     """Learning curves of policies (paper, figure 7): a column for each task, a row for each quantity of ``against``.
 
     curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets, and of
@@ -39,44 +40,60 @@ def figure7(
 
     Lines are means, bands their 95 % t intervals over the k. Against iterations, dashes show the predicted return. A
     policy whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of
-    it. Seconds are on a logarithmic axis from 1 s.
+    it; such points stand side by side. Seconds are on a logarithmic axis from 1 s. The range of returns is that of the
+    ends and what lies near them; where curves begin, and references outside, stand in words below. yours: as curves,
+    drawn over them as hollow diamonds.
     """
-    return _draw(curves, references or {}, against)
+    return _draw(curves, references or {}, against, yours=yours)
 
 
 @styled
-def figure8(curves: LearningCurves, references: Mapping[Method, float] | None = None) -> Figure:
+def figure8(
+    curves: LearningCurves, references: Mapping[Method, float] | None = None, yours: LearningCurves | None = None
+) -> Figure:
     """Learning curves of policies with noise and with delay beside the clean arm (paper, figure 8), one scale for all.
 
     curves: condition -> method -> {"return_true": (k, R), "iterations": (R,)}; references: zero or random torques ->
-    return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals.
+    return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals. yours: as curves, drawn over
+    them as hollow diamonds.
     """
-    return _draw(curves, dict.fromkeys(curves, references or {}), ("iterations",), sharey=True)
+    every = dict.fromkeys({**curves, **(yours or {})}, references or {})
+    return _draw(curves, every, ("iterations",), sharey=True, yours=yours)
 
 
-def _draw(curves: LearningCurves, references: References, against: Sequence[str], sharey: bool = False) -> Figure:
-    """``figure7``; sharey: one scale of returns for all columns."""
+def _draw(
+    curves: LearningCurves, references: References, against: Sequence[str], sharey: bool = False,
+    yours: LearningCurves | None = None,
+) -> Figure:  # fmt: skip
+    """``figure7``; sharey: one scale of returns for all columns, from doing nothing on."""
     known("against", against, list(AXES))
-    known("references", references, list(curves))
-    checked = {task: {method: _checked(f"{task}, {method.label}", given) for method, given in rows.items()}
-               for task, rows in curves.items()}  # fmt: skip
-    look_of = {method: _look(method, look) for method, look in axes.looks(checked).items()}
+    known("references", references, [*curves, *(yours or {})])
+    checked, own = (
+        {task: {method: _checked(f"{task}, {method.label}", given) for method, given in rows.items()}
+         for task, rows in part.items()} for part in (curves, yours or {})
+    )  # fmt: skip
+    checked = {task: checked.get(task, {}) for task in {**checked, **own}}
+    look_of = {method: _look(method, look) for method, look in axes.looks(checked, own).items()}
     levels = {task: axes.references(references.get(task, {})) for task in checked}
     size = (WIDTH if len(checked) > 1 else 3.8, 1.75 * len(against) + 0.1)
     figure, grid = plt.subplots(
         len(against), len(checked), figsize=size, squeeze=False, sharey=True if sharey else "col"
     )
     for column, (task, rows) in zip(grid.T, checked.items(), strict=True):
-        column[0].set_ylim(_limits(checked if sharey else {task: rows}, levels, floored=sharey))
+        mine = own.get(task, {})
+        shown = {name: part or own.get(name, {}) for name, part in (checked if sharey else {task: rows}).items()}
+        column[0].set_ylim(_limits(shown, levels, floored=sharey))
         column[0].set_title(task.capitalize())
         for ax, word in zip(column, against, strict=True):
             for method, level in levels[task].items():
                 ax.axhline(level, **axes.reference_look(method), zorder=1)
-            drawn = {method: rows[method] for method in look_of if word in rows.get(method, {})}
-            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.5)
+            drawn, over = ({method: part[method] for method in look_of if word in part.get(method, {})}
+                           for part in (rows, mine))  # fmt: skip
+            below = [] if sharey else _below(ax, levels[task], [*drawn.values(), *over.values()], word)
+            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.5, over, below)
     for row in grid:
         row[0].set_ylabel("executed return")
-    every = [row for rows in checked.values() for row in rows.values()]
+    every = [row for part in (checked, own) for rows in part.values() for row in rows.values()]
     used = dict.fromkeys(method for own in levels.values() for method in own)
     handles = axes.entries(look_of)
     handles += [entry(method.look.name, **axes.reference_look(method)) for method in used]
@@ -84,35 +101,65 @@ def _draw(curves: LearningCurves, references: References, against: Sequence[str]
         handles.append(entry("predicted return", color="#777777", **PREDICTED))
     if any(len(row["return_true"]) > 1 for row in every):
         handles.append(entry("95 % interval", color="#DDDDDD", lw=5, solid_capstyle="butt"))
+    handles += axes.yours_entry(*own.values())
     return axes.finish(figure, grid, handles, 4 if len(checked) > 1 else 2)
 
 
 def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, floored: bool) -> tuple[float, float]:
-    """The range of returns of some tasks; floored: what falls far below doing nothing may lie outside."""
-    bands = [axes.band(row["return_true"]) for rows in checked.values() for row in rows.values()]
-    means = np.concatenate([mean for mean, _ in bands])
-    ends = means if floored else np.concatenate([mean + sign * half for mean, half in bands for sign in (-1, 1)])
+    """The range of returns of some tasks: of the ends of curves, and somewhat more than as far again below them.
+
+    floored: of everything, but what falls far below doing nothing may lie outside.
+    """
+    means = [axes.band(row["return_true"])[0] for rows in checked.values() for row in rows.values()]
     floors = [level for task in checked for level in levels[task].values()]
-    low, high = axes.limits(means, ends, also=floors)
-    return max(low, min(floors) - 0.35 * (high - min(floors))) if floored and floors else low, high
+    if not floored:
+        ends = np.array([*(mean[-1] for mean in means), *(max(own.values()) for own in levels.values() if own)])
+        low, high = axes.limits(ends, ends)
+        return low - 1.2 * (high - low), high + 0.1 * (high - low)
+    every = np.concatenate(means)
+    low, high = axes.limits(every, every, also=floors)
+    return max(low, min(floors) - 0.35 * (high - min(floors))) if floors else low, high
 
 
-def _panel(ax: Axes, word: str, drawn: Mapping[Method, Curves], look_of: Mapping[Method, Props], inches: float) -> None:
-    """Curves against one quantity, a key of AXES."""
-    far, notes = _scale(ax, word, [row[word] for row in drawn.values()]), []
+def _below(ax: Axes, levels: Mapping[Method, float], drawn: Sequence[Curves], word: str) -> list[str]:
+    """In words, where curves begin that come from below the axis, and the references there."""
+    low = ax.get_ylim()[0]
+    first = [float(row["return_true"][:, 0].mean()) for row in drawn if word != "samples" or np.ptp(row[word])]
+    begin = [axes.spell(value) for value in (min(first, default=low), max((v for v in first if v < low), default=low))]
+    words = [f"curves begin at {' to '.join(dict.fromkeys(begin))}"] * any(value < low for value in first)
+    words += [f"{method.look.name} {axes.spell(level)}" for method, level in levels.items() if level < low]
+    return [", ".join(words)] if words else []
+
+
+def _panel(
+    ax: Axes, word: str, drawn: Mapping[Method, Curves], look_of: Mapping[Method, Props], inches: float,
+    over: Mapping[Method, Curves], below: Sequence[str],
+) -> None:  # fmt: skip
+    """Curves against one quantity, a key of AXES; ``over`` them diamonds. below: what is already said to lie there."""
+    far, notes = _scale(ax, word, [row[word] for row in (*drawn.values(), *over.values())]), list(below)
+    points = [method for method, row in drawn.items() if word == "samples" and np.ptp(row[word]) == 0]
     for i, (method, row) in enumerate(drawn.items()):
         look, at, (mean, half) = look_of[method], row[word], axes.band(row["return_true"])
         if word == "seconds":
             at, mean, half = (part[at >= 1] for part in (at, mean, half))
-        if word == "samples" and np.ptp(at) == 0:
-            at, mean, half = at[-1:], mean[-1:], half[-1:]
+        if method in points:
+            at, mean, half = at[-1:] + 0.022 * far * points.index(method), mean[-1:], half[-1:]
             ax.plot([at[0], far], [mean[0]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
-            ax.errorbar(at, mean, half, elinewidth=0.9, **{**look, "ls": ""}, zorder=4)
+            ax.vlines(at, mean - half, mean + half, color=look["color"], lw=0.7, alpha=0.5, zorder=3)
+            ax.plot(at, mean, **{**look, "ls": ""}, zorder=4)
         else:
             axes.curve(ax, at, mean, half, look, shift=i / len(drawn))
         if word == "iterations" and "return_predicted" in row:
             ax.plot(at, row["return_predicted"].mean(0), color=look["color"], **PREDICTED, zorder=2.5)
-        notes += axes.outside(ax, at, mean, method)
+        notes += axes.outside(ax, at[-1:], mean[-1:], method) if below else axes.outside(ax, at, mean, method)
+    for method, row in over.items():
+        at, mean = row[word], row["return_true"].mean(0)
+        some = np.unique(np.linspace(0, len(at) - 1, 6).astype(int))
+        if below:  # where curves begin is said
+            some = some[mean[some] >= ax.get_ylim()[0]] if (mean[some] >= ax.get_ylim()[0]).any() else some[-1:]
+        if word == "samples" and np.ptp(at) == 0:
+            some = some[-1:]
+        notes += axes.diamonds(ax, "y", at[some], mean[some], method)
     ax.grid(axis="y", color=GRID, lw=0.6)
     axes.foot(ax, AXES[word], notes, inches)
 
@@ -146,7 +193,9 @@ def _scale(ax: Axes, word: str, at: Sequence[np.ndarray]) -> float:
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if far < 100 * near else (1.0,)))
         ax.xaxis.set_minor_locator(NullLocator())
     else:
-        ax.set_xlim(-0.015 * far, 1.02 * far)
+        ax.set_xlim(-0.015 * far, 1.06 * far)
         ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    thousands = word == "samples" and far >= 10_000
+    unit, suffix = (1000, "k") if thousands else (1, "")
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / unit:,g}{suffix if value else ''}"))
     return far

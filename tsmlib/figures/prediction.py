@@ -22,21 +22,29 @@ BAND = {"color": "#DDDDDD", "lw": 5, "solid_capstyle": "butt"}
 
 
 @styled
-def figure5(values: Mapping[str, Panels], ylabel: str | Mapping[str, str] = "log-likelihood per step") -> Figure:
+def figure5(
+    values: Mapping[str, Panels],
+    ylabel: str | Mapping[str, str] = "log-likelihood per step",
+    yours: Mapping[str, Panels] | None = None,
+) -> Figure:
     """Prediction quality by environment (paper, figure 5): mean over seeds, 95 % t interval, each seed a small dot.
 
-    values: title -> environment -> method -> (k,), one value per seed; ylabel: one for all, or title -> text.
+    values: title -> environment -> method -> (k,), one value per seed; ylabel: one for all, or title -> text; yours: as
+    values, drawn over them as hollow diamonds at their means.
     """
+    own = {title: finite_panels(panel, "k") for title, panel in (yours or {}).items()}
     checked = {title: finite_panels(panel, "k") for title, panel in values.items()}
-    look_of = axes.looks(*checked.values())
+    look_of = axes.looks(*checked.values(), *own.values())
     ylabels = per_panel("ylabel", ylabel, checked)
     slots, group = {method: i for i, method in enumerate(look_of)}, len(look_of) + 1.6
     width = WIDTH if len(checked) > 1 else 0.72 * WIDTH
     figure, grid = panels(len(checked), len(checked), 2.25, width=width, head=0)
     several = False
     for ax, (title, panel) in zip(grid, checked.items(), strict=True):
-        every = [seeds for rows in panel.values() for seeds in rows.values()]
-        several |= any(len(seeds) > 1 for seeds in every)
+        mine = own.get(title, {})
+        panel = {env: panel.get(env, {}) for env in {**panel, **mine}}
+        every = [seeds for env, rows in panel.items() for seeds in {**mine.get(env, {}), **rows}.values()]
+        several |= any(len(seeds) > 1 for rows in panel.values() for seeds in rows.values())
         ax.set_ylim(axes.limits(np.concatenate(every), axes.ends(every)))
         ax.set_xlim(-1.3, len(panel) * group - 1.3)
         notes = []
@@ -44,6 +52,9 @@ def figure5(values: Mapping[str, Panels], ylabel: str | Mapping[str, str] = "log
             for method, seeds in rows.items():
                 far = axes.mark(ax, "y", e * group + slots[method], seeds, look_of[method], aside=0.32)
                 notes += [f"{env}, {method.label} {text}" for text in far]
+            for method, seeds in mine.get(env, {}).items():
+                place, mean = np.array([e * group + slots[method]]), np.array([seeds.mean()])
+                notes += [f"{env}, {text}" for text in axes.diamonds(ax, "y", place, mean, method)]
             if e:
                 ax.axvline(e * group - 1.3, color="#CCCCCC", lw=0.6, zorder=1)
         ax.grid(axis="y", color=GRID, lw=0.6)
@@ -54,57 +65,60 @@ def figure5(values: Mapping[str, Panels], ylabel: str | Mapping[str, str] = "log
     handles = axes.entries(look_of, ls="", ms=4.2)
     if several:
         handles.append(entry("one seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
+    handles += axes.yours_entry(*own.values())
     return axes.finish(figure, [grid], handles, 5 if len(checked) > 1 else 3)
 
 
 @styled
 def against_horizon(
     curves: Panels, ylabel: str | Mapping[str, str], *, log: Collection[str] = (),
-    reference: Mapping[str, float] | None = None, columns: int = 3,
+    reference: Mapping[str, float] | None = None, columns: int = 3, yours: Panels | None = None,
 ) -> Figure:  # fmt: skip
     """Scores at every step ahead, one panel each: mean over seeds, and a band for its 95 % t interval.
 
     curves: title -> method -> (k, T); ylabel: one for all, or title -> text; log: the titles with a logarithmic axis;
-    reference: title -> a value to draw a dashed line at, such as the nominal coverage.
-    A band may run out of its panel; of a curve that does, the furthest value stands below.
+    reference: title -> a value to draw a dashed line at, such as the nominal coverage; yours: as curves, drawn over
+    them as hollow diamonds. The axis is that of the medians over seeds: one seed that goes astray does not squeeze the
+    others. A band may run out of its panel; of a curve that does, the furthest value stands below.
     """
-    reference = reference or {}
+    reference, own = reference or {}, finite_panels(yours or {}, "k T")
     checked = finite_panels(curves, "k T")
     known("log", log, curves)
     known("reference", reference, curves)
-    look_of, ylabels, titles = axes.looks(curves), per_panel("ylabel", ylabel, curves), list(curves)
+    look_of, ylabels, titles = axes.looks(curves, own), per_panel("ylabel", ylabel, curves), list(curves)
     columns = min(columns, len(titles))
     width = WIDTH if columns > 2 else 3.5 * columns
     figure, grid = panels(len(titles), columns, 1.55, width=width, head=0.1)
     banded = False
     for i, (title, ax) in enumerate(zip(titles, grid, strict=True)):
-        lines = {method: axes.band(rows) for method, rows in checked[title].items()}
-        _scale(ax, title, list(lines.values()), reference.get(title), title in log)
+        lines, mine = {method: axes.band(rows) for method, rows in checked[title].items()}, own.get(title, {})
+        every = {**mine, **checked[title]}.values()
+        medians, means = (np.concatenate([of(rows, 0) for rows in every]) for of in (np.median, np.mean))
+        _scale(ax, title, medians, means, reference.get(title), title in log)
         notes = []
         for j, (method, (mean, half)) in enumerate(lines.items()):
             steps = np.arange(1, len(mean) + 1)
             axes.curve(ax, steps, mean, half, look_of[method], shift=j / len(lines))
             notes += axes.outside(ax, steps, mean, method)
             banded |= bool(half.any())
-        ax.set_xlim(0, max(mean.size for mean, _ in lines.values()) + 1)
+        for method, rows in mine.items():
+            some = np.linspace(0, rows.shape[1] - 1, 5).astype(int)
+            notes += axes.diamonds(ax, "y", some + 1, rows.mean(0)[some], method)
+        ax.set_xlim(0, max(rows.shape[1] for part in (checked[title], mine) for rows in part.values()) + 1)
         alike = i % columns and ylabels[title] == ylabels[titles[i - 1]]
         ax.set(title=axes.wrapped(title, width / columns - 0.2), ylabel="" if alike else ylabels[title])
         axes.foot(ax, "steps ahead" if i + columns >= len(titles) else "", notes, width / columns - 0.4)
     handles = [*axes.entries(look_of), *([entry("95 % interval over seeds", **BAND)] if banded else [])]
-    rows = [grid[i : i + columns] for i in range(0, len(grid), columns)]
-    return axes.finish(figure, rows, handles, 5 if width == WIDTH else 2)
+    handles += axes.yours_entry(*own.values())
+    down = [grid[i : i + columns] for i in range(0, len(grid), columns)]
+    return axes.finish(figure, down, handles, 5 if width == WIDTH else 2)
 
 
-def _scale(
-    ax: axes.Axes, title: str, lines: Collection[tuple[np.ndarray, np.ndarray]], level: float | None, log: bool
-) -> None:
-    """The y axis for lines, each a mean and half its interval (T,), and a dashed reference."""
-    points = np.concatenate([mean for mean, _ in lines])
+def _scale(ax: axes.Axes, title: str, points: np.ndarray, near: np.ndarray, level: float | None, log: bool) -> None:
+    """The y axis for points of lines, for others where they are near, and a dashed reference."""
     if log and points.min() <= 0:
         raise ValueError(f"{title}: {axes.spell(points.min())} cannot stand on a logarithmic axis")
-    bands = np.concatenate([mean + sign * half for mean, half in lines for sign in (-1, 1)])
-    bands = np.maximum(bands, 0) if points.min() >= 0 else bands  # no room for what an error cannot be
-    low, high = axes.limits(points, bands, [] if level is None else [level], log)
+    low, high = axes.limits(points, near, [] if level is None else [level], log)
     ax.locator_params(nbins=6)
     if log:
         axes.log_axis(ax, low, high)
@@ -114,15 +128,17 @@ def _scale(
 
 
 @styled
-def calibration(levels: np.ndarray, curves: Panels, columns: int = 3) -> Figure:
+def calibration(levels: np.ndarray, curves: Panels, columns: int = 3, yours: Panels | None = None) -> Figure:
     """Observed against nominal coverage of a model's central intervals; ideal is the diagonal.
 
-    levels: (L,) nominal coverages in [0, 1]; curves: title -> method -> (L,) observed shares in [0, 1].
+    levels: (L,) nominal coverages in [0, 1]; curves: title -> method -> (L,) observed shares in [0, 1]; yours: as
+    curves, drawn over them as hollow diamonds.
     """
     nominal = finite("levels", levels, "L")
-    checked = finite_panels(curves, str(len(nominal)))
-    look_of = axes.looks(curves)
-    shares = {f"{title}, {method.label}": row for title, rows in checked.items() for method, row in rows.items()}
+    checked, own = (finite_panels(given, str(len(nominal))) for given in (curves, yours or {}))
+    look_of = axes.looks(curves, own)
+    shares = {f"{title}, {method.label}": row for part in (checked, own) for title, rows in part.items()
+              for method, row in rows.items()}  # fmt: skip
     for word, array in {"levels": nominal, **shares}.items():
         if array.min() < 0 or array.max() > 1:
             raise ValueError(f"{word}: {array.min():g} to {array.max():g}, expected shares between 0 and 1")
@@ -134,6 +150,9 @@ def calibration(levels: np.ndarray, curves: Panels, columns: int = 3) -> Figure:
         ax.plot((0, 1), (0, 1), color="#999999", lw=0.7, zorder=1)
         for method, row in rows.items():
             ax.plot(nominal, row, **look_of[method], zorder=3, clip_on=False, markevery=max(1, len(nominal) // 8))
+        some = np.linspace(0, len(nominal) - 1, 7).astype(int)[1:-1]
+        for method, row in own.get(title, {}).items():
+            axes.diamonds(ax, "y", nominal[some], row[some], method)
         note(ax, "intervals too wide", 0.03, 0.97)
         note(ax, "too narrow", 0.97, 0.03)
         for axis in (ax.xaxis, ax.yaxis):
@@ -142,27 +161,32 @@ def calibration(levels: np.ndarray, curves: Panels, columns: int = 3) -> Figure:
         ax.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", title=title, xlabel="nominal coverage" if last else "",
                ylabel="" if i % columns else "observed coverage")  # fmt: skip
         ax.tick_params(labelbottom=last)
-    return axes.finish(figure, [grid], axes.entries(look_of), (1, 3, 5, 5)[min(columns, 4) - 1])
+    handles = [*axes.entries(look_of), *axes.yours_entry(*own.values())]
+    return axes.finish(figure, [grid], handles, (1, 3, 5, 5)[min(columns, 4) - 1])
 
 
 @styled
 def differences(
-    values: Panels, xlabel: str | Mapping[str, str], subject: Method, *, lower_is_better: Collection[str] = ()
-) -> Figure:
+    values: Panels, xlabel: str | Mapping[str, str], subject: Method, *, lower_is_better: Collection[str] = (),
+    yours: Panels | None = None,
+) -> Figure:  # fmt: skip
     """``subject`` minus each other method, paired by seed, with 95 % t intervals and a line at zero (a forest plot).
 
     values: title -> the other method -> (k,) differences; xlabel: one for all, or title -> text;
     lower_is_better: the titles in which a negative difference favours ``subject``. A mark is filled and its row tinted
     where the interval excludes zero; it is open where it does not, and for a single seed, which has no interval.
+    yours: as values, drawn below them as hollow diamonds at their means.
     """
-    checked = finite_panels(values, "k")
+    checked, own = finite_panels(values, "k"), finite_panels(yours or {}, "k")
     known("lower_is_better", lower_is_better, values)
-    look_of, xlabels, count = axes.looks(values), per_panel("xlabel", xlabel, values), len(values)
+    look_of, xlabels, count = axes.looks(values, own), per_panel("xlabel", xlabel, values), len(values)
     heights = {method: y for y, method in enumerate(look_of)}
     width = WIDTH if count > 1 else 4.5
     figure, grid = panels(count, count, 0.21 * len(look_of) + 0.85, width=width, head=0, sharey=True)
     for ax, (title, rows) in zip(grid, checked.items(), strict=True):
-        ax.set_xlim(axes.limits(np.concatenate(list(rows.values())), axes.ends(rows.values()), also=[0.0]))
+        mine = own.get(title, {})
+        every = [*rows.values()] or [seeds.mean(keepdims=True) for seeds in mine.values()]
+        ax.set_xlim(axes.limits(np.concatenate(every), axes.ends(every), also=[0.0]))
         ax.locator_params(axis="x", nbins=5)
         notes = []
         for method, seeds in rows.items():
@@ -172,6 +196,9 @@ def differences(
             else:
                 look = {**look, "mfc": "white"}
             notes += [f"{method.label} {text}" for text in axes.mark(ax, "x", y, seeds, look, aside=0.27)]
+        for method, seeds in mine.items():
+            at, own_mean = np.array([heights[method] - 0.25 * (method in rows)]), np.array([seeds.mean()])
+            notes += axes.diamonds(ax, "x", at, own_mean, method)
         ax.axvline(0, color="#555555", lw=0.8, zorder=1)
         words = ("better", "worse") if title in lower_is_better else ("worse", "better")
         above(ax, f"← {words[0]}", 0)
@@ -184,4 +211,4 @@ def differences(
     grid[0].annotate(f"{subject.label} minus", (0, 1), (-5, 1), xycoords="axes fraction", textcoords="offset points",
                      fontsize=7, ha="right", va="bottom", weight="bold", color=subject.look.colour)  # fmt: skip
     grid[0].set_ylim(len(look_of) - 0.5, -0.5)
-    return axes.finish(figure, [grid])
+    return axes.finish(figure, [grid], axes.yours_entry(*own.values()))

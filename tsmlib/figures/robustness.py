@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from tsmlib.figures import axes
-from tsmlib.figures.checks import Panels, finite, finite_panels, shaped
+from tsmlib.figures.checks import Panels, finite, finite_panels
 from tsmlib.figures.method import Method
 from tsmlib.figures.style import BLUE, DARK, ORANGE, PALE, WIDTH, Props, entry, legend, panels, styled, tint
 
@@ -46,17 +47,20 @@ def imperfect_episode(
 
 
 @styled
-def filtering_errors(ahead: Panels, now: Mapping[str, Mapping[Method, float]], raw: Mapping[str, float]) -> Figure:
+def filtering_errors(
+    ahead: Panels, now: Mapping[str, Mapping[Method, float]], raw: Mapping[str, float], yours: Panels | None = None
+) -> Figure:
     """Errors to the clean state after a noisy past, against the raw observation's.
 
     ahead: panel -> method -> (k, K), the error of each seed 1 .. K steps ahead; now: panel -> filter -> the error of
-    its estimate of the present state, at 0 steps; raw: panel -> the raw observation's. One scale for all panels; what
-    leaves it has an arrow, and its value stands in words below.
+    its estimate of the present state, at 0 steps; raw: panel -> the raw observation's; yours: as ahead, drawn over them
+    as hollow diamonds. One scale for all panels; what leaves it has an arrow, and its value stands in words below.
     """
     for word, given in (("now", now), ("raw", raw)):
         if set(given) != set(ahead):
             raise ValueError(f"{word} has the panels {', '.join(given)}; expected {', '.join(ahead)}")
-    checked, look_of = finite_panels(ahead, "k K"), axes.looks(ahead)
+    checked, own = finite_panels(ahead, "k K"), finite_panels(yours or {}, "k K")
+    look_of = axes.looks(ahead, own)
     means = np.concatenate([row.mean(0) for rows in checked.values() for row in rows.values()])
     figure, grid = panels(len(ahead), len(ahead), 2.1, head=0, sharey=True)
     grid[0].set_ylim(0, max(1.25 * max(raw.values()), 1.05 * float(np.quantile(means, 0.9))))
@@ -73,42 +77,53 @@ def filtering_errors(ahead: Panels, now: Mapping[str, Mapping[Method, float]], r
                 at, mean, half = np.append(0, at), np.append(now[title][method], mean), np.append(0, half)
             axes.curve(ax, at, mean, half, look_of[method])
             notes += axes.outside(ax, at, mean, method)
+        for method, row in own.get(title, {}).items():
+            some = np.arange(0, row.shape[1], 3)
+            notes += axes.diamonds(ax, "y", some + 1, row.mean(0)[some], method)
         for method in points.keys() & now[title].keys():
             ax.plot(0, now[title][method], **points[method], zorder=4)
         ax.set(title=title.capitalize(), xticks=range(0, max(row.shape[1] for row in rows.values()) + 1, 2))
         axes.foot(ax, "steps ahead", notes, WIDTH / len(ahead) - 0.2)
     grid[0].set_ylabel("error to the clean state\n(half ranges)")
     handles = [*axes.entries(look_of), *(entry(method.label, **look) for method, look in points.items())]
-    return axes.finish(figure, [grid], [*handles, entry("raw observation", **unseen)], 4)
+    handles += [entry("raw observation", **unseen), *axes.yours_entry(*own.values())]
+    return axes.finish(figure, [grid], handles, 4)
 
 
 @styled
 def advantage_map(
-    differences: Mapping[str, np.ndarray], *, noise: Sequence[float], delay: Sequence[int], unit: str
+    differences: Mapping[str, Mapping[Method, float]],
+    *,
+    unit: str,
+    yours: Mapping[str, Mapping[Method, float]] | None = None,
 ) -> Figure:
-    """Advantage of a model over a grid of noise and delay, one panel per place and rival.
+    """Advantage of a model over its rivals where something is hidden and where nothing is: a line each.
 
-    differences: panel -> (noise, delay), NaN where there is none, which is hatched; above zero the model is ahead.
+    differences: place -> rival -> how far the model is ahead, in ``unit``; above zero it is. yours: the same, in
+    brackets. Places without numbers are left out by whoever gives them.
     """
-    if not differences:
-        raise ValueError("differences holds no panel: nothing to draw")
-    shape = f"{len(noise)} {len(delay)}"
-    grids = {title: shaped(f"{title} (noise by delay)", values, shape) for title, values in differences.items()}
-    every = np.abs(np.concatenate([values.ravel() for values in grids.values()]))
-    far = float(np.nanmax(every, initial=0)) or 1.0
-    figure, grid = panels(len(grids), len(grids), 2.2, head=0, sharey=True)
-    for ax, (title, values) in zip(grid, grids.items(), strict=True):
-        image = ax.imshow(values, cmap="PuOr", norm=TwoSlopeNorm(0.0, -far, far), origin="lower", aspect="auto")
-        for (row, column), value in np.ndenumerate(values):
-            text = "" if np.isnan(value) else f"{value:+.1f}".replace("-", "\u2212")
-            ax.text(column, row, text, ha="center", va="center", fontsize=8,
-                    color="white" if abs(value) > 0.6 * far else "black")  # fmt: skip
-        ax.set(title=title.replace(": ", ":\n"), xlabel="delay (steps)")
-        ax.set_xticks(range(len(delay)), [f"{value}" for value in delay])
-        ax.set_yticks(range(len(noise)), [f"{value:g}" for value in noise])
-        ax.patch.set(hatch="////", edgecolor="#C8C8C8")
-        ax.spines[:].set_visible(False)
-        ax.tick_params(length=0)
-    grid[0].set_ylabel("noise (half ranges)")
-    figure.colorbar(image, ax=grid, label=unit, shrink=0.9)
+    yours = yours or {}
+    places = list(dict.fromkeys([*differences, *yours]))
+    rivals = list(dict.fromkeys(m for part in (differences, yours) for row in part.values() for m in row))
+    if not rivals:
+        raise ValueError("differences holds no place with a rival: nothing to draw")
+    values, mine = (
+        np.array([[part.get(place, {}).get(rival, np.nan) for rival in rivals] for place in places])
+        for part in (differences, yours)
+    )
+    shade = np.where(np.isnan(values), mine, values)
+    far = float(np.nanmax(np.abs(shade), initial=0)) or 1.0
+    figure, ax = plt.subplots(figsize=(1.1 * len(rivals) + 2.4, 0.27 * len(places) + 0.55))
+    image = ax.imshow(shade, cmap="PuOr", norm=TwoSlopeNorm(0.0, -far, far), aspect="auto")
+    for at, value in np.ndenumerate(values):
+        texts = [form.format(each) for form, each in (("{:+.1f}", value), ("({:+.1f})", mine[at])) if each == each]
+        ax.text(at[1], at[0], " ".join(texts).replace("-", "\u2212"), ha="center", va="center", fontsize=7.5,
+                color="white" if abs(shade[at]) > 0.6 * far else "black")  # fmt: skip
+    ax.set_xticks(range(len(rivals)), [f"against {rival.label}" for rival in rivals])
+    ax.set_yticks(range(len(places)), places)
+    ax.xaxis.tick_top()
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0, labelsize=7)
+    ax.set_xlabel("in brackets: yours" if yours else "")
+    figure.colorbar(image, ax=ax, label=f"ahead by ({unit})", shrink=0.9)
     return figure

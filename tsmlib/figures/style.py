@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from functools import wraps
 from io import BytesIO
@@ -89,6 +90,17 @@ def entry(label: str, **look: Any) -> Line2D:
 def legend(figure: Figure, handles: Sequence[Line2D], columns: int = 8) -> None:
     """A legend above all panels, where it covers nothing."""
     figure.legend(handles=handles, loc="outside upper left", ncols=min(columns, len(handles)))
+
+
+def stamp(figure: Figure, text: str) -> Figure:
+    """The figure with a line below everything that says where its numbers are from."""
+    lines = textwrap.wrap(text, int(figure.get_figwidth() / 0.056))
+    with plt.style.context(STYLE):
+        if lines:
+            figure.set_figheight(figure.get_figheight() + 0.12 * len(lines) + 0.06)
+            told = entry("\n".join(lines), ls="")
+            figure.legend(handles=[told], loc="outside lower left", handlelength=0, handletextpad=0, labelcolor=NOTE)
+    return figure
 
 
 def joint_legend(figure: Figure, main: str = DARK) -> None:

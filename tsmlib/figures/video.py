@@ -1,9 +1,14 @@
-"""Films of an arm: several of them side by side and one above another, an mp4 file, and that file inside a notebook."""
+"""Films of an arm: side by side and one above another, as files, and as pictures that move inside a notebook.
+
+A notebook's film is an animated PNG. JupyterLab removes the source of a ``<video>`` from a notebook that it does not
+trust, as from any that was executed elsewhere, and GitHub shows none; both show a picture.
+"""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +19,10 @@ from matplotlib.figure import Figure
 from tsmlib.storage.files import write_bytes
 
 if TYPE_CHECKING:
-    from IPython.display import Video
+    from IPython.display import Image
+
+
+ANIMATED = {".png": "PNG", ".gif": "GIF", ".webp": "WEBP"}
 
 
 def _frames(field: str, frames: np.ndarray) -> np.ndarray:
@@ -60,13 +68,19 @@ def _waiting(film: np.ndarray, length: int) -> np.ndarray:
 
 
 def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
-    """Write ``frames`` (T, H, W, 3) uint8 as an mp4 that browsers play; odd sizes get one repeated row or column."""
+    """Write ``frames`` (T, H, W, 3) uint8 to ``path``: .mp4, or a picture that moves, .png, .gif or .webp.
+
+    An mp4's odd sizes get one repeated row or column, since browsers play only even ones.
+    """
+    frames, path = _frames("frames", frames), Path(path)
+    if path.suffix in ANIMATED:
+        write_bytes(path, animation(frames, fps, form=ANIMATED[path.suffix]))
+        return path
+    if path.suffix != ".mp4":
+        raise ValueError(f"video file {path} must end in .mp4, {', '.join(ANIMATED)}")
     import imageio.v2 as imageio  # an mp4 is no figure: only who writes one needs it
     from imageio_ffmpeg import count_frames_and_secs
 
-    frames, path = _frames("frames", frames), Path(path)
-    if path.suffix != ".mp4":
-        raise ValueError(f"video file {path} must end in .mp4")
     even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")
     options = ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart"]  # one thread: the same bytes again
     with tempfile.TemporaryDirectory() as folder:
@@ -83,10 +97,39 @@ def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
     return path
 
 
-def embed(path: str | Path) -> Video:
-    """The film at ``path`` for the end of a notebook cell, its data inside the notebook."""
-    from IPython.display import Video
+def animation(frames: np.ndarray, fps: int = 25, *, form: str = "PNG", width: int = 960, colours: int = 96) -> bytes:
+    """``frames`` (T, H, W, 3) uint8 as a picture that moves, again and again.
 
-    if not Path(path).is_file():
+    form: PNG, GIF or WEBP. width: wider frames are made smaller, in pixels. colours: of a PNG or GIF, all frames alike,
+    which makes them as small as a film is; a WEBP has any.
+    """
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in _frames("frames", frames)]
+    if (across := pictures[0].width) > width:
+        size = width, round(pictures[0].height * width / across)
+        pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
+    options: dict[str, int] = {"quality": 70} if form == "WEBP" else {}
+    if form != "WEBP":
+        some = np.concatenate([np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 8)]])
+        palette = Image.fromarray(some).quantize(colours, dither=Image.Dither.NONE)
+        pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    written = BytesIO()
+    pictures[0].save(written, form, save_all=True, append_images=pictures[1:], duration=1000 / fps, loop=0, **options)
+    return written.getvalue()
+
+
+def embed(film: str | Path | np.ndarray, fps: int = 25) -> Image:
+    """A film for the end of a notebook cell, as a picture that moves: frames (T, H, W, 3), or an mp4 file."""
+    from IPython.display import Image
+
+    return Image(data=animation(film if isinstance(film, np.ndarray) else _read(Path(film)), fps), format="png")
+
+
+def _read(path: Path) -> np.ndarray:
+    """The frames of an mp4 file."""
+    import imageio.v2 as imageio
+
+    if not path.is_file():
         raise FileNotFoundError(f"no film at {path}; write it with figures.save_video(frames, path) first")
-    return Video(str(path), embed=True, html_attributes="controls loop muted playsinline")
+    return np.stack(imageio.mimread(path, memtest=False))

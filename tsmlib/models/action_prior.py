@@ -9,15 +9,17 @@ Planning over its codes explores only actions like those the dynamics model was 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Self, cast
 
 import torch
 from torch import Tensor
 
-from tsmlib.models.config import Configured
+from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
 from tsmlib.sampling import Noise
-from tsmlib.trajectory import Window
+from tsmlib.storage.files import Json
+from tsmlib.trajectory import Trajectories, Window
 
 
 class ActionPrior(Configured):
@@ -45,6 +47,18 @@ class ActionPrior(Configured):
         self.encoder = Encoder(action_dim, segment_len, latent_dim)
         self.decoder = CausalDecoder(action_dim, action_dim, latent_dim, channels=channels, dilations=dilations)
         self.register_buffer("std", torch.ones(action_dim))
+
+    @classmethod
+    def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
+        """The prior of ``data`` as training starts: its scale, and weights drawn from ``seed``.
+
+        options: those of the constructor.
+        """
+        make = cast(Callable[..., Self], cls)
+        with weights_from(seed):
+            prior = make(data.actions.shape[2], **options)
+        prior.fit_scale(torch.from_numpy(data.actions))
+        return prior
 
     def fit_scale(self, actions: Tensor) -> ActionPrior:
         """Take the scale of training actions (N, T, du)."""

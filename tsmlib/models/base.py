@@ -145,7 +145,13 @@ def stepper(model: Model, past: Segment, *, generator: Noise | None = None) -> S
 
 
 def _past_len(model: Model, past: Segment) -> int:
-    """Steps of past that ``model`` reads; ValueError where there are fewer."""
+    """Steps of past that ``model`` reads; ValueError where there are fewer, or it knows no statistics of its data."""
+    features = getattr(model, "features", None)
+    if isinstance(features, Features) and not features.fitted:
+        raise ValueError(
+            f"the features of this {type(model).__name__} were never fitted, so it cannot predict: make it with "
+            f"{type(model).__name__}.for_data(trajectories), or call model.features.fit(torch.from_numpy(states))"
+        )
     needed, found = as_dynamics(model).past_len, past.states.shape[1]
     if found < needed:
         raise ValueError(

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 from tsmlib.models.base import Step, predict_segment
 from tsmlib.models.config import Configured
-from tsmlib.models.features import Features
+from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Recurrent
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class OneStep(Configured):
+class OneStep(Featured, Configured):
     """A fully connected network f(x_t, u_t): a segment model with H = 1 that reads the last state alone.
 
     state_dim, action_dim: dx, du. angles: state dimensions in radians.
@@ -27,7 +27,7 @@ class OneStep(Configured):
     segment_len, past_len, stochastic = 1, 1, False
 
     def __init__(
-        self, state_dim: int, action_dim: int, *, angles: tuple[int, ...] = (0, 1), hidden: int = 200, layers: int = 3
+        self, state_dim: int, action_dim: int, *, angles: tuple[int, ...] = (), hidden: int = 200, layers: int = 3
     ) -> None:
         super().__init__()
         self.features = Features(state_dim, tuple(angles))
@@ -62,7 +62,7 @@ class OneStep(Configured):
         return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
 
 
-class LSTM(Configured):
+class LSTM(Featured, Configured):
     """(iii) A recurrent model: its hidden state reads the true past, then runs on with the model's own predictions.
 
     hidden: size of h. past_len: steps of past that warm it up. segment_len: it keeps its hidden state for as many
@@ -76,7 +76,7 @@ class LSTM(Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         hidden: int = 160,
         past_len: int = 10,  # H
         segment_len: int = 100,  # the length of an episode

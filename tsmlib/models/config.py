@@ -2,8 +2,10 @@
 
 import functools
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
+import torch
 from torch import nn
 
 from tsmlib.storage.files import Json
@@ -34,6 +36,14 @@ class Configured(nn.Module):
 
     def config(self) -> dict[str, Json]:
         return dict(self._config)
+
+
+@contextmanager
+def weights_from(seed: int) -> Iterator[None]:
+    """First weights drawn from ``seed``: torch's layers draw theirs from the global generator, which is left alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
 
 
 def _json(value: Json | Configured) -> Json:

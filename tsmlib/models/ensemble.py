@@ -11,12 +11,12 @@ from torch.nn import functional as F
 
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
-from tsmlib.models.features import Features
+from tsmlib.models.features import Featured, Features
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class Ensemble(Configured):
+class Ensemble(Featured, Configured):
     """PETS: networks that differ in their first weights and in the order of their data, each stating a Gaussian.
 
     gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the
@@ -31,7 +31,7 @@ class Ensemble(Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         gaussian: bool = True,
         members: int = 5,
         hidden: int = 200,

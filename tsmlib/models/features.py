@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self, cast
+
 import torch
 from torch import Tensor, nn
+
+from tsmlib.models.config import weights_from
+from tsmlib.storage.files import Json
+from tsmlib.trajectory import Trajectories
 
 
 class Features(nn.Module):
@@ -24,7 +31,7 @@ class Features(nn.Module):
         self.dim = state_dim + len(angles)
         self.register_buffer("mean", torch.zeros(self.dim))
         self.register_buffer("std", torch.ones(self.dim))
-        self.register_buffer("step_std", torch.ones(state_dim))  # of x_{t+1} - x_t, physical units
+        self.register_buffer("step_std", torch.zeros(state_dim))  # of x_{t+1} - x_t, physical units; 0 until fitted
 
     def fit(self, states: Tensor) -> Features:
         """Take the statistics of training states (N, T + 1, dx)."""
@@ -34,6 +41,11 @@ class Features(nn.Module):
         self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
         self.step_std.copy_(states.diff(dim=1).flatten(0, 1).std(0))
         return self
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there are statistics: data in which nothing moves have none."""
+        return bool(self.step_std.any())
 
     @property
     def moving(self) -> Tensor:
@@ -61,6 +73,24 @@ class Features(nn.Module):
     def _raw(self, states: Tensor) -> Tensor:
         angles = states[..., _columns(self.angles)]
         return torch.cat([angles.cos(), angles.sin(), states[..., _columns(self.others)]], dim=-1)
+
+
+class Featured:
+    """A model of states, made for its training data."""
+
+    features: Features
+
+    @classmethod
+    def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
+        """The model of ``data`` as training starts: its sizes, angles and statistics, and weights drawn from ``seed``.
+
+        options: those of the constructor.
+        """
+        make = cast(Callable[..., Self], cls)
+        with weights_from(seed):
+            model = make(data.states.shape[2], data.actions.shape[2], angles=data.angles, **options)
+        model.features.fit(torch.from_numpy(data.states))
+        return model
 
 
 def _columns(index: list[int]) -> slice | list[int]:

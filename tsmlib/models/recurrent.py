@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
 from tsmlib.models.energy import distance, energy_score
-from tsmlib.models.features import Features
+from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Memory, Recurrent
 from tsmlib.sampling import Noise, standard_normal
@@ -26,7 +26,7 @@ from tsmlib.trajectory import Segment, Window
 SAMPLES = 2  # of the energy score
 
 
-class RecurrentTSM(Configured):
+class RecurrentTSM(Featured, Configured):
     """Recurrent segment model of one environment.
 
     state_dim, action_dim: dx, du. angles: state dimensions in radians. hidden: size of h and c.
@@ -44,7 +44,7 @@ class RecurrentTSM(Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         hidden: int = 160,
         latent_dim: int = 8,
         past_len: int = 10,

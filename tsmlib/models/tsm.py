@@ -15,7 +15,7 @@ from torch import Tensor
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
 from tsmlib.models.energy import energy_score
-from tsmlib.models.features import Features
+from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import (
     CausalDecoder,
     DecoderOptions,
@@ -29,7 +29,7 @@ from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Window
 
 
-class TSM(Configured):
+class TSM(Featured, Configured):
     """Temporal segment model of one environment.
 
     state_dim, action_dim: dx, du. angles: state dimensions in radians.
@@ -48,7 +48,7 @@ class TSM(Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         segment_len: int = 10,  # H, section 5.1
         latent_dim: int = 8,  # section 5.1
         beta: float = 1.0,

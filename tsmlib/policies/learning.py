@@ -28,6 +28,7 @@ from tsmlib.policies.networks import Policy
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts
+from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.trajectory import Segment, initial_past
 
@@ -118,6 +119,7 @@ def learn_policy(
     measure: Measure | None = None,  # also before the first iteration
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
+    callback: Callback | None = None,  # at every record, the one before the first iteration too
 ) -> LearningCurve:
     """Improve all copies of ``policy`` in ``model`` by Adam on the discounted return (Eq. 4).
 
@@ -137,7 +139,7 @@ def learn_policy(
         reward=getattr(reward, "__name__", "reward"), seed=seed,
     )  # fmt: skip
     state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), o.iterations, identity, checkpoint)
-    learner = _Learner(policy, model, reward, draw, measure, o, seed, state)
+    learner = _Learner(policy, model, reward, draw, measure, callback, o, seed, state)
     purpose = f"learning a policy, seed {seed}"
     with resumable(state, purpose=purpose, progress=progress) as bar, _frozen(model):
         if not state.step:
@@ -170,6 +172,7 @@ class _Learner:
     reward: Callable[[Tensor], Reward]
     draw: Draw
     measure: Measure | None
+    callback: Callback | None
     options: LearningOptions
     seed: int
     state: TrainingState[LearningCurve]
@@ -208,6 +211,10 @@ class _Learner:
         for name, values in (self.measure(self.policy) if self.measure else {}).items():
             curve.measured.setdefault(name, []).append(values.tolist())
         self.state.keep(-predicted.mean().item())
+        if self.callback is not None:
+            newest = {"predicted": curve.predicted[-1]} | {name: rows[-1] for name, rows in curve.measured.items()}
+            means = {name: sum(values) / len(values) for name, values in newest.items()}
+            self.callback(Progress(self.state.step, self.state.seconds, means))
 
 
 def discounted(rewards: Tensor, gamma: float) -> Tensor:

@@ -82,7 +82,7 @@ class OneStepPolicy(Policy):
         action_dim: int,
         target_dim: int = 2,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         hidden: int = 64,
         layers: int = 2,
         target_std: float = 0.1,  # of a coordinate, uniform in the disc of radius 0.2 m
@@ -128,7 +128,7 @@ class SegmentPolicy(Policy):
         prior: ActionPrior | Mapping[str, Json],
         target_dim: int = 2,
         *,
-        angles: tuple[int, ...] = (0, 1),
+        angles: tuple[int, ...] = (),
         channels: int = 32,
         dilations: Sequence[int] = (1, 2, 4, 2),  # receptive field 10 = H
         target_std: float = 0.1,

@@ -61,7 +61,7 @@ def read_bytes(path: PathLike) -> bytes:
 def remedy(path: Path) -> str:
     """Advice about a damaged file."""
     if any((folder / MANIFEST).is_file() for folder in path.absolute().parents):
-        return "Restore it: git checkout -- data, where it came with the repository."
+        return "Restore it: git checkout -- data in a clone; where tsmlib is installed, install it again."
     return "Delete it and make it again."
 
 

@@ -47,6 +47,8 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     if run.seed in HELD_OUT_SEED.values():
         raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
     seed = HELD_OUT_SEED.get(split, run.seed)
+    if n >= 1000:
+        print(f"{env}: collecting {n:,} episodes for {split}, about {n / 100:.0f} s on one core")
     data = random_data(env, n, seed=seed)
     artifacts.save_trajectories(
         path, data, {"split": split, "seed": seed, "scale": run.scale, "fingerprint": fingerprint(env)}

@@ -1,32 +1,62 @@
 """What a notebook shows: figures, tables, and films and strips of executed plans."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import pandas as pd
+import torch
 from IPython.display import Markdown, display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from tsmlib import figures, rewards
 from tsmlib.envs.render import draw_scene
+from tsmlib.evaluation import latent
+from tsmlib.evaluation.futures import Coded
 from tsmlib.figures.method import Method
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
 from tsmlib.study.results import table
 from tsmlib.study.runs import Run
+from tsmlib.trajectory import Trajectories, Window
+
+if TYPE_CHECKING:
+    from ipywidgets import VBox
 
 
-def show(run: Run, figure: Figure, stem: str) -> None:
-    """Save a figure as ``stem`` among the run's and display it."""
+def show(run: Run, figure: Figure, stem: str, rows: pd.DataFrame | None = None, *, n: int | None = None) -> None:
+    """Save a figure as ``stem`` among the run's and display it.
+
+    It is stamped with where its numbers are from: rows, what it draws (``study.evidence``); or n, of how many episodes
+    or targets of this run.
+    """
+    if rows is not None:
+        figures.stamp(figure, table.stamp(rows, figure=True))
+    elif n is not None:
+        figures.stamp(figure, f"{'' if run.scale == 'paper' else 'yours: '}{of_run(run)}, n = {n:,}")
     figures.save(figure, run.figures / stem)
     display(figure)
 
 
-def show_table(found: pd.DataFrame | str, title: str = "", form: str = "{:.3g}") -> None:
-    """Display a table, or one that is Markdown already, below its title; nothing of an empty one. form: of floats."""
+def of_run(run: Run) -> str:
+    """Scale and seed of a run, for a stamp."""
+    return f"scale {run.scale}, seed {run.seed}"
+
+
+def show_table(
+    found: pd.DataFrame | str, title: str = "", form: str = "{:.3g}", rows: pd.DataFrame | None = None
+) -> None:
+    """Display a table, or one that is Markdown already, below its title; nothing of an empty one.
+
+    form: of floats. rows: what it is made of (``study.evidence``), for a line below that says where they are from.
+    """
+    stamp = "" if rows is None or not len(rows) else f"*{table.stamp(rows)}*"
     if len(found) and isinstance(found, pd.DataFrame):
         found = found if found.index.names == [None] else found.reset_index()
         floats = found.select_dtypes("float")
@@ -34,7 +64,7 @@ def show_table(found: pd.DataFrame | str, title: str = "", form: str = "{:.3g}")
             found.assign(**{str(name): floats[name].map(form.format, na_action="ignore") for name in floats})
         )
     if len(found):
-        display(Markdown("\n\n".join(part for part in (title, found) if part)))
+        display(Markdown("\n\n".join(part for part in (title, found, stamp) if part)))
 
 
 def film(task: Task, trial: Trial, target: int) -> np.ndarray:
@@ -51,6 +81,11 @@ def film(task: Task, trial: Trial, target: int) -> np.ndarray:
     return figures.side_by_side(dict(zip(titles, _filmed(task, target, predicted, executed), strict=True)))
 
 
+def episode_film(data: Trajectories, episode: int) -> np.ndarray:
+    """Frames (T + 1, height, width, 3) of one episode, without a target."""
+    return _frames(data.env, data.states[episode], np.full(2, 9.0))  # where no camera sees it
+
+
 def compared_film(task: Task, trials: Mapping[Method, Trial], target: int) -> np.ndarray:
     """Frames of one target: a column for each method, its predicted rollout above, the executed one below."""
     rows: tuple[dict[str, np.ndarray], ...] = {}, {}
@@ -59,6 +94,24 @@ def compared_film(task: Task, trials: Mapping[Method, Trial], target: int) -> np
         for row, word, frames in zip(rows, ("predicted", "executed"), films, strict=True):
             row[f"{method.look.name}: {word}"] = frames
     return figures.stacked(*map(figures.side_by_side, rows))
+
+
+def code_sliders(model: Coded, window: Window, codes: Tensor, plane: Tensor, *, env: str, method: Method) -> VBox:
+    """The object's futures of one moment under two sliders: how far all codes (n, dz) lie along two directions.
+
+    window: N = 1, the moment; plane (2, dz): the directions, orthonormal. What else a code says stays as it is.
+    """
+    start, steps = window.past.states[0, -1].numpy(), window.future.actions.shape[1]
+
+    def ways(codes: Tensor) -> np.ndarray:
+        return latent.decode_codes(model, window, codes, steps)[..., rewards.BLOCK].numpy()
+
+    scene, happened = partial(draw_scene, env_id=env), window.future.states[0, :, rewards.BLOCK].numpy()
+    picture = figures.code_fan(scene, start, ways(codes), happened, method)
+    return figures.slider_panel(
+        lambda first, second: picture(ways(latent.held(codes, plane, torch.tensor([first, second])))),
+        {"first direction of the code": (-3.0, 3.0, 0.25), "second direction of the code": (-3.0, 3.0, 0.25)},
+    )
 
 
 def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: int = 6) -> Figure:
@@ -78,11 +131,15 @@ def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: in
 
 def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
     """A film of each rollout (T, dx)."""
-    env: Any = gymnasium.make_vec(task.env, num_envs=1).unwrapped
-    goal = task.target[target].numpy()
-    films = [np.stack([env.image(state, goal) for state in states]) for states in rollouts]
+    return [_frames(task.env, states, task.target[target].numpy()) for states in rollouts]
+
+
+def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Each of the states (T, dx) drawn."""
+    env: Any = gymnasium.make_vec(env_id, num_envs=1).unwrapped
+    frames = np.stack([env.image(state, target) for state in states])
     env.close()
-    return films
+    return frames
 
 
 def _rollouts(trial: Trial, target: int) -> tuple[np.ndarray, np.ndarray]:

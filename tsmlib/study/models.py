@@ -1,20 +1,23 @@
 """Trained models at a run's scale; trained where they are missing. Which there are, and how trained: ``zoo``."""
 
+from __future__ import annotations
+
 import os
 import shutil
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, cast
 
-import pandas as pd
 import torch
 from torch import Tensor
 
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
+from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import StoreError
 from tsmlib.study import zoo
@@ -23,6 +26,9 @@ from tsmlib.study.parallel import precompute
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
+
+if TYPE_CHECKING:
+    import pandas as pd  # of the extra "study", which a pretrained model does not need
 
 PRETRAINED = ROOT / "data" / "pretrained"
 Header = Mapping[str, Any]  # JSON: what a file says of itself
@@ -45,7 +51,7 @@ class Trained(NamedTuple):
 
 def schedule(run: Run, env: str, model: str) -> list[zoo.Updates]:
     """How a model is trained at a run's scale: laptop has half the budget of paper, smoke next to nothing."""
-    return zoo.find(model).schedule(EnvSpec.parse(env), run.pick(smoke=0.0, laptop=0.5, paper=1.0))
+    return zoo.find(model).schedule(EnvSpec.parse(env), _share(run))
 
 
 def load_or_train(run: Run, env: str, model: str) -> Trained:
@@ -69,6 +75,10 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
                 raise StoreError(
                     f"{path} was trained by another schedule: {found}, expected {planned}. Restore or delete it"
                 )
+            if (turned := header.get("symmetries", 1)) != (wanted := _symmetries(env, model)):
+                raise StoreError(
+                    f"{path} was trained on {turned} symmetric copies of its data, expected {wanted}. Restore it"
+                )
             return Trained(net, header)
     return train(run, env, model, own)
 
@@ -79,14 +89,14 @@ def load_prior(run: Run, env: str) -> ActionPrior:
 
 
 def load_pretrained(model: str, *, env: str) -> TrainedModel:
-    """A model that comes with the repository, by its word in the zoo and the id of its environment.
+    """A model that comes with the package, by its word in the zoo and the id of its environment.
 
     ValueError naming what there is.
     """
     folder = PRETRAINED / EnvSpec.parse(_trained_on(env, zoo.find(model).word)).name
     if not (path := folder / f"{model}.safetensors").exists():
         there = [path.stem for path in sorted(folder.glob("*.safetensors")) if path.stem in zoo.ZOO]
-        known = f"there are {', '.join(there)}" if there else "there are none; they come with the repository"
+        known = f"there are {', '.join(there)}" if there else "there are none"
         raise ValueError(f"no pretrained {model} of {env} in {folder}: {known}.")
     return _load(path, _trained_on(env, model), model)
 
@@ -100,6 +110,8 @@ def train_all(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, st
 
 def described(trained: Mapping[tuple[str, str], Trained]) -> pd.DataFrame:
     """What was trained, as texts: parameters, updates, CPU seconds (older files: unknown), scale."""
+    import pandas as pd
+
     lines = []
     for (env, model), (net, header) in trained.items():
         parameters = sum(weights.numel() for weights in cast(torch.nn.Module, net).parameters())
@@ -131,8 +143,10 @@ def _load(path: Path, env: str, model: str) -> TrainedModel:
 
 def train(run: Run, env: str, model: str, path: Path) -> Trained:
     """Train a model by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
-    print(f"{env}: no trained {model} at scale {run.scale}; training it now")
+    print(f"{env}: no trained {model} at scale {run.scale}; training it now, {_duration(run, env, model)}")
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
+    if (symmetries := _symmetries(env, model)) > 1:
+        data = symmetric(data)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves = schedule(run, env, model), {}
     checkpoints = {key: path.with_name(f"{model}-{key}.checkpoint") for key in zoo.keys(stages)}
@@ -151,7 +165,7 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
         curves[key] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "schedule": [stage.stated() for stage in stages],
+        "schedule": [stage.stated() for stage in stages], "symmetries": symmetries,
         "bf16": [key for key, curve in curves.items() if any(curve["bf16"])],  # as the processor had it
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"),
@@ -164,6 +178,25 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     return Trained(net, artifacts.read_header(path))
 
 
+def _share(run: Run) -> float:
+    """The part of its budget that a model is trained for."""
+    return run.pick(smoke=0.0, laptop=0.5, paper=1.0)
+
+
+def _duration(run: Run, env: str, model: str) -> str:
+    """How long a training may take, in words."""
+    spec = zoo.find(model)
+    seconds = _share(run) * (zoo.BUDGET[EnvSpec.parse(env).arm.name] if spec.budget is None else spec.budget)
+    if not seconds:
+        return "a few updates"
+    return f"about {max(1, round(seconds / 60))} min of one core. Stopped, it goes on from there the next time"
+
+
+def _symmetries(env: str, model: str) -> int:
+    """Symmetric copies of the data that a model is trained on; of the prior 1, since its training knows no states."""
+    return copies(env) if zoo.find(model).group != "prior" else 1
+
+
 def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
     """The data that a model in ``path`` was trained on: file, relative to the model, and SHA-256."""
     files = [run.data / EnvSpec.parse(env).name / f"{split}.safetensors" for split in ("train", "validation")]
@@ -172,14 +205,6 @@ def _inputs(run: Run, env: str, path: Path) -> dict[str, str]:
 
 def initialise(run: Run, model: str, data: Trajectories) -> TrainedModel:
     """The model as training starts: new weights, and the statistics of the training data."""
-    spec, (dx, du) = zoo.find(model), (data.states.shape[2], data.actions.shape[2])
-    arguments = spec.arguments(EnvSpec.parse(data.env))
-    with torch.random.fork_rng(devices=[]):  # torch layers draw their weights from the global generator
-        torch.manual_seed(run.seed)
-        if spec.group == "prior":
-            net = spec.load()(du, **arguments)
-            cast(ActionPrior, net).fit_scale(torch.from_numpy(data.actions))
-            return cast(TrainedModel, net)
-        dynamics = cast(TrainedModel, spec.load()(dx, du, angles=data.angles, **arguments))
-        dynamics.features.fit(torch.from_numpy(data.states))
-        return dynamics
+    spec = zoo.find(model)
+    made_for = cast(type[ActionPrior | TSM], spec.load())  # all classes of the zoo have it
+    return cast(TrainedModel, made_for.for_data(data, seed=run.seed, **spec.arguments(EnvSpec.parse(data.env))))

@@ -1,9 +1,11 @@
 """Execution of notebooks, and the status of what they made."""
 
 import contextlib
+import importlib.util
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,10 +13,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from tqdm.auto import tqdm
+
 from tsmlib.storage.files import STATUS, Json, StoreError, alive, writer_lock
 from tsmlib.study import parameters
 from tsmlib.study.parameters import Value
-from tsmlib.study.runs import Notebook, Run, RunError, notebooks, resolve
+from tsmlib.study.runs import Notebook, Run, RunError, home, notebooks, resolve
+
+TOOLS = ("papermill", "ipykernel", "pandas", "tabulate", "sklearn", "ipywidgets", "imageio_ffmpeg")  # extra "study"
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,15 @@ def prepare(
     values = {name: asked[name] for name in parameters.declared(notebook.path) if name in asked}
     run = resolve(notebook.stem, device=device, **values)  # type: ignore[arg-type]  # which it checks
     return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
+
+
+def require_tools() -> None:
+    """RunError naming what the notebooks need and a plain installation lacks."""
+    missing = [name for name in TOOLS if importlib.util.find_spec(name) is None]
+    if missing:
+        raise RunError(
+            f"notebooks need {', '.join(missing)}, missing here: {sys.executable} -m pip install 'tsmlib[study]'"
+        )
 
 
 def execute(execution: Execution, *, progress: bool = True) -> Path:
@@ -124,7 +139,8 @@ def _papermill(execution: Execution, progress: bool) -> Path:
         bar = {"desc": notebook.stem} if progress else False
         executed = papermill.execute_notebook(
             _literally(notebook.path), _literally(unfinished), dict(execution.values),
-            kernel_name="python3", language="python", cwd=str(notebook.path.parent), progress_bar=bar, config=options,
+            kernel_name="python3", language="python", cwd=str(home()), progress_bar=bar, config=options,
+            stdout_file=_Terminal() if progress else None,
         )  # fmt: skip
         code = [cell for cell in executed.cells if cell.cell_type == "code" and cell.source.strip()]
         if any(cell.execution_count is None for cell in code):  # sys.exit(0) in a cell, for one
@@ -143,6 +159,16 @@ def _papermill(execution: Execution, progress: bool) -> Path:
     if failure:
         raise RunError(f"{notebook.stem} failed: {failure}{seen}")
     return output
+
+
+class _Terminal:
+    """What a notebook prints, above the progress bar as it comes: that a model is missing and is trained now, say."""
+
+    def write(self, text: str) -> None:
+        tqdm.write(text, file=sys.stderr, end="")
+
+    def flush(self) -> None:
+        sys.stderr.flush()
 
 
 def _is_whole(notebook: Path) -> bool:

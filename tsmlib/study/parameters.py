@@ -1,15 +1,19 @@
 """Parameters of the notebooks: names, types and ranges; one schema for every way in.
 
 ``python -m tsmlib run`` checks the text that was typed, and a notebook's first cell checks the values that arrived
-there (papermill only warns of unknown names, and executes every name as code). Both happen before any file exists.
+there. Both happen before any file exists. papermill executes every name as code, and only warns of unknown ones, which
+``papermill_plugin`` refuses where they were typed.
 A notebook's ``parameters`` cell holds the defaults; a name in it that stands here too obeys the rule here.
 """
 
 import ast
+import difflib
+import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+import tokenize
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,7 +26,7 @@ ENVS = tuple(f"tsm/{arm}" for arm in ("Reacher-v0", "ReacherObstacle-v0", "Reach
 LONGEST = 1000  # characters
 Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
-_RESTORE = "Restore it: git checkout -- notebooks"
+_RESTORE = "Restore it: git checkout -- notebooks in a clone; where tsmlib is installed, install it again"
 
 
 class ParameterError(ValueError):
@@ -59,17 +63,22 @@ def _is_folder(value: str) -> bool:
     return not value.startswith("~") and ".." not in path.parts and value.strip() == value and not reserved
 
 
+_REACH = "from -1 to 1; the fingertip gets as far as 0.21 from the shoulder"
+
 SCHEMA: dict[str, Rule] = {
     "scale": _one_of(*SCALES),
     "seed": _whole(0, 2**31 - 1),
     "device": Rule(str, "cpu, cuda, or one of several as in cuda:1", lambda value: bool(_DEVICE.fullmatch(value))),
     "run_dir": Rule(
-        str, "an absolute path, or one inside the repository, without '..', a leading '~', control characters or names "
+        str, "an absolute or a relative path, without '..', a leading '~', control characters or names "
         "that Windows reserves", _is_folder,
     ),
     "env": _some_of(*ENVS),
     "envs": _some_of(*ENVS),
     "models": _some_of(*zoo.words()),
+    "model": Rule(str, f"{zoo.OURS} or {zoo.PAPERS}", lambda value: value in (zoo.OURS, zoo.PAPERS)),
+    "target_x": Rule(float, f"metres, {_REACH}", lambda value: abs(value) <= 1),
+    "target_y": Rule(float, f"metres, {_REACH}", lambda value: abs(value) <= 1),
     "n_targets": _whole(0, 100),
 }  # fmt: skip
 PLAIN = {  # for a parameter without a rule, by the type of its default
@@ -110,35 +119,67 @@ def _shown(value: object) -> str:
 
 def declared(notebook: Path) -> dict[str, object]:
     """Name -> default of every parameter: the literals in the cell tagged ``parameters``."""
+    return {name: default for name, (default, _) in _cell(notebook).items()}
+
+
+def explained(notebook: Path) -> str:
+    """A line for every parameter: how its default would be given to ``run``, and the comment beside it."""
+    given = {
+        f"--{name} {default!r}" if name in ("scale", "seed") else f"-p {name}={default!r}": comment
+        for name, (default, comment) in _cell(notebook).items()
+    }
+    width = min(30, max(map(len, given)))
+    return "\n".join(f"  {text:{width}}  {comment}".rstrip() for text, comment in given.items())
+
+
+def require_known(notebook: Path, names: Iterable[str]) -> None:
+    """ParameterError for a name that is none of a notebook's parameters, naming the closest and all that there are."""
+    known = list(declared(notebook))
+    for name in names:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            raise ParameterError(
+                f"{notebook.stem} has no parameter {_shown(name)}"
+                f"{f'; the closest is {close[0]}, and' if close else ';'} it has {', '.join(known)}."
+            )
+
+
+def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Value]:
+    """Values for a notebook's parameters from their text, to be checked. Unknown names are refused."""
+    require_known(notebook, given)
+    defaults = declared(notebook)
+    return {name: convert(name, text, default=defaults[name]) for name, text in given.items()}
+
+
+def _cell(notebook: Path) -> dict[str, tuple[object, str]]:
+    """Name -> default and comment of every parameter, in order."""
     try:
-        cells = json.loads(notebook.read_text())["cells"]
+        cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
         tagged = [cell for cell in cells if "parameters" in cell["metadata"].get("tags", [])]
         sources = ["".join(cell["source"]) for cell in tagged]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ParameterError(f"{notebook} is not a notebook: {error!r:.200}. {_RESTORE}") from error
     if len(sources) != 1:
         raise ParameterError(f"{notebook.name} has {len(sources)} cells tagged 'parameters', expected one. {_RESTORE}")
-    found: dict[str, object] = {}
+    found: dict[str, tuple[object, str]] = {}
     try:
-        for statement in ast.parse(sources[0]).body:
+        statements = ast.parse(sources[0]).body
+        comments = {
+            token.start[0]: token.string.lstrip("# ")
+            for token in tokenize.generate_tokens(io.StringIO(sources[0]).readline)
+            if token.type == tokenize.COMMENT
+        }
+        for statement in statements:
             match statement:
                 case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                    found[name] = ast.literal_eval(value)
+                    pass
                 case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
-                    found[name] = ast.literal_eval(value)
+                    pass
                 case _:
                     raise ValueError(f"line {statement.lineno} is not 'name = literal'")
+            found[name] = ast.literal_eval(value), comments.get(statement.end_lineno or 0, "")
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
         raise ParameterError(
             f"{notebook.name}, parameters cell: {error}; expected 'name = literal' only. {_RESTORE}"
         ) from error
     return found
-
-
-def typed(notebook: Path, given: Mapping[str, str]) -> dict[str, Value]:
-    """Values for a notebook's parameters from their text, to be checked. Unknown names are refused."""
-    defaults = declared(notebook)
-    for name in given:
-        if name not in defaults:
-            raise ParameterError(f"{notebook.stem} has no parameter {_shown(name)}; it has {', '.join(defaults)}.")
-    return {name: convert(name, text, default=defaults[name]) for name, text in given.items()}

@@ -82,7 +82,8 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
             if header.get("made_from") == made_from and (path == shipped or header.get("budget") == asdict(budget)):
                 return Learned(artifacts.load_model(path, cls, expect=fingerprint(task.env)), header)
     print(
-        f"{task.env}: no {method.search_space} policy learned in {method.model} at scale {run.scale}; learning it now"
+        f"{task.env}: no {method.search_space} policy learned in {method.model} at scale {run.scale}; learning it now, "
+        f"{budget.iterations} iterations of 0.1 to 1 s. Stopped, it goes on from there the next time"
     )
     about = {"made_from": made_from, "budget": asdict(budget), "model": method.model,
              "search_space": method.search_space}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Publishing: a paper-scale run copied into data/ and figures/, and README's results written from it."""
+"""Publishing: a paper-scale run copied into data/ and figures/, and the results in README and docs/ written from it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +21,17 @@ from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import table
+from tsmlib.study.results.planning import PUSH, REACH
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.study.zoo import OURS, PAPERS
 
 README = ROOT / "README.md"
+RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
+README_MODELS = (PAPERS, OURS, "onestep", "lstm")
+README_CLAIMS = ("C27", "C32", "C53")  # what the paper says of predictions, plans and prior
 POOLED = (
     "03_predict",
     "04_latent",
@@ -37,7 +41,7 @@ POOLED = (
 
 
 def publish(run: Run) -> None:
-    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what README says of them.
+    """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what is said of them.
 
     The tables of POOLED have the rows of the other seeds beside this run as well. Raises RunError, before anything is
     written, unless the notebooks ran to their end and their results are as they left them.
@@ -59,7 +63,6 @@ def publish(run: Run) -> None:
     for notebook, rows in tables.items():
         tables_storage.save(RESULTS / f"{notebook}.csv", rows)
     manifest.write_manifest(ROOT / "data")
-    _between(MARKS, readme_results())
     publish_claims()
 
 
@@ -77,11 +80,14 @@ def pooled(run: Run) -> dict[str, pd.DataFrame]:
 
 
 def publish_claims() -> None:
-    """Judge every claim from the tables that ship: data/results/08_claims.csv, and README's table. Idempotent."""
+    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent."""
     papers, ours = shipped_verdicts(PAPERS), shipped_verdicts(OURS)
     tables_storage.save(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
-    _between(CLAIM_MARKS, readme_claims(papers, ours))
+    _between(README, MARKS, readme_results())
+    _between(RESULTS_PAGE, MARKS, results_page())
+    _between(README, CLAIM_MARKS, readme_claims(papers, ours))
+    _between(CLAIMS_PAGE, CLAIM_MARKS, claims_page(papers, ours))
 
 
 def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
@@ -91,17 +97,69 @@ def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
     return [evaluate.judge(claim, rows) for claim in claims]
 
 
-def _between(marks: tuple[str, str], written: str) -> None:
-    """Put ``written`` between two marks of README."""
-    before, _, rest = README.read_text().partition(marks[0])
+def _between(page: Path, marks: tuple[str, str], written: str) -> None:
+    """Put ``written`` between two marks of a page."""
+    before, _, rest = page.read_text().partition(marks[0])
     after = rest.partition(marks[1])[2]
-    files.write_bytes(README, "\n".join([before + marks[0], "", written, "", marks[1] + after]).encode())
+    files.write_bytes(page, "\n".join([before + marks[0], "", written, "", marks[1] + after]).encode())
+
+
+def _shipped(name: str) -> pd.DataFrame:
+    """A table that ships; without rows where there is none."""
+    path = RESULTS / f"{name}.csv"
+    return tables_storage.load(path) if path.exists() else tables_storage.frame([])
+
+
+# README --------------------------------------------------------------------------------------------------------------
+
+
+def readme_results() -> str:
+    """Four models by four numbers: on pushing, or on reaching as long as pushing has no rows of the paper's model."""
+    predict, control = _shipped("03_predict"), _shipped("05_control")
+    pushed = all(len(table.select(rows, env=PUSH, model=PAPERS)) for rows in (predict, control))
+    env = PUSH if pushed else REACH
+    plans = table.select(planning_results.chosen(control, env=env, planners=["cem"]), search_space="latent")
+    found = {
+        "prediction error": prediction_results.values(predict, "nrmse", env=env),
+        "log-likelihood": prediction_results.values(predict, "ll_own", env=env),
+        "share of oracle's gain": table.values(table.select(plans, metric="gain_share")),
+        "gap (m)": table.values(table.select(plans, metric="gap_absolute")),
+    }
+    first, *_, last = found.values()
+    lines = []
+    for model in README_MODELS:
+        cells = {title: table.spell(values[model]) if model in values else "-" for title, values in found.items()}
+        seeds = f"{len(first.get(model, ()))} / {len(last.get(model, ()))}"
+        lines.append({"model": f"`{model}`", **cells, "seeds": seeds})
+    episodes, targets = prediction_results.select(predict, "nrmse", env=env)["n"].max(), plans["n"].max()
+    return f"""{table.markdown(pd.DataFrame(lines))}
+
+*Published rows of `{env}`; means over training seeds (of predicting / of planning), half the 95 % t interval; -: no
+rows yet. Predicting: {episodes:,} test episodes, 90 steps open loop; error as a share of the data's deviation (nRMSE),
+likelihood in nats per step. Planning: {targets} targets, CEM over codes; the share is 1 for plans through the true
+simulator, 0 for doing nothing; the gap is the mean size of predicted minus executed return.*"""
 
 
 def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
-    """What README says of the paper's claims: those that carry it, and how many of all got which verdict."""
-    pairs = [pair for pair in zip(papers, ours, strict=True) if pair[0].claim.headline]
-    table = claims_report.table([first for first, _ in pairs], [second for _, second in pairs])
+    """Three sentences: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
+    carrying = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
+    said = "; ".join(f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" for verdict in carrying)
+    return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
+With `{OURS}` in its place, {claims_report.counts(ours)}.
+What carries the paper, with its own model: {said}."""
+
+
+# Pages of docs/ ------------------------------------------------------------------------------------------------------
+
+
+def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Every claim with its verdict, those that carry the paper first."""
+    pairs = sorted(zip(papers, ours, strict=True), key=lambda pair: not pair[0].claim.headline)
+    headlines = sum(verdict.claim.headline for verdict in papers)
+    carry, others = (
+        claims_report.table([first for first, _ in part], [second for _, second in part], root="../")
+        for part in (pairs[:headlines], pairs[headlines:])
+    )
     by_definition = ", ".join(verdict.claim.id for verdict in papers if verdict.word == DEFINITIONAL)
     return f"""Written by `python -m tsmlib publish --claims` from the rows in `data/results`.
 
@@ -109,19 +167,19 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
 - `{OURS}` in its place: {claims_report.counts(ours)}.
 - Not counted, since they hold by definition: {by_definition}.
 
-Below are the {len(pairs)} of {len(papers)} claims that carry the paper. All of them, and why each verdict is what it
-is, are in `notebooks/08_claims.ipynb`; what the paper leaves open is in [docs/deviations.md](docs/deviations.md).
+## The {headlines} claims that carry the paper
 
-{table}"""
+{carry}
+
+## The others
+
+{others}"""
 
 
-def readme_results() -> str:
-    """What README says about results, from the shipped tables alone."""
-    control, predict, peers, free = (
-        tables_storage.load(path) if (path := RESULTS / f"{name}.csv").exists() else tables_storage.frame([])
-        for name in ("05_control", "03_predict", "peers_pets", "model_free")
-    )
-    predict = tables_storage.frame(pd.concat([predict, peers]))
+def results_page() -> str:
+    """Every published table of predictions, plans and policies, from the shipped rows alone."""
+    control, free = _shipped("05_control"), _shipped("model_free")
+    predict = tables_storage.frame(pd.concat([_shipped("03_predict"), _shipped("peers_pets")]))
     learned = tables_storage.frame(pd.concat([control, policies_results.finished(free)]))
     seeds = {env: own["seed"].nunique() for env, own in table.groups(predict, "env")}
     scores = "\n\n".join(
@@ -129,11 +187,13 @@ def readme_results() -> str:
         + prediction_results.scores_table(predict, METRICS, env=env)
         for env, n in seeds.items()
     )
-    seed = control["seed"].iloc[0]
+    planned = ", ".join(str(seed) for seed in sorted(control["seed"].dropna().unique()))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
 
-**Prediction.** {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
+## Prediction
+
+{n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
 observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
 seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
 of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`). `pets` is the same
@@ -141,17 +201,21 @@ kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
 
 {scores}
 
-**Planning.** Training seed {seed}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
+## Planning
+
+Training seed {planned}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
 over steps.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
-**Planning again** every ten steps, pushing:
+## Planning again every ten steps, pushing
 
 {planning_results.loops_table(control)}
 
-**Policies** learned inside the models, and model-free ones in the environment; means of the last record
+## Policies
+
+Learned inside the models, and model-free ones in the environment; means of the last record
 over k copies or seeds, with half the 95 % t interval.
 
 {policies_results.policies_table(policies_results.learning_curves(learned))}"""

@@ -2,6 +2,10 @@
 
 Everything that a run makes is in one folder, ``runs/<scale>/seed<k>/``: ``data``, ``models``, ``metrics``, ``figures``,
 the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (``notebooks.require``).
+
+What ships lies in ``ROOT``, below ``data`` and ``notebooks``: in a checkout the repository, in an installed package
+``tsmlib/_shipped``, which ``setup.py`` puts into a wheel. A checkout has its runs in the repository, an installed
+package in the working directory.
 """
 
 import os
@@ -12,7 +16,9 @@ from typing import TypeVar
 from tsmlib.study import parameters
 from tsmlib.study.parameters import ParameterError, Value
 
-ROOT = Path(__file__).resolve().parents[2]
+_PACKAGE = Path(__file__).resolve().parents[1]
+INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
+ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
 NOTEBOOKS = ROOT / "notebooks"
 
 T = TypeVar("T")
@@ -54,7 +60,7 @@ class Run:
 
     @property
     def shipped(self) -> Path:
-        """The pretrained models that come with the repository. Read only."""
+        """The pretrained models that come with the package. Read only."""
         return ROOT / "data" / "pretrained"
 
     def pick(self, *, smoke: T, laptop: T, paper: T) -> T:
@@ -91,13 +97,18 @@ def notebooks() -> dict[str, Notebook]:
     return {path.stem[3:]: Notebook(path.stem[3:], path) for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
 
 
+def home() -> Path:
+    """The folder that ``runs`` lies in: the repository, or the working directory where the package is installed."""
+    return Path.cwd() if INSTALLED else ROOT
+
+
 def resolve(
     notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Value
 ) -> Run:
     """The run that a notebook belongs to. Touches no file.
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
-    run_dir: the folder that holds all runs, relative to the repository; '' means TSM_RUN_DIR, and without it runs.
+    run_dir: the folder that holds all runs, relative to ``home``; '' means TSM_RUN_DIR, and without it runs.
     device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu.
     others: the notebook's other parameters. All are checked here and nowhere else, whichever way they came.
     Raises ParameterError naming the value and what is allowed.
@@ -105,7 +116,7 @@ def resolve(
     parameters.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
-    base = ROOT / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
+    base = home() / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
     known = [each.path for each in notebooks().values() if each.stem == notebook] if others else []
     defaults = parameters.declared(known[0]) if known else {}
     for name, value in others.items():

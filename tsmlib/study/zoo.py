@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     import torch
 
     from tsmlib.envs.spec import EnvSpec
+    from tsmlib.storage.files import Json
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
-    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 1160.0,
-    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 240.0,
+    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 580.0,
+    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 120.0,
 }  # fmt: skip
 
 
@@ -98,18 +99,18 @@ class ModelSpec:
     budget: seconds of training of its own, in place of the environment's. group: dynamics models are compared
     everywhere; an ablation is TSM with a part put in or taken away, a choice changes one of the paper's; the prior is
     the prior.
-    planned: whether figure 6 plans with it. pushing: share of the budget there; all but one model have had half so far.
+    planned: whether figure 6 plans with it. pushing: its stages there, where they differ.
     """
 
     word: str
     look: Look
     cls: str
     stages: tuple[Stage, ...]
-    arguments: Callable[[EnvSpec], Mapping[str, object]] = lambda env: {}
+    arguments: Callable[[EnvSpec], Mapping[str, Json]] = lambda env: {}
     group: Literal["dynamics", "ablation", "choice", "prior"] = "dynamics"
     budget: float | None = None
     planned: bool = False
-    pushing: float = 0.5
+    pushing: tuple[Stage, ...] = ()
 
     def load(self) -> type[torch.nn.Module]:
         """The class."""
@@ -119,8 +120,8 @@ class ModelSpec:
     def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
         """How the model is trained in a share of its budget, on an imperfect arm as on the plain one."""
         seconds = share * (BUDGET[env.arm.name] if self.budget is None else self.budget)
-        seconds *= self.pushing if env.task == "push" and self.budget is None else 1.0
-        return [stage.within(seconds, env.has_block) for stage in self.stages]
+        stages = (env.task == "push" and self.pushing) or self.stages
+        return [stage.within(seconds, env.has_block) for stage in stages]
 
 
 # Training stages and arguments ----------------------------------------------------------------------------------------
@@ -129,6 +130,11 @@ class ModelSpec:
 def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> Stage:
     """Free-running over two chained segments."""
     return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False)
+
+
+def _muon(stage: Stage) -> Stage:
+    """The stage with Muon, at the best of three rates (``benchmarks/settings``, pushing)."""
+    return replace(stage, muon=0.02, lr=2e-3)
 
 
 TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
@@ -141,17 +147,17 @@ RECURRENT = (  # the mode first, since a sample costs less than two; at last ove
 PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
 
 
-def _wide(env: EnvSpec) -> dict[str, object]:
+def _wide(env: EnvSpec) -> dict[str, Json]:
     """Appendix A.1."""
     return {"channels": 64, "head_channels": 128} if env.has_block else {}
 
 
-def _skip(env: EnvSpec) -> dict[str, object]:
+def _skip(env: EnvSpec) -> dict[str, Json]:
     """A head that sees the state itself, over a narrower stack."""
     return {"channels": 32, "state_skip": 200}
 
 
-def _choice(word: str, name: str, colour: str, **arguments: object) -> ModelSpec:
+def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
     """One of the paper's choices, changed; as many updates as TSM."""
     look = Look(f"TSM, {name}", colour)
     return ModelSpec(word, look, "tsmlib.models.tsm:TSM", PAPER, lambda env: _wide(env) | arguments, "choice")
@@ -167,8 +173,14 @@ _TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
     )
 )  # fmt: skip
 _MODELS = (
-    ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True),
-    ModelSpec("rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT, planned=True, pushing=1.0),
+    ModelSpec(
+        "tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True,
+        pushing=tuple(replace(stage, muon=0.006) for stage in PAPER),  # diverges at 0.02
+    ),
+    ModelSpec(
+        "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT, planned=True,
+        pushing=tuple(replace(stage, muon=0.01) for stage in RECURRENT),
+    ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy", Look("TSM + energy", "#56B4E9", "D"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
         "ablation",
@@ -186,18 +198,23 @@ _MODELS = (
     ),
     ModelSpec(
         "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (Stage("loss", 36),), planned=True,
+        pushing=(_muon(Stage("loss", 36)),),
     ),
     ModelSpec(  # free-running over 2 H steps
         "multistep", Look("multi-step", "#D55E00", "^"), _ONE_STEP, (Stage("multi_step_loss", 21),), planned=True,
+        pushing=(_muon(Stage("multi_step_loss", 21)),),
     ),
-    ModelSpec("lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5),), planned=True),
+    ModelSpec(
+        "lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5, bf16=False),), planned=True,
+        pushing=(_muon(Stage("loss", 14.5, bf16=False)),),
+    ),
     ModelSpec(
         "ensemble", Look("ensemble (Gaussian)", "#CC79A7", "P"), _ENSEMBLE, (Stage("loss", 33.3),),
-        lambda env: {"gaussian": True},
+        lambda env: {"gaussian": True}, pushing=(_muon(Stage("loss", 33.3)),),
     ),
     ModelSpec(
         "ensemble+mse", Look("ensemble (squared error)", "#6A2BD9", "X"), _ENSEMBLE, (Stage("loss", 33.3),),
-        lambda env: {"gaussian": False}, planned=True,
+        lambda env: {"gaussian": False}, planned=True, pushing=(_muon(Stage("loss", 33.3)),),
     ),
     ModelSpec(
         "prior", Look("action prior", "#882255"), _PRIOR, (Stage("loss", 30, lr=1e-3, bf16=False),), group="prior",

@@ -7,18 +7,30 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tsmlib.storage.artifacts import digest
+from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.training.muon import Muon, matrices
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, windows
 
 Loss = Callable[[Window, torch.Generator], Tensor]
+
+
+@runtime_checkable
+class Statistics(Protocol):
+    """What a model of states knows of its training data."""
+
+    fitted: bool
+
+    @property
+    def fit(self) -> Callable[[Tensor], object]: ...
 
 
 @dataclass(frozen=True)
@@ -86,13 +98,18 @@ def fit(
     device: str = "cpu",  # where it is trained, such as "cuda"; the model comes back to the CPU
     checkpoint: Path | None = None,  # a folder of its own
     progress: str = "",  # title of the progress bar; none without
+    callback: Callback | None = None,  # at every validation
 ) -> TrainingHistory:
     """Minimise ``loss`` over random windows; leave the weights with the best validation loss in ``model``.
 
     Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint``, a folder, continues
     as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
     weights so far in ``model``, and StoreError for a checkpoint of another run, or one that another process writes.
+    A model of states whose features have no statistics yet takes those of ``train`` first.
     """
+    features = getattr(model, "features", None)
+    if isinstance(features, Statistics) and not features.fitted:
+        features.fit(torch.from_numpy(train.states))
     o, generator, lengths = options, torch.Generator(), (options.past_len, options.future_len)
     held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, *lengths)))
     draw = batches(
@@ -118,6 +135,8 @@ def fit(
                 if (step + 1) % o.validate_every == 0 or step + 1 == o.steps:
                     state.step, state.seconds = step + 1, time.process_time() - began
                     _record(state, sum(losses) / len(losses), validate(loss, held_out, seed), bf16)
+                    if callback is not None:
+                        callback(_newest(state))
                     state.save()
                     bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
                     losses = []
@@ -186,6 +205,12 @@ def _record(state: TrainingState[TrainingHistory], train: float, validation: flo
     state.curve.bf16.append(bf16)
     if validation < state.best_loss:
         state.keep(validation)
+
+
+def _newest(state: TrainingState[TrainingHistory]) -> Progress:
+    """The last record of a training."""
+    curve = state.curve
+    return Progress(state.step, state.seconds, {"train": curve.train[-1], "validation": curve.validation[-1]})
 
 
 def _require_finite(state: TrainingState[TrainingHistory], what: str, value: float, step: int) -> None:

@@ -61,7 +61,7 @@ CLEAN = REACHER._replace(table="06_robustness")
 NOISE, DELAY = CLEAN._replace(noise=0.25), CLEAN._replace(delay=5)
 TASKS, ARMS = (REACHER, PUSH), (REACHER, OBSTACLE, PUSH)
 
-# Other readings of the paper: name -> fields of Query. A1 to A31 are numbers of docs/deviations.md.
+# Other readings of the paper: name -> fields of Query. A1 to A33 are numbers of docs/deviations.md.
 VARIANCE = {"A1d one variance per step and dimension": {"likelihood": "ll_horizon"}}
 LIKELIHOODS = {"A1b one shared variance": {"likelihood": "ll_shared"}, **VARIANCE}
 PROTOCOLS = {**LIKELIHOODS, "A6 segments from the true past": {"execution": "segments"}}

@@ -6,7 +6,7 @@ Rows of executed plans have the execution "open loop". The ``subset`` of others 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,29 +139,66 @@ def _means(found: pd.DataFrame, index: Sequence[str], metrics: Sequence[str], fo
     return table.printed(table.means(own, list(index)), {metric: (metric, form) for metric in metrics})
 
 
-def torques_table(found: pd.DataFrame, env: str) -> str:
+@table.sourced
+def torques_table(found: pd.DataFrame, env: str) -> pd.DataFrame:
     """Action statistics in Markdown: one line per method, mean over seeds, the data first."""
-    return table.markdown(_means(table.select(found, env=env), ("torques", "n"), TORQUES, "{:.3g}"))
+    return _means(table.select(found, env=env), ("torques", "n"), TORQUES, "{:.3g}")
 
 
-def thresholds_table(found: pd.DataFrame) -> str:
+@table.sourced
+def thresholds_table(found: pd.DataFrame) -> pd.DataFrame:
     """THRESHOLDS beside what plans came to, in Markdown: means over seeds."""
     plans = table.select(found, execution="open loop")
     wide = _means(plans, ("task", "method", "search_space"), ("auc", "change_ratio"), "{:.3f}")
-    return table.markdown(wide.assign(threshold=wide["search_space"].map(THRESHOLDS)).drop(columns="search_space"))
+    return wide.assign(threshold=wide["search_space"].map(THRESHOLDS)).drop(columns="search_space")
 
 
-def costs_table(found: pd.DataFrame) -> str:
+@table.told
+def plans_told(found: pd.DataFrame) -> Iterator[str]:
+    """A sentence per task: how much plans change their torques beside the data, how surely they are told from it, and
+    the same of samples of the prior."""
+    for task, part in table.groups(found, "task"):
+        plans = table.select(part, execution="open loop")
+        for word, own in (("direct plans", table.select(plans, search_space="direct")),
+                          ("latent plans", table.select(plans, search_space="latent")),
+                          ("samples of the prior", table.select(part, subset="sampled"))):  # fmt: skip
+            change, auc = (own[own["metric"] == metric]["value"] for metric in ("change_ratio", "auc"))
+            if len(change):
+                yield (f"{task}, {word}: torques change {_range(change)} times as much as the data's"
+                       + (f", AUC {_range(auc)}." if len(auc) else "."))  # fmt: skip
+
+
+def _range(values: pd.Series) -> str:
+    low, high = values.min(), values.max()
+    return f"{low:.2f}" if f"{low:.2f}" == f"{high:.2f}" else f"{low:.2f} to {high:.2f}"
+
+
+@table.told
+def costs_told(found: pd.DataFrame, model: str, planner: str) -> Iterator[str]:
+    """A sentence per task on what searching codes costs a model, and on how many targets lie outside the data."""
+    for task, part in table.groups(found, "task"):
+        means = (
+            table.select(part, model=model, planner=planner, search_space="latent").groupby("metric")["value"].mean()
+        )
+        if {"lost_share", "outside"} <= set(means.index):
+            yield (f"{task}: plans by {zoo.look(model).name} lose {means['lost_share']:.1%} of their return in the "
+                   f"latent space; {means['outside']:.0%} of the targets need torques outside the data.")  # fmt: skip
+
+
+@table.sourced
+def costs_table(found: pd.DataFrame) -> pd.DataFrame:
     """Rows of ``cost_of_prior`` in Markdown: means over seeds."""
-    return table.markdown(_means(found, ("task", "model", "planner", "n"), COSTS, "{:.3f}"))
+    return _means(found, ("task", "model", "planner", "n"), COSTS, "{:.3f}")
 
 
-def starts_table(found: pd.DataFrame) -> str:
+@table.sourced
+def starts_table(found: pd.DataFrame) -> pd.DataFrame:
     """Plans from smooth and from noisy first torques (07_starts.csv), in Markdown."""
-    return table.markdown(_means(found, ("torque_weight", "search_space", "start"), STARTS, "{:.3f}"))
+    return _means(found, ("torque_weight", "search_space", "start"), STARTS, "{:.3f}")
 
 
-def gradients_table(found: pd.DataFrame) -> str:
+@table.sourced
+def gradients_table(found: pd.DataFrame) -> pd.DataFrame:
     """Signal-to-noise ratio of gradients in Markdown: the geometric mean over starts, and by how much that of the
     latent search space is larger, with the 95 % t interval over starts (means over the seeds there are)."""
     own = table.select(found, metric="gradient_snr")
@@ -174,4 +211,4 @@ def gradients_table(found: pd.DataFrame) -> str:
         lines.append({"env": env, "method": zoo.method(model), "n": len(wide)}
                      | {space: f"{np.exp(wide[space].mean()):.3g}" for space in ("latent", "direct")}
                      | {"latent / direct": f"{ratio:.3g} [{low:.3g}, {high:.3g}]"})  # fmt: skip
-    return table.markdown(pd.DataFrame(lines)) if lines else ""
+    return pd.DataFrame(lines)

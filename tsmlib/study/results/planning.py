@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -172,6 +172,19 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
     return {method: {"open": opened[method], "closed": distances} for method, distances in closed.items()}
 
 
+def return_panels(
+    found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem", methods: Sequence[Method] = ()
+) -> dict[str, Any]:
+    """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
+    every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
+    return {task: {m: rows[m] for m in methods or rows if m in rows} for task, rows in every.items()}
+
+
+def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, Any]:
+    """The input of ``figures.final_distances``."""
+    return {task.name: final_distances(found, task.env)}
+
+
 def along_the_way(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.ndarray]]:
     """What ``figures.along_the_way`` draws: method -> iterations, true and predicted mean returns (I,) each."""
     own = table.with_method(table.select(found, env=env, execution=OPEN, metric=["return_true", "return_predicted"]))
@@ -205,25 +218,37 @@ def _printed(plans: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     return table.printed(table.means(table.with_method(plans), ["env", "method", "n"]), columns)
 
 
-def plans_table(found: pd.DataFrame, *, planner: str = "cem") -> str:
+@table.sourced
+def plans_table(found: pd.DataFrame, *, planner: str = "cem") -> pd.DataFrame:
     """Every model planned with by one planner, executed open loop, with floors and oracle, in Markdown."""
-    return table.markdown(_printed(chosen(found, planners=[planner]), MAIN))
+    return _printed(chosen(found, planners=[planner]), MAIN)
 
 
 def violations_table(found: pd.DataFrame, *, env: str = "", planner: str = "cem") -> str:
     """Signs of exploitation, in Markdown: shares of predicted steps that violate physics, and action statistics."""
+    return _violations(found, env, planner) or NOT_YET
+
+
+@table.sourced
+def _violations(found: pd.DataFrame, env: str, planner: str) -> pd.DataFrame:
     own = _printed(chosen(found, env=env, planners=[planner]), SIGNS)
-    return table.markdown(own.drop(columns="n")) if "violations" in set(found["metric"]) else NOT_YET
+    measured = "violations" in set(found["metric"])
+    return (own if "source" in found else own.drop(columns="n")) if measured else own.iloc[:0]
 
 
 def loops_table(found: pd.DataFrame) -> str:
     """Open loop beside closed loop, of the methods that were executed both ways, in Markdown."""
+    return _loops(found) or NOT_YET
+
+
+@table.sourced
+def _loops(found: pd.DataFrame) -> pd.DataFrame:
     opened, closed = (_printed(chosen(found, execution=execution), LOOP) for execution in (OPEN, CLOSED))
-    both = opened.merge(closed, "right", ["env", "method", "n"], suffixes=(f", {OPEN}", f", {CLOSED}"))
-    return table.markdown(both) if len(both) else NOT_YET
+    return opened.merge(closed, "right", ["env", "method", "n"], suffixes=(f", {OPEN}", f", {CLOSED}"))
 
 
-def planners_table(found: pd.DataFrame) -> str:
+@table.sourced
+def planners_table(found: pd.DataFrame) -> pd.DataFrame:
     """Model and search space by planner, in Markdown: the mean executed return, and in brackets the gap."""
     own = chosen(found)
     own = table.with_method(own[own["model"] != "none"], "model", "search_space")
@@ -234,10 +259,11 @@ def planners_table(found: pd.DataFrame) -> str:
         for word, title in PLANNERS.items()
         if (word, "return_true") in wide
     }
-    return table.markdown(pd.DataFrame(cells, index=wide.index).reset_index())
+    return pd.DataFrame(cells, index=wide.index).reset_index()
 
 
-def spaces_table(found: pd.DataFrame) -> str:
+@table.sourced
+def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
     """What the action prior changes, in Markdown: latent minus direct, paired by target, with half the 95 % t interval.
     found: rows with a ``target``."""
     own = table.select(chosen(found), metric=["return_true", "return_predicted"], search_space=["latent", "direct"])
@@ -250,10 +276,11 @@ def spaces_table(found: pd.DataFrame) -> str:
                  "size of the gap (m)": gaps[0] - gaps[1]}  # fmt: skip
         line = {"env": env, "method": zoo.method(model, "", planner), "n": len(part)}
         lines.append(line | {title: table.spell(values, "{:+.3f} ± {:.3f}") for title, values in cells.items()})
-    return table.markdown(pd.DataFrame(lines)) if lines else ""
+    return pd.DataFrame(lines)
 
 
-def convergence_table(found: pd.DataFrame) -> str:
+@table.sourced
+def convergence_table(found: pd.DataFrame) -> pd.DataFrame:
     """Iterations of planners to 95 % of what they gain in the end, in Markdown, from rows with a ``target``."""
     own = table.with_method(table.select(found, metric="iterations_to_95"))
     lines = [
@@ -261,7 +288,35 @@ def convergence_table(found: pd.DataFrame) -> str:
          **{f"within {bound}": f"{(values <= bound).mean():.1%}" for bound in (100, 150)}}
         for (env, method), part in table.groups(own, ["env", "method"]) for values in [part["value"]]
     ]  # fmt: skip
-    return table.markdown(pd.DataFrame(lines)) if lines else ""
+    return pd.DataFrame(lines)
+
+
+@table.sourced
+def thresholds_table(found: pd.DataFrame, model: str) -> pd.DataFrame:
+    """``thresholds`` in Markdown."""
+    return thresholds(found, model)
+
+
+@table.told
+def plans_told(found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem") -> Iterator[str]:
+    """A sentence per task on plans through learned models: cost beside the oracle's, size of the gap."""
+    for task in tasks:
+        own = table.select(chosen(found, env=task.env), planner=planner)
+        own = own[~own["model"].isin(["oracle", "none"])]
+        cost, gap = (own[own["metric"] == metric]["value"] for metric in ("cost_over_oracle", "relative_gap_median"))
+        if len(cost):
+            yield (f"{task.name}: plans through learned models cost {cost.min():.2f} to {cost.max():.2f} times the "
+                   f"oracle's; the median gap is {gap.min():.1%} to {gap.max():.1%} of the return.")  # fmt: skip
+
+
+@table.told
+def planners_told(found: pd.DataFrame, task: Task, model: str, planners: Sequence[str]) -> Iterator[str]:
+    """A sentence on the executed returns of a model by some planners, in both search spaces."""
+    own = table.select(chosen(found, env=task.env), metric="return_true", model=model, planner=list(planners))
+    own = table.with_method(own)
+    if own["planner"].nunique() == len(planners):
+        said = [f"{method.label} {part['value'].mean():.2f}" for method, part in table.groups(own, "method")]
+        yield f"{task.name}: {', '.join(said)}."
 
 
 def thresholds(found: pd.DataFrame, model: str) -> pd.DataFrame:

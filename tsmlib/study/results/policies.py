@@ -6,7 +6,7 @@ A record stands at the optimiser ``iteration``; for the model-free policies of b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -186,15 +186,48 @@ def _one_env(own: pd.DataFrame) -> pd.DataFrame:
 # Tables --------------------------------------------------------------------------------------------------------------
 
 
-def plateaus_table(found: pd.DataFrame) -> str:
+@table.sourced
+def plateaus_table(found: pd.DataFrame) -> pd.DataFrame:
     """Rows of ``plateau_rows`` in Markdown: what each policy needed to come to 90 %, means over seeds."""
     own = table.with_method(table.select(found, metric=list(SOONEST)), "model", "search_space")
     titles = {metric: (title, "{:,.0f}") for metric, title in SOONEST.items()}
-    return table.markdown(table.printed(table.means(own, ["task", "method"]), titles)) if len(own) else ""
+    return table.printed(table.means(own, ["task", "method"]), titles) if len(own) else own.iloc[:0]
 
 
 def policies_table(curves: Mapping[str, Mapping[Method, Curves]]) -> str:
     """The end of every learning curve in Markdown: means over copies and seeds, with half 95 % intervals."""
+    return table.markdown(_ends(curves))
+
+
+@table.sourced
+def learned_table(found: pd.DataFrame) -> pd.DataFrame:
+    """``policies_table`` of the ``learning_curves`` of rows."""
+    return _ends(learning_curves(found))
+
+
+@table.told
+def learned_told(found: pd.DataFrame, plans: pd.DataFrame, models: Sequence[str]) -> Iterator[str]:
+    """A sentence per task on policies of some models: where they end, and their returns beside open-loop plans'.
+
+    plans: rows of the same table with those of plans, of which the same source counts.
+    """
+    same = plans[plans["source"].isin(found["source"].unique())] if "source" in found else plans
+    for task, curves in learning_curves(found).items():
+        inside = [own for method, own in curves.items() if method.model in models]
+        free = [own["return_true"][:, -1].mean() for method, own in curves.items() if not method.search_space]
+        plans_of = table.select(same, task=task, metric="return_true", execution="open loop", iteration=None)
+        planned = plans_of[~plans_of["model"].isin(["oracle", "none"])]["value"]
+        if inside:
+            ends = [own["final_distance"][:, -1].mean() for own in inside]
+            returns = [own["return_true"][:, -1].mean() for own in inside]
+            text = (f"{task}: policies learned inside the baselines end {min(ends):.3f} to {max(ends):.3f} m from "
+                    f"their targets on average and return {min(returns):.2f} to {max(returns):.2f}")  # fmt: skip
+            text += f", open-loop plans {planned.min():.2f} to {planned.max():.2f}" if len(planned) else ""
+            text += f", model-free policies {min(free):.2f} to {max(free):.2f}" if free else ""
+            yield text + "."
+
+
+def _ends(curves: Mapping[str, Mapping[Method, Curves]]) -> pd.DataFrame:
     shown = {"return_true": "executed return", "return_predicted": "predicted return",
              "final_distance": "final distance (m)", "success": ARRIVED,
              "within_data": "steps within the data"}  # fmt: skip
@@ -207,4 +240,4 @@ def policies_table(curves: Mapping[str, Mapping[Method, Curves]]) -> str:
         for task, methods in curves.items()
         for method, own in methods.items()
     ]  # fmt: skip
-    return table.markdown(pd.DataFrame(lines)) if lines else ""
+    return pd.DataFrame(lines)

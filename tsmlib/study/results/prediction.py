@@ -9,7 +9,7 @@ timestep".
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from tsmlib.evaluation.contacts import after_first, contact_steps
 from tsmlib.evaluation.prediction import Scores, cut
 from tsmlib.evaluation.scoring import LEVELS
 from tsmlib.figures.method import Method
+from tsmlib.study import zoo
 from tsmlib.study.results import table
 from tsmlib.study.results.table import Row
 from tsmlib.trajectory import Trajectories
@@ -29,6 +30,13 @@ from tsmlib.trajectory import Trajectories
 SEGMENTS = range(10, 100, 30)  # steps at which the segments that are scored from the true past begin
 HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
+NAMES = {  # of metrics, as readers meet them
+    "ll_paper": "log-likelihood, paper's protocol", "ll_shared": "log-likelihood, one shared variance",
+    "ll_horizon": "log-likelihood, variance per step", "ll_own": "log-likelihood, own density",
+    "energy_score": "energy score, bare samples", "energy_score_noise": "energy score", "crps_noise": "CRPS",
+    "nrmse": "error / data's s.d.", "coverage80": "truths in 80 % intervals", "diverged": "rollouts out of range",
+    "spread": "spread of samples", "error": "error", "kl": "KL (nats)", "active_units": "active units",
+}  # fmt: skip
 
 
 def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajectories, **common: object) -> list[Row]:
@@ -121,6 +129,35 @@ def values(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> di
     return table.values(select(found, metric, env=env, **where))
 
 
+@table.sourced
+def best_table(found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]) -> pd.DataFrame:
+    """The best model of each environment by some metrics, in Markdown; titles: of metrics."""
+    ranked = {env: {title: ranking(found, metric, env=env) for metric, title in titles.items()} for env in envs}
+    return pd.DataFrame(
+        {"env": env} | {title: zoo.look(order[0]).name for title, order in row.items()}
+        for env, row in ranked.items() if all(row.values())
+    )  # fmt: skip
+
+
+@table.told
+def versus(
+    found: pd.DataFrame, subject: str, rival: str, metric: str, envs: Sequence[str], **where: object
+) -> Iterator[str]:
+    """A sentence per environment: the values of two models, and their difference where it has an interval."""
+    for env in envs:
+        of = values(found, metric, env=env, **where)
+        if subject in of and rival in of:
+            apart = paired(found, subject, metric, env=env, **where).get(zoo.method(rival), np.zeros(0))
+            more = f"; difference {table.spell(apart)}" if len(apart) > 1 else ""
+            yield (f"{EnvSpec.parse(env).name}, {NAMES[metric]}: {zoo.look(subject).name} {table.spell(of[subject])}, "
+                   f"{zoo.look(rival).name} {table.spell(of[rival])}{more}.")  # fmt: skip
+
+
+def named(*metrics: str) -> dict[str, str]:
+    """Metrics with their NAMES, for ``scores_table``."""
+    return {metric: NAMES[metric] for metric in metrics}
+
+
 def ranking(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> list[str]:
     """Models from the best to the worst mean over seeds."""
     means = {model: seeds.mean() for model, seeds in values(found, metric, env=env, **where).items()}
@@ -142,6 +179,33 @@ def curves(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> di
     return table.methods(lines)
 
 
+def score_panels(found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]) -> dict[str, Any]:
+    """The input of ``figures.figure5``: title -> environment -> method -> one value per seed; titles: of metrics."""
+    found_of = {metric: {env: table.methods(values(found, metric, env=env)) for env in envs} for metric in titles}
+    return {titles[metric]: {EnvSpec.parse(env).name: found for env, found in rows.items() if found}
+            for metric, rows in found_of.items()}  # fmt: skip
+
+
+def horizon_panels(found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]) -> dict[str, Any]:
+    """The input of ``figures.against_horizon``: a panel for each environment and metric; titles: of metrics."""
+    return {f"{EnvSpec.parse(env).name}: {title}": curves(found, metric, env=env)
+            for env in envs for metric, title in titles.items()}  # fmt: skip
+
+
+def paired_panels(found: pd.DataFrame, subject: str, titles: Mapping[str, str], env: str) -> dict[str, Any]:
+    """The input of ``figures.differences`` of an environment: a panel for each metric; titles: of metrics."""
+    return {title: paired(found, subject, metric, env=env) for metric, title in titles.items()}
+
+
+def calibration_panels(found: pd.DataFrame, envs: Sequence[str]) -> dict[str, Any]:
+    """The input of ``figures.calibration``: a panel for each environment, then those after contact."""
+    contact = [env for env in envs if EnvSpec.parse(env).has_block]
+    panels = {EnvSpec.parse(env).name: calibration(found, env=env) for env in envs}
+    return panels | {
+        f"{EnvSpec.parse(env).name}, after contact": calibration(found, env=env, subset="contact") for env in contact
+    }
+
+
 def calibration(found: pd.DataFrame, *, env: str, **where: object) -> dict[Method, np.ndarray]:
     """Method -> (19,): observed coverage at the nominal LEVELS, mean over seeds."""
     metrics = [_coverage(level) for level in LEVELS]
@@ -149,24 +213,34 @@ def calibration(found: pd.DataFrame, *, env: str, **where: object) -> dict[Metho
     return table.methods(table.arrays(wide.T))
 
 
+@table.sourced
 def scores_table(
     found: pd.DataFrame,
-    metrics: Sequence[str],
+    metrics: Sequence[str] | Mapping[str, str],
     *,
     env: str,
     steps_ahead: Sequence[int | None] = (None,),
     **where: object,
-) -> str:
-    """A Markdown table: one line per model, mean over seeds ± half its 95 % interval; fewer seeds are said."""
-    own = select(found, metrics, env=env, steps_ahead=list(steps_ahead), **where)
+) -> pd.DataFrame:
+    """A Markdown table: one line per model, mean over seeds ± half its 95 % interval; fewer seeds are said.
+
+    metrics: their words, or with them the titles of columns; then models stand by their names.
+    """
+    own = select(found, list(metrics), env=env, steps_ahead=list(steps_ahead), **where)
     if own.empty:
-        return ""
+        return own
+    titles = metrics if isinstance(metrics, Mapping) else {metric: metric for metric in metrics}
     own = own.assign(
-        column=own["metric"] + own["steps_ahead"].map(lambda h: "" if pd.isna(h) else f" at {h}").astype(str)
+        column=own["metric"].map(titles)
+        + own["steps_ahead"].map(lambda h: "" if pd.isna(h) else f" at {h}").astype(str)
     )
-    titles = [metric + (f" at {h}" if h else "") for metric in metrics for h in steps_ahead]
+    columns = [title + (f" at {h}" if h else "") for title in titles.values() for h in steps_ahead]
     wide = own.pivot_table(index="model", columns="column", values="value", aggfunc=table.spell, sort=False)
-    seeds = own[own["column"] == titles[0]].groupby("model")["seed"].nunique()
-    wide = wide.reindex(columns=titles).loc[[model for model in wide.index if model in seeds]]
-    wide.index = [f"{model} (seeds: {seeds[model]})" if seeds[model] < seeds.max() else model for model in wide.index]
-    return table.markdown(wide.rename_axis("model").reset_index())
+    seeds = own[own["column"] == columns[0]].groupby("model")["seed"].nunique()
+    wide = wide.reindex(columns=columns).loc[[model for model in wide.index if model in seeds]]
+    names = wide.index if titles is not metrics else [zoo.look(model).name for model in wide.index]
+    fewer = [f" (seeds: {n})" if (n := seeds[model]) < seeds.max() else "" for model in wide.index]
+    if "source" in found:
+        wide.insert(0, "n", own.groupby("model")["n"].max())
+    wide.index = [name + few for name, few in zip(names, fewer, strict=True)]
+    return wide.rename_axis("model").reset_index()

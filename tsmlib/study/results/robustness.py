@@ -6,7 +6,7 @@ An imperfect arm's rows have the plain arm's name as ``env``; what is imperfect 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from tsmlib.evaluation.filtering import PARTS, rmse
 from tsmlib.figures.method import Method
 from tsmlib.study import zoo
 from tsmlib.study.results import table
-from tsmlib.study.results.prediction import paired, values
+from tsmlib.study.results.prediction import paired, select, values
 from tsmlib.study.results.table import Row
 
 LAST = 880  # iterations up to which policies are compared; by then the curves of 05_control are flat
@@ -76,9 +76,52 @@ def filtering_panels(
         at = [values(found, metric, env=env, execution="segments", steps_ahead=step) for step in range(11)]
         drawn = [model for model in at[1] if model in (*models, "filter")]
         ahead[title] = {zoo.method(model): np.stack([step[model] for step in at[1:]], 1) for model in drawn}
-        now[title] = {zoo.method(model): float(at[0][model].mean()) for model in ("filter", "exponential")}
+        now[title] = {zoo.method(model): float(at[0][model].mean()) for model in ("filter", "exponential")
+                      if model in at[0]}  # fmt: skip
         raw[title] = float(at[1]["none"].mean())
     return ahead, now, raw
+
+
+def own_errors(found: pd.DataFrame, env: str, models: Sequence[str]) -> dict[str, Any]:
+    """The reader's own in ``figures.filtering_errors``: panel -> method -> errors ahead (k, 10)."""
+    if not len(select(found, "rmse_clean", env=env, execution="segments", steps_ahead=1)):
+        return {}
+    return filtering_panels(found, env, models)[0]
+
+
+@table.told
+def errors_told(found: pd.DataFrame, env: str, models: Sequence[str]) -> Iterator[str]:
+    """A sentence on errors to the clean state, one and ten steps ahead, as shares of the raw observation's."""
+    for step in (1, 10):
+        of = values(found, "rmse_clean", env=env, execution="segments", steps_ahead=step)
+        words = {**{model: zoo.look(model).name for model in models}, "filter": "Kalman filter"}
+        said = [f"{name} {of[model].mean() / of['none'].mean():.2f}" for model, name in words.items() if model in of]
+        if said and "none" in of:
+            yield f"{step} step{'s' * (step > 1)} ahead, as shares of the raw observation's: {', '.join(said)}."
+
+
+@table.told
+def worlds_told(found: pd.DataFrame, envs: Mapping[str, str], models: Sequence[str]) -> Iterator[str]:
+    """A sentence per world on errors and on truths within 80 % intervals. envs: world -> environment."""
+    for title, env in envs.items():
+        error, held = (values(found, metric, env=env) for metric in ("nrmse", "coverage80"))
+        blind = values(found, "nrmse", env=env, subset="past actions zero")
+        if said := [f"{zoo.look(model).name} {error[model].mean():.2f}" for model in models if model in error]:
+            text = f"{title}, error / data's s.d.: {', '.join(said)}"
+            text += "".join(f"; {zoo.look(model).name} shown zeros for past actions {blind[model].mean():.2f}"
+                            for model in models if model in blind)  # fmt: skip
+            yield text + "."
+        if said := [f"{zoo.look(model).name} {held[model].mean():.0%}" for model in models if model in held]:
+            yield f"{title}, truths within 80 % intervals: {', '.join(said)}."
+
+
+@table.told
+def lost_told(found: pd.DataFrame, methods: Sequence[Method], random: float, last: int = LAST) -> Iterator[str]:
+    """A sentence per world on the share of the clean arm's gain over random torques that policies lose there."""
+    for arm in ("noise", "delay"):
+        shares = {method: lost(found, method, arm, last, random) for method in methods}
+        if said := [f"{method.label} {share:.0%}" for method, share in shares.items() if share == share]:
+            yield f"{arm}, lost of the clean gain: {', '.join(said)}."
 
 
 def world(noise: float, delay: int) -> str:
@@ -86,6 +129,12 @@ def world(noise: float, delay: int) -> str:
     words = [word if value == paper else f"{word} {value:g}"
              for word, value, paper in (("noise", noise, NOISE), ("delay", delay, DELAY)) if value]  # fmt: skip
     return ", ".join(words) or "clean"
+
+
+@table.sourced
+def thresholds_table(found: pd.DataFrame, method: Method, random: float, last: int = LAST) -> pd.DataFrame:
+    """``thresholds`` in Markdown."""
+    return thresholds(found, method, random, last)
 
 
 def _policies(found: pd.DataFrame, last: int, *metrics: str) -> pd.DataFrame:
@@ -102,7 +151,8 @@ def _ends(found: pd.DataFrame, last: int, *metrics: str) -> pd.DataFrame:
     return own[own["iteration"] == end]
 
 
-def policies_table(found: pd.DataFrame, last: int = LAST) -> str:
+@table.sourced
+def policies_table(found: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
     """What policies come to in each world, in Markdown: means over copies with half their 95 % t interval, at the
     last record of at most ``last`` iterations."""
     shown = {"return_true": "executed return", "final_distance": "final distance (m)", "success50": "within 0.05 m"}
@@ -112,7 +162,7 @@ def policies_table(found: pd.DataFrame, last: int = LAST) -> str:
     )
     titles = {f"{arm}: {title}": (arm, metric) for arm in ends["world"].unique() for metric, title in shown.items()}
     columns = {title: wide[column] for title, column in titles.items() if column in wide}
-    return table.markdown(pd.DataFrame(columns, index=wide.index).reset_index())
+    return pd.DataFrame(columns, index=wide.index).reset_index()
 
 
 def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float) -> float:
@@ -135,20 +185,22 @@ def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Met
 
 def advantage(
     found: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
-) -> dict[str, np.ndarray]:
-    """``subject`` minus each rival in ``ll_horizon``, nats per step, over noise and delay: the input of the map.
+) -> dict[str, dict[Method, float]]:
+    """``subject`` minus each rival in ``ll_horizon``, nats per step: the input of the map.
 
-    Panel -> (noises, delays); pairs of training seeds averaged; NaN where there are no rows. Beside the plain arm the
-    one with the obstacle, from the first touch on.
+    Place -> rival -> mean over pairs of training seeds; places without any are left out. The plain arm with every noise
+    and delay, then the one with the obstacle, from the first touch on.
     """
-    maps, places = {}, {"plain arm": ("tsm/Reacher-v0", ""), "after contact": ("tsm/ReacherObstacle-v0", "contact")}
+    plain, obstacle = "tsm/Reacher-v0", "tsm/ReacherObstacle-v0"
+    places = {f"noise {noise:g}, delay {delay}": (imperfect(plain, noise=noise, delay=delay), "")
+              for delay in delays for noise in noises}  # fmt: skip
+    places["obstacle, after contact"] = obstacle, "contact"
+    ahead = {}
     for words, (env, subset) in places.items():
-        arms = [[imperfect(env, noise=noise, delay=delay) for delay in delays] for noise in noises]
-        pairs = [[paired(found, subject, "ll_horizon", env=arm, subset=subset) for arm in line] for line in arms]
-        for other in map(zoo.method, rivals):
-            grid = [[cell[other].mean() if other in cell else np.nan for cell in line] for line in pairs]
-            maps[f"{words}: minus {other.label}"] = np.array(grid)
-    return maps
+        pairs = paired(found, subject, "ll_horizon", env=env, subset=subset)
+        if rows := {other: float(pairs[other].mean()) for other in map(zoo.method, rivals) if other in pairs}:
+            ahead[words] = rows
+    return ahead
 
 
 def thresholds(found: pd.DataFrame, method: Method, random: float, last: int = LAST) -> pd.DataFrame:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,21 @@ from tsmlib.storage import tables
 from tsmlib.study.runs import Run
 from tsmlib.study.zoo import LOOKS, ZOO, method
 
+P = ParamSpec("P")
 T = TypeVar("T")
+PUBLISHED, YOURS = "published", "yours"  # of the column source, see study.evidence
+KEYS = (
+    "env",
+    "task",
+    "torque_weight",
+    "model",
+    "method",
+    "torques",
+    "search_space",
+    "planner",
+    "start",
+    "what",
+)  # what a line is about
 Row = dict[str, Any]
 Columns = Mapping[str, tuple[str, str]]  # metric -> title and format of its column
 
@@ -126,6 +141,124 @@ def means(table: pd.DataFrame, by: str | list[str], columns: str | list[str] = "
     return table.pivot_table(index=by, columns=columns, values="value", sort=False)
 
 
+# Published rows and the reader's own ----------------------------------------------------------------------------------
+
+
+def drawn(found: pd.DataFrame) -> pd.DataFrame:
+    """The rows that a figure draws in full: the published ones; at scale paper, whose figures are published, the run's
+    own. All of them where no ``source`` is told."""
+    if "source" not in found:
+        return found
+    own = select(found, source=YOURS)
+    return own if "paper" in set(own["scale"]) else select(found, source=PUBLISHED)
+
+
+def beside(found: pd.DataFrame) -> pd.DataFrame:
+    """The reader's own rows, where ``drawn`` gives those of others."""
+    if "source" not in found:
+        return found.iloc[:0]
+    own = select(found, source=YOURS)
+    return own.iloc[:0] if "paper" in set(own["scale"]) else own
+
+
+def pair(
+    found: pd.DataFrame, read: Callable[[pd.DataFrame], Mapping[str, Mapping[Any, Any]]]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What ``read`` makes of the rows that are drawn in full, and of the reader's own beside them: title -> panel.
+
+    Panels for which neither has rows are left out.
+    """
+    first, second = read(drawn(found)), read(beside(found))
+    titles = [title for title in {**first, **second} if first.get(title) or second.get(title)]
+    return {title: first.get(title, {}) for title in titles}, {
+        title: second[title] for title in titles if second.get(title)
+    }
+
+
+def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
+    """Where rows are from, in one line: scale, seeds and n of the published ones and of the reader's own.
+
+    Arms of which nothing is published are named. figure: only of what a figure shows, which says less at scale paper.
+    """
+    shown = pd.concat([drawn(found), beside(found)]) if figure else found
+    said = []
+    for source, part in groups(shown, "source"):
+        title = "" if figure and len(beside(found)) == 0 and source == YOURS else f"{source}: "
+        said.append(f"{title}{_origin(part)}")
+    known = set(select(found, source=PUBLISHED)["env"])
+    if figure and beside(found).empty:  # at scale paper it is what will be published
+        known |= set(found["env"])
+    if missing := [env for env in found["env"].unique() if env and env not in known]:
+        names = ", ".join(EnvSpec.parse(env).name for env in missing)
+        said.append(f"of {names} nothing is published")
+    return "; ".join(said)
+
+
+def _origin(part: pd.DataFrame) -> str:
+    seeds, counts = sorted(set(part["seed"].dropna())), sorted(set(part["n"].dropna()))
+    if "target" in part and part["target"].notna().all():  # rows of single targets
+        counts = [part["target"].nunique()]
+    words = [f"scale {', '.join(part['scale'].unique())}"]
+    words += [f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"] * bool(seeds)
+    words += [f"n {'up to' if len(counts) > 1 else '='} {counts[-1]:,}"] * bool(counts)
+    return ", ".join(words)
+
+
+def sourced(make: Callable[Concatenate[pd.DataFrame, P], pd.DataFrame]) -> Callable[Concatenate[pd.DataFrame, P], str]:
+    """A table in Markdown with a line for the published rows and one for the reader's own, next to each other.
+
+    A column says which is which, with n where lines have one. Rows without a ``source`` make the table as it is.
+    """
+
+    @wraps(make)
+    def made(found: pd.DataFrame, *args: P.args, **kwargs: P.kwargs) -> str:
+        if "source" not in found:
+            return markdown(make(found, *args, **kwargs))
+        parts = [(part, make(part, *args, **kwargs)) for _, part in groups(found, "source")]
+        labelled = [_labelled(lines, part) for part, lines in parts if len(lines)]
+        return markdown(_alternating(pd.concat(labelled, ignore_index=True))) if labelled else ""
+
+    return made
+
+
+def told(
+    say: Callable[Concatenate[pd.DataFrame, P], Iterable[str]],
+) -> Callable[Concatenate[pd.DataFrame, P], str]:
+    """Sentences that are made of rows, as a Markdown list: those of the published ones, then the reader's own."""
+
+    @wraps(say)
+    def made(found: pd.DataFrame, *args: P.args, **kwargs: P.kwargs) -> str:
+        parts = groups(found, "source") if "source" in found else iter([("", found)])
+        lines = [f"- {source and source.capitalize() + ': '}{text}" for source, part in parts
+                 for text in say(part, *args, **kwargs)]  # fmt: skip
+        return "\n".join(lines)
+
+    return made
+
+
+def _labelled(lines: pd.DataFrame, part: pd.DataFrame) -> pd.DataFrame:
+    """A table of rows of one source, with the column ``rows`` after those that say what a line is about."""
+    source = part["source"].iloc[0]
+    own = source == YOURS
+    seeds = ", ".join(map(str, sorted(set(part["seed"].dropna()))))
+    more = f", seed {seeds}, scale {part['scale'].iloc[0]}" if own else ""
+    counts = lines["n"].tolist() if "n" in lines else [""] * len(lines)
+    texts = [f"{source}{'' if n == '' or pd.isna(n) else f', n = {n:,}'}{more}" for n in counts]
+    place = sum(name in KEYS for name in lines)
+    keys = [name for name in lines if name in KEYS]
+    rest = [name for name in lines if name not in (*KEYS, "n")]
+    found = lines[[*keys, *rest]].copy()
+    found.insert(place, "rows", [f"**{text}**" if own else text for text in texts])
+    return found
+
+
+def _alternating(lines: pd.DataFrame) -> pd.DataFrame:
+    """Lines about the same below each other, otherwise in order of appearance."""
+    keys = [name for name in lines if name in KEYS]
+    ranks = pd.DataFrame({name: pd.factorize(lines[name].map(str))[0] for name in keys}, index=lines.index)
+    return lines.loc[ranks.sort_values(keys, kind="stable").index] if keys else lines
+
+
 # Printed tables ------------------------------------------------------------------------------------------------------
 
 
@@ -143,7 +276,9 @@ def printed(wide: pd.DataFrame, columns: Columns) -> pd.DataFrame:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """A Markdown table of texts; methods and environments as readers know them."""
+    """A Markdown table of texts, empty without lines; methods and environments as readers know them."""
+    if not len(table):
+        return ""
     known: dict[str, Callable[[Any], str]] = {
         "env": "`{}`".format, "method": lambda method: method.label, "reached": {True: "yes", False: "no"}.__getitem__,
     }  # fmt: skip

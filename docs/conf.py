@@ -1,0 +1,50 @@
+"""The documentation site: ``make docs``. Nothing is fetched and no notebook is executed while it is built.
+
+The notebooks of ``notebooks/`` are pages as they are stored. To show them with their outputs, name the run whose
+executed notebooks are to be shown instead: ``make docs RUN=runs/laptop/seed0``.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parent)]
+
+import tsmlib  # noqa: E402
+
+project, author, release = "tsmlib", "The tsmlib authors", tsmlib.__version__
+copyright = "the tsmlib authors, MIT licence"
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "pages",  # beside this file
+]
+exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
+templates_path = ["_templates"]
+
+# Pages
+myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+myst_heading_slug_func = "pages.anchor"
+nb_execution_mode = "off"
+nitpicky = True
+nitpick_ignore_regex = [(r"py:.*", r"(?!tsmlib\.).*|.*\.[A-Z]")]  # types of other libraries, and type variables
+suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets of executed notebooks
+
+# API
+autosummary_generate = True
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+toc_object_entries = False
+
+# Look
+html_theme = "furo"
+html_title = f"tsmlib {release}"
+html_copy_source = False
+html_static_path: list[str] = []

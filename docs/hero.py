@@ -1,0 +1,61 @@
+"""The animated picture at the top of README: ``python docs/hero.py`` writes figures/hero.webp.
+
+A plan through the shipped ``rtsm`` for the first frozen targets of pushing; shown is the one with the median final
+distance, at half speed, left the rollout that the model predicted, right the executed one.
+"""
+
+import argparse
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import tsmlib as tsm
+from tsmlib.envs.render import render_array
+from tsmlib.figures import side_by_side
+from tsmlib.storage.files import write_bytes
+from tsmlib.study.results.planning import by_final_distance
+
+LARGEST = 3_000_000  # bytes
+
+
+def frames(env: str, targets: int, model: Path | None) -> np.ndarray:
+    """The film (T, height, width, 3). model: a file in place of the shipped one."""
+    net = tsm.load_model(model, tsm.RecurrentTSM) if model else tsm.load_pretrained("rtsm", env=env)
+    task = tsm.load_task(env).take(targets)
+    space = tsm.LatentActions(tsm.load_pretrained("prior", env=env), task.horizon)
+    predict = tsm.model_predictor(net, task.past(net.past_len))
+    trial = tsm.execute(task, tsm.cem(predict, task.reward, space, targets, candidates=96, progress="planning"))
+    order = by_final_distance(task, trial)
+    target = order[len(order) // 2]
+    with torch.no_grad():
+        predicted = predict(trial.actions[None])[0, 0, target]
+    goal = task.target[target].numpy()
+    rollouts = {"predicted": predicted, "executed": trial.states[target, 1:]}
+    return side_by_side({
+        word: np.stack([render_array(state.numpy(), env, goal, size=360) for state in states])
+        for word, states in rollouts.items()
+    })  # fmt: skip
+
+
+def save_webp(film: np.ndarray, path: Path, *, milliseconds: int = 40) -> None:
+    """Write ``film`` (T, H, W, 3) uint8 as an animation that repeats, its last frame held for a second and a half."""
+    images = [Image.fromarray(frame) for frame in film]
+    held = [milliseconds] * (len(images) - 1) + [1500]
+    made = BytesIO()
+    images[0].save(made, "WEBP", save_all=True, append_images=images[1:], duration=held, loop=0, quality=70, method=4)
+    if len(made.getvalue()) > LARGEST:
+        raise ValueError(f"{path} would have {len(made.getvalue()):,} bytes, expected at most {LARGEST:,}")
+    write_bytes(path, made.getvalue())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--env", default="tsm/ReacherPush-v1")
+    parser.add_argument("--targets", type=int, default=8)
+    parser.add_argument("--model", type=Path, help="a model file in place of the shipped rtsm")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "figures" / "hero.webp")
+    given = parser.parse_args()
+    save_webp(frames(given.env, given.targets, given.model), given.out)

@@ -1,0 +1,105 @@
+"""Sphinx extension of this site: pages of notebooks and modules, links into them, and docstrings as they are written.
+
+Docstrings of tsmlib are plain text with ``code``, paragraphs and indented formulas. Read as reStructuredText,
+``(C, B, *shape)`` would open an emphasis and ``E|X - x|`` a substitution.
+"""
+
+import os
+import re
+import shutil
+from itertools import groupby
+from pathlib import Path
+
+import nbformat
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+MARKUP = re.compile(r"(``.+?``)")
+SPECIAL = re.compile(r"([\\*|_`])")
+
+
+def process(app: object, what: str, name: str, found: object, options: object, lines: list[str]) -> None:
+    """Turn the ``lines`` of a docstring into reStructuredText that looks like them. Sphinx's own signature."""
+    paragraphs = [list(part) for filled, part in groupby(lines, key=lambda line: bool(line.strip())) if filled]
+    lines[:] = [line for paragraph in paragraphs for line in [*converted(paragraph), ""]]
+
+
+def converted(paragraph: list[str]) -> list[str]:
+    """One paragraph: indented is a formula, partly indented or a list keeps its lines, all else is text."""
+    indents = [len(line) - len(line.lstrip()) for line in paragraph]
+    if min(indents):
+        return ["::", "", *("    " + line for line in paragraph)]
+    if max(indents) or paragraph[0].startswith(("- ", "1. ")):
+        return ["| " + " " * indent + escaped(line.strip()) for indent, line in zip(indents, paragraph, strict=True)]
+    return [escaped(line) for line in paragraph]
+
+
+def escaped(line: str) -> str:
+    """The line without markup, but for ``code``."""
+    parts = MARKUP.split(line)
+    return "".join(part if MARKUP.fullmatch(part) else SPECIAL.sub(r"\\\1", part) for part in parts)
+
+
+def anchor(title: str) -> str:
+    """Anchor of a heading as Jupyter makes it, so that a link into a notebook works in both."""
+    return title.strip().replace(" ", "-")
+
+
+def linked(text: str) -> str:
+    """Links to notebooks as links to their pages, and to what is no page as its path."""
+    text = re.sub(r"\[[^\]]+\]\((?:\.\./)+(benchmarks/[^)]+)\)", r"`\1`", text)
+    return re.sub(r"\]\((?:\.\./)+notebooks/", "](/notebooks/", text)
+
+
+def public_names() -> dict[str, list[str]]:
+    """Module -> names of it that ``import tsmlib`` gives, which have pages of their own."""
+    found: dict[str, list[str]] = {}
+    stub = (ROOT / "tsmlib" / "__init__.pyi").read_text()
+    for module, name in re.findall(r"^from \.([\w.]+) import (\w+) as", stub, re.MULTILINE):
+        found.setdefault(f"tsmlib.{module}", []).append(name)
+    return found
+
+
+def write_modules() -> None:
+    """docs/api/modules/ anew: a page for each module, of all its names but those that have a page of their own."""
+    target, public = HERE / "api" / "modules", public_names()
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    for path in sorted((ROOT / "tsmlib").rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        if name in ("tsmlib", "tsmlib.__main__"):
+            continue
+        lines = [name.replace("_", r"\_"), "=" * len(2 * name), "", f".. automodule:: {name}"]
+        if not path.with_suffix(".pyi").exists():  # what a facade gives has its page already
+            lines += ["   :members:", f"   :exclude-members: {', '.join(public.get(name, []))}"]
+        if name in public:
+            lines += ["", "On pages of their own: " + ", ".join(f":py:obj:`~tsmlib.{one}`" for one in public[name])]
+        (target / f"{name}.rst").write_text("\n".join([*lines, ""]))
+
+
+def copy_notebooks() -> None:
+    """docs/notebooks/ anew: the stored notebooks, or those that the run of $TSM_DOCS_RUN executed where it has them."""
+    target, executed = HERE / "notebooks", os.environ.get("TSM_DOCS_RUN", "")
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    for path in sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb")):
+        own = ROOT / executed / path.name
+        notebook = nbformat.read(own if executed and own.exists() else path, 4)
+        for cell in notebook.cells:
+            if cell.cell_type == "markdown":
+                cell.source = linked(cell.source.replace("](../docs/", "](../"))
+        nbformat.write(notebook, target / path.name)
+
+
+def read(app: Sphinx, name: str, source: list[str]) -> None:
+    """Sphinx's event source-read."""
+    source[0] = linked(source[0])
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    copy_notebooks()
+    write_modules()
+    app.connect("source-read", read)
+    app.connect("autodoc-process-docstring", process)
+    return {"parallel_read_safe": True}

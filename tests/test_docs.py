@@ -1,0 +1,80 @@
+"""What a person reads: README is short, each block of Python in it and in docs/ runs, results are those of the rows."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tsmlib.study import publish
+from tsmlib.study.runs import ROOT
+
+README, DOCS = ROOT / "README.md", ROOT / "docs"
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+WRITTEN = [page for page in sorted(DOCS.rglob("*.md")) if "_build" not in page.parts]
+PAGES = [page for page in WRITTEN if BLOCK.search(page.read_text())]
+
+
+def run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The Python blocks of a page as one program, in an empty folder: the names that it leaves."""
+    monkeypatch.chdir(folder)
+    names: dict[str, Any] = {"__name__": page.stem}
+    exec(compile("\n".join(BLOCK.findall(page.read_text())), str(page), "exec"), names)
+    return names
+
+
+def test_the_readme_is_a_screen_and_a_half() -> None:
+    assert len(README.read_text().splitlines()) <= 120
+    assert README.stat().st_size <= 8192
+
+
+def test_the_plan_in_the_readme_is_far_better_than_doing_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = run(README, tmp_path, monkeypatch)
+    predicted = -names["plan"].predicted_return.mean()
+    cost, nothing = (-names[name].executed_return.mean() for name in ("trial", "idle"))
+    assert cost <= 0.6 * nothing
+    assert abs(cost - predicted) <= 0.1 * cost  # as predicted by samples that had no part in choosing the plan
+    assert (tmp_path / "reach.mp4").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_program_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(page, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [README, *sorted(DOCS.glob("[!_]*.md")), *sorted(DOCS.glob("[!_]*/*.md")), ROOT / "CONTRIBUTING.md"],
+    ids=str,
+)
+def test_a_page_names_commands_and_files_that_exist(page: Path) -> None:
+    text, makefile = page.read_text(), (ROOT / "Makefile").read_text()
+    for target in re.findall(r"(?:^|`)make (\w+)", text, re.MULTILINE):
+        assert re.search(rf"^(\w+ )*{target}( \w+)*:", makefile, re.MULTILINE), target
+    for name in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        assert (page.parent / name).exists(), name
+
+
+@pytest.mark.parametrize("asked", ["own environment", "own robot", "fine-tune", "cluster"])
+def test_a_search_finds_a_how_to(asked: str) -> None:
+    words = asked.replace("fine-tune", "fine-tun").split()
+    titles = [page.read_text().partition("\n")[0].lower() for page in (DOCS / "howto").glob("*.md")]
+    assert any(all(word in title for word in words) for title in titles)
+
+
+def test_written_results_are_those_of_the_shipped_tables() -> None:
+    again = "what is written of the results is not what data/results says; run: python -m tsmlib publish --claims"
+    assert publish.readme_results() in README.read_text(), again
+    assert publish.results_page() in publish.RESULTS_PAGE.read_text(), again
+
+
+def test_templates_and_workflow_are_yaml() -> None:
+    files = sorted((ROOT / ".github").rglob("*.yml"))
+    assert len(files) >= 4
+    for path in files:
+        assert yaml.safe_load(path.read_text()), path

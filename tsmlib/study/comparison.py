@@ -1,0 +1,40 @@
+"""What a notebook shows: the reader's own rows beside the published ones."""
+
+from collections.abc import Iterable, Mapping
+
+import pandas as pd
+
+from tsmlib.storage import tables
+from tsmlib.study import predictions
+from tsmlib.study.results.table import PUBLISHED, YOURS
+from tsmlib.study.runs import Run
+
+
+def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
+    """The published rows of a notebook's table and those of this run, told apart by the column ``source``.
+
+    At scale paper the other seeds beside this run are its own too (``published_rows``). table: what follows the
+    notebook's name in the table's, ``_rows`` for instance. What is written stays without the column: ``tables.save``
+    and ``publish`` know nothing of it.
+    """
+    path = predictions.RESULTS / f"{run.notebook}{table}.csv"
+    published = tables.load(path) if path.exists() else tables.frame([])
+    own = predictions.published_rows(run, rows, table) if run.scale == "paper" else tables.frame(rows)
+    return _sourced(published, own)
+
+
+def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFrame:
+    """Write the table of a notebook's run, without the column ``source``. Returns its ``evidence``."""
+    tables.save(run.metrics / f"{run.notebook}.csv", rows)
+    return evidence(run, rows)
+
+
+def evidence_of(run: Run, notebook: str) -> pd.DataFrame:
+    """``evidence`` of another notebook's table; of this run's rows those of this seed, where it ran there."""
+    own, published = run.metrics / f"{notebook}.csv", predictions.RESULTS / f"{notebook}.csv"
+    return _sourced(*(tables.load(path) if path.exists() else tables.frame([]) for path in (published, own)))
+
+
+def _sourced(published: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
+    parts = {PUBLISHED: published, YOURS: own}
+    return tables.frame(pd.concat([part.assign(source=source) for source, part in parts.items()]))
