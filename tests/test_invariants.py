@@ -112,10 +112,12 @@ def test_every_made_up_violation_is_found() -> None:
 
 
 def test_shares_are_of_the_steps_of_each_plan() -> None:
-    dreams = still(20)
-    dreams[3, 26:, 6] += 0.1  # 25 of its 50 steps
-    dreams[7, :, 0], dreams[7, 0, 0] = np.pi / 2, 0.0  # the arm lies inside the object, but for the start
-    found = shares(dreams[:, 0], np.stack([dreams[:, 1:], still(20)[:, 1:]]), PUSH)  # every other dream is sound
+    predicted = still(20)
+    predicted[3, 26:, 6] += 0.1  # 25 of its 50 steps
+    predicted[7, :, 0], predicted[7, 0, 0] = np.pi / 2, 0.0  # the arm lies inside the object, but for the start
+    found = shares(
+        predicted[:, 0], np.stack([predicted[:, 1:], still(20)[:, 1:]]), PUSH
+    )  # every other rollout is sound
     expected = np.zeros((2, 20))
     expected[0, 3], expected[1, 7] = 0.25, 0.5
     np.testing.assert_allclose(found["moves_untouched"], expected[0])
@@ -123,7 +125,7 @@ def test_shares_are_of_the_steps_of_each_plan() -> None:
     np.testing.assert_allclose(found["violations"], expected.sum(0))
 
 
-def test_the_worst_tenth_is_what_was_promised_most_in_excess() -> None:
+def test_the_worst_tenth_is_what_was_predicted_most_in_excess() -> None:
     error = np.zeros(20)
     error[[3, 5, 9]] = 2.0, 1.0, -7.0  # predicted less than executed: no exploitation
     assert sorted(worst(error)) == [3, 5]

@@ -39,10 +39,7 @@ def test_data() -> Trajectories:
 
 @pytest.fixture(scope="module")
 def model(test_data: Trajectories) -> TSM:
-    torch.manual_seed(0)
-    net = TSM(10, 2, channels=8, latent_dim=3)
-    net.features.fit(torch.from_numpy(test_data.states))
-    return net
+    return TSM.for_data(test_data, channels=8, latent_dim=3)
 
 
 class Shifts:
@@ -61,10 +58,7 @@ class Shifts:
 
 @pytest.fixture(scope="module")
 def recurrent(test_data: Trajectories) -> RecurrentTSM:
-    torch.manual_seed(0)
-    net = RecurrentTSM(10, 2, hidden=8, latent_dim=3)
-    net.features.fit(torch.from_numpy(test_data.states))
-    return net
+    return RecurrentTSM.for_data(test_data, hidden=8, latent_dim=3)
 
 
 def still_window(n: int, steps: int = 10) -> Window:

@@ -1,4 +1,4 @@
-"""The repository keeps its promises: pins, layout, imports that point one way."""
+"""What holds of the repository: pins, layout, imports that point one way."""
 
 from __future__ import annotations
 

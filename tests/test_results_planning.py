@@ -72,7 +72,7 @@ def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> 
     assert value(rows, "gain_share", planner="zero") == pytest.approx(0)
 
 
-def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
+def test_a_predicted_rollout_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
     task = some_task()
     torques = random_torques(task)
     sound, careless = foreseen(task, torques), foreseen(task, torques)
@@ -87,7 +87,7 @@ def test_a_dream_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_no
     assert value(rows, "violations_worst", model="lstm") == pytest.approx(0.5, abs=0.06)  # the worst tenth is that one
     assert planning_results.by_target(tables.frame(per_target), "violations")[LSTM].argmax() == 3
     closed, _ = planning_results.rows([task], {PUSH: {TSM: sound}}, RUN, execution=planning_results.CLOSED)
-    assert not any(row["metric"].startswith("violations") for row in closed)  # each plan dreams from another start
+    assert not any(row["metric"].startswith("violations") for row in closed)  # each plan predicts from another start
 
 
 def test_rough_torques_are_told_from_smooth_ones() -> None:

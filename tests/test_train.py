@@ -22,7 +22,7 @@ from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
-from tsmlib.training.callbacks import CsvCallback, Progress, TensorBoardCallback
+from tsmlib.training.callbacks import Callback, CsvCallback, Progress, TensorBoardCallback
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, optimizers, schedule
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, initial_past
@@ -313,17 +313,22 @@ def test_a_resumed_training_has_every_step_once_in_its_table(tmp_path: Path, at:
     assert [line["validation"] for line in lines(table.path)] == curve.validation
 
 
-def test_a_record_made_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
-    """A training that is stopped after a record and before its checkpoint."""
-    table, checkpoint = CsvCallback(tmp_path / "losses.csv"), tmp_path / "run"
+def interrupted_after(callback: Callback, checkpoint: Path) -> None:
+    """A training that is stopped at step 10, after the callback and before its checkpoint."""
 
     def stop(progress: Progress) -> None:
-        table(progress)
+        callback(progress)
         if progress.step == 10:
             raise Interrupted
 
     with pytest.raises(Interrupted):
         train(new_tsm(), checkpoint=checkpoint, callback=stop)
+
+
+def test_a_record_made_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    table, checkpoint = CsvCallback(tmp_path / "losses.csv"), tmp_path / "run"
+
+    interrupted_after(table, checkpoint)
     assert [line["step"] for line in lines(table.path)] == [5, 10]
     curve = train(new_tsm(), checkpoint=checkpoint, callback=table)
     assert [line["step"] for line in lines(table.path)] == curve.step
@@ -341,13 +346,7 @@ def test_tensorboard_shows_every_step_of_a_resumed_training_once(tmp_path: Path)
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     board, checkpoint = TensorBoardCallback(tmp_path / "board"), tmp_path / "run"
 
-    def stop(progress: Progress) -> None:
-        board(progress)
-        if progress.step == 10:
-            raise Interrupted
-
-    with pytest.raises(Interrupted):
-        train(new_tsm(), checkpoint=checkpoint, callback=stop)
+    interrupted_after(board, checkpoint)
     curve = train(new_tsm(), checkpoint=checkpoint, callback=TensorBoardCallback(tmp_path / "board"))
     shown = accumulator.EventAccumulator(str(tmp_path / "board")).Reload()
     assert set(shown.Tags()["scalars"]) == {"train", "validation", "seconds"}

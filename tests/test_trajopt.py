@@ -142,7 +142,7 @@ def test_more_iterations_never_make_the_predicted_return_worse(planner: str) -> 
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_a_plan_keeps_its_promises(planner: str) -> None:
+def test_a_plan_returns_what_it_predicts(planner: str) -> None:
     predict, space = predictor(0.1, 5), DirectActions(T, 1, rms=0.5)
     plan = plan_by(planner, predict, reward, 5)
     assert plan.actions.shape == (B, T, 1)
