@@ -92,6 +92,7 @@ def figure6(results: Results, yours: Results | None = None) -> Figure:
         _row_names(cost, places)
         cost.set(title=f"{task.capitalize()}: executed cost (lower is better)")
         gap.set(title=f"{task.capitalize()}: gap (0 is best)")
+        gap.locator_params(axis="x", nbins=5)  # wide numbers
     handles = [entry(method.look.name, **reference_look(method)) for method in used]
     planners = dict.fromkeys(method.planner for places in heights.values() for method in places)
     marker = MARKERS.get(next(iter(planners), ""), "o")
