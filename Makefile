@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 PIP := $(PY) -m pip --disable-pip-version-check install --progress-bar on
 TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
-.PHONY: help quickstart collect train predict latent control robustness action_prior claims test reliability bench docs lint clean
+.PHONY: help quickstart collect train predict latent control robustness action_prior claims test reliability bench explorer docs lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
@@ -22,6 +22,7 @@ help:
 	@echo "make test      all tests, then all notebooks cut down"
 	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"
 	@echo "make bench     speed of everything against references, and docs/speed.md"
+	@echo "make explorer  the page for the browser, into explorer/dist (needs node and npm); python -m tsmlib explore serves it"
 	@echo "make docs      the documentation, into docs/_build/html"
 	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
@@ -39,6 +40,12 @@ reliability: $(READY)
 bench: $(READY)
 	$(PY) -m tsmlib bench
 	$(PY) -m tsmlib bench table
+
+explorer: $(READY)
+	@command -v npm >/dev/null || { echo "the explorer is built with node and npm, of which npm is missing: install node 20 or newer" >&2; exit 1; }
+	cd explorer && npm ci --ignore-scripts --no-audit --no-fund
+	$(PY) explorer/export.py explorer/dist
+	node explorer/build.mjs
 
 # RUN=runs/laptop/seed0 shows the notebooks as that run executed them.
 docs: $(READY)

@@ -19,7 +19,10 @@ from tsmlib.figures import style
 from tsmlib.storage import files
 from tsmlib.study import runs
 
-ORDER = ("collect", "train", "avx2", "rollout", "plan", "policy", "score", "seed", "parallel", "growth", "trust")
+ORDER = (
+    *("collect", "robots", "train", "avx2", "rollout", "plan", "policy", "score", "seed", "parallel", "growth"),
+    "trust",
+)
 DOCS = runs.ROOT / "docs" / "speed.md"
 PICTURE = runs.ROOT / "figures" / "bench_growth"
 MARKS = ("<!-- table -->", "<!-- end of table -->")

@@ -117,7 +117,7 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
         return partial(adam, predict, some.reward, DirectActions(horizon), n_targets, iterations=1)
 
     def learn(copies: int) -> float:
-        policy: Any = OneStepPolicy(reach.start.shape[1], DU, copies=copies)
+        policy: Any = OneStepPolicy(reach.start.shape[1], DU, angles=small.features.angles, copies=copies)
         policy.features.load_state_dict(small.features.state_dict())
         draw = episodes_from(torch.from_numpy(reach.start))
         options = LearningOptions(iterations=2, record_every=2)

@@ -46,9 +46,9 @@ def main() -> None:
     def learn(space: str, copies: int, n: int = n) -> float:
         """Seconds of the updates alone, without the records before and after them."""
         learner: Any = (
-            SegmentPolicy(state_dim, prior, copies=copies)
+            SegmentPolicy(state_dim, prior, angles=model.features.angles, copies=copies)
             if space == "latent"
-            else OneStepPolicy(state_dim, 2, copies=copies)
+            else OneStepPolicy(state_dim, 2, angles=model.features.angles, copies=copies)
         )
         learner.features.load_state_dict(model.features.state_dict())
         options = LearningOptions(iterations=n, record_every=n, horizon=horizon)

@@ -158,8 +158,9 @@ def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
 def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
     """Three copies, 2,200 updates, direct, and latent where there is a prior."""
     draw = episodes_from(torch.from_numpy(task.start))
-    learners: list[Any] = [OneStepPolicy(task.start.shape[1], 2, copies=3)]
-    learners += [SegmentPolicy(task.start.shape[1], prior, copies=3)] if prior is not None else []
+    dx, angles = task.start.shape[1], net.features.angles
+    learners: list[Any] = [OneStepPolicy(dx, 2, angles=angles, copies=3)]
+    learners += [SegmentPolicy(dx, prior, angles=angles, copies=3)] if prior is not None else []
     for learner in learners:
         learner.features.load_state_dict(net.features.state_dict())
 

@@ -97,9 +97,22 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = linked(source[0])
 
 
+def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
+    """Sphinx's event build-finished: the page of the explorer beside its description, or how to build it."""
+    built, target = ROOT / "explorer" / "dist", Path(app.outdir) / "explorer"
+    shutil.rmtree(target, ignore_errors=True)
+    if (built / "index.html").exists():
+        shutil.copytree(built, target)
+    else:
+        target.mkdir(parents=True)
+        said = "The explorer was not built with this documentation; build both: make explorer docs"
+        (target / "index.html").write_text(f"<!doctype html><title>tsmlib explorer</title><p>{said}</p>")
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     copy_notebooks()
     write_modules()
     app.connect("source-read", read)
     app.connect("autodoc-process-docstring", process)
+    app.connect("build-finished", copy_explorer)
     return {"parallel_read_safe": True}

@@ -77,11 +77,15 @@ MODELS = {
     "lstm": Case(lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False),
     "rtsm": Case(
         lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20, mode_weight=0.5),
-        losses=(("loss", ()), ("point_loss", ("codes",))),
+        losses=(("loss", ()), ("point_loss", ("decoders.0.codes",))),
+    ),
+    "rtsm, three decoders": Case(
+        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, members=3, hidden=16, segment_len=20),
+        losses=(("loss", ()), ("point_loss", tuple(f"decoders.{k}.codes" for k in range(3)))),
     ),
     "rtsm, obstacle": Case(
         lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20), state_dim=10, constant=(6, 7, 8, 9),
-        losses=(("loss", ()), ("point_loss", ("codes",))),
+        losses=(("loss", ()), ("point_loss", ("decoders.0.codes",))),
     ),
     "ensemble": Case(lambda dx: Ensemble(dx, DU, angles=ANGLES, hidden=16, layers=2, segment_len=10)),
     "ensemble+mse, obstacle": Case(
@@ -215,7 +219,7 @@ def test_a_plan_of_the_prior_is_segments_chained_by_hand(prior: ActionPrior) -> 
 
 # Two decoding paths --------------------------------------------------------------------------------------------------
 
-CODED = [name for name, case in MODELS.items() if hasattr(case.build(case.state_dim), "decode")]
+CODED = [name for name, case in MODELS.items() if hasattr(case.build(case.state_dim), "decode") and "three" not in name]
 TSMS = [name for name in CODED if isinstance(MODELS[name].build(6), TSM)]
 
 

@@ -23,6 +23,7 @@ import _table
 
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],
+    "robots": ["--episodes", "3", "--loop-episodes", "2"],
     "train": ["--models", "tsm,onestep", "--updates", "1", "--batch", "4", "--batches", "4", "--episodes", "3"],
     "avx2": ["--models", "onestep,prior", "--updates", "1", "--batch", "4", "--episodes", "3"],
     "rollout": ["--models", "tsm,onestep", "--rows", "2,4", "--horizon", "3", "--episodes", "2"],
@@ -39,6 +40,7 @@ TINY = {
 SPEEDS, SECONDS = {"steps_per_second"}, {"seconds"}
 ROWS = {  # configuration -> metrics
     "collect": {"env.step": {"steps_per_second", "steps_per_core_second"}, "mj_step": SPEEDS},
+    "robots": {"VectorEnv.step": {"steps_per_second", "steps_per_core_second"}, "env.step": SPEEDS},
     "train": {
         "teacher_forced_loss": {"targets_per_second"}, "loss": {"targets_per_second"}, "batch": {"windows_per_second"},
     },
@@ -51,7 +53,7 @@ ROWS = {  # configuration -> metrics
     "trust": {"checkpoints": SECONDS, "load": SECONDS},
     "seed": dict.fromkeys(("train", "score", "plan", "policy", "a whole seed"), SECONDS),
 }  # fmt: skip
-LIMITED = {"collect", "train", "rollout", "plan", "policy", "score"}
+LIMITED = {"collect", "robots", "train", "rollout", "plan", "policy", "score"}
 
 
 def run(name: str, *options: str) -> str:

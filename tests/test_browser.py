@@ -42,7 +42,7 @@ def process(command: list[str], answers: str, **options: Any) -> Iterator[None]:
         wait_for(lambda: urllib.request.urlopen(answers, timeout=30).status == 200)
         yield
     finally:
-        server.terminate()
+        server.kill()
         server.wait(60)
 
 

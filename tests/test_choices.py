@@ -26,6 +26,7 @@ sys.path.insert(0, str(runs.ROOT / "benchmarks" / "settings"))
 
 import as_published
 import judge
+import rows
 import spent
 
 ARM = ["--env", "tsm/Reacher-v0"]
@@ -140,3 +141,12 @@ def test_fresh_samples_are_common_to_a_population_and_new_in_the_next() -> None:
         assert torch.equal(states, first[0])
     assert not torch.equal(start, first[0])
     assert not torch.equal(again, first[0])
+
+
+def test_rows_take_the_place_of_those_of_the_same_model_and_method() -> None:
+    row = dict(env="e", sim="mujoco", model="tsm", planner="cem", execution="open loop", seed=0, scale="paper")
+    row |= dict(metric="cost", value=1.0, n=2)
+    published = tables.frame([row, {**row, "model": "lstm"}, {**row, "seed": 1}])
+    found = rows.merged(published, [{**row, "value": 2.0}, {**row, "value": 3.0, "metric": "gap"}])
+    kept = {(line["model"], line["seed"], line["metric"]): line["value"] for line in tables.records(found)}
+    assert kept == {("tsm", 0, "cost"): 2, ("tsm", 0, "gap"): 3, ("lstm", 0, "cost"): 1, ("tsm", 1, "cost"): 1}

@@ -387,7 +387,7 @@ def test_swapping_the_labels_of_two_models_turns_every_check_that_compares_them(
 
 def test_every_choice_that_the_paper_leaves_open_is_stated_once() -> None:
     page = (ROOT / "docs" / "deviations.md").read_text()
-    assert re.findall(r"^\| (A\d+) \|", page, re.MULTILINE) == [f"A{i}" for i in range(1, 34)]
+    assert re.findall(r"^\| (A\d+) \|", page, re.MULTILINE) == [f"A{i}" for i in range(1, 35)]
 
 
 def test_a_reading_says_which_claims_it_turns() -> None:

@@ -16,7 +16,7 @@ from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
 from tsmlib.storage.files import StoreError
 from tsmlib.study import predictions
-from tsmlib.study.results import planning, prediction, table
+from tsmlib.study.results import latent, planning, prediction, table
 from tsmlib.study.runs import Run
 
 REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
@@ -162,6 +162,54 @@ def test_scores_of_yours_follow_the_published_ones_of_the_same_model() -> None:
                                                   ["LSTM", "published, n = 1,000"], ["LSTM", own]]  # fmt: skip
     best = lines(prediction.best_table(found, {"nrmse": "error"}, [REACH]))
     assert [line[1].strip("*").split(",")[0] for line in best] == ["published", "yours"]
+
+
+@pytest.fixture
+def codes() -> pd.DataFrame:
+    """Rows of 04_latent: published for two training seeds at reaching, yours for one at reaching and pushing."""
+    found = []
+    for source, scale, n, seeds in (("published", "paper", 3000, (0, 1)), ("yours", "laptop", 600, (7,))):
+        for env in (REACH, PUSH) if source == "yours" else (REACH,):
+            row = dict(env=env, model="tsm", execution="segments", source=source, scale=scale, n=n)
+            for seed in seeds:
+                found += [dict(row, seed=seed, metric=metric, value=0.01 * (1 + seed))
+                          for metric in ("kl", "spread", "error_posterior", "error_prior", "error_zero")]  # fmt: skip
+                found += [dict(row, seed=seed, metric=metric, value=seed + 0.1 * i, dimension=i)
+                          for metric in ("kl_dimension", "importance") for i in range(8)]  # fmt: skip
+            if env == PUSH:
+                found.append(dict(row, seed=7, metric="direction_told", value=0.5, subset="object moves"))
+    return tables.frame(found)
+
+
+def test_what_codes_say_stands_in_a_published_line_and_in_yours(codes: pd.DataFrame) -> None:
+    published, own = "published, n = 3,000", "**yours, n = 600, seed 7, scale laptop**"
+    errors = lines(latent.errors_table(codes, [REACH, PUSH], "tsm"))
+    assert [line[:4] for line in errors] == [[f"`{REACH}`", "all segments", published, "0.015"],
+                                             [f"`{REACH}`", "all segments", own, "0.080"],
+                                             [f"`{PUSH}`", "all segments", own, "0.080"]]  # fmt: skip
+    thresholds = lines(latent.thresholds_table(codes, ["tsm"]))
+    assert [line[0] for line in thresholds] == ["Reacher: KL (nats)"] * 2 + ["Reacher: spread of samples"] * 2
+    assert [line[-1] for line in thresholds] == ["0.015", "0.08"] * 2
+    assert latent.directions_told(codes, REACH) == ""
+    assert latent.directions_told(codes, PUSH).startswith(
+        "- Yours: TSM: a linear function of the encoder's code explains 50%"
+    )
+
+
+def test_units_of_codes_are_those_of_one_training(codes: pd.DataFrame) -> None:
+    one = latent.one_training(codes)
+    assert set(zip(one["source"], one["seed"], strict=True)) == {("published", 0), ("yours", 7)}
+    units = lines(latent.codes_table(one, REACH))
+    assert [(line[1], line[2].strip("*").split(",")[0], line[3]) for line in units] == [
+        ("KL", "published", "0.000"), ("KL", "yours", "7.000"),
+        ("moves", "published", "0.000"), ("moves", "yours", "7.000"),
+    ]  # fmt: skip
+
+
+def test_panels_of_codes_are_those_of_either_source(codes: pd.DataFrame) -> None:
+    first, second = table.pair(codes, partial(latent.use_panels, envs=[REACH, PUSH]))
+    assert first["KL per segment"]["Reacher"][study.method("tsm")].tolist() == [0.01, 0.02]
+    assert second["KL per segment"]["Reacher"][study.method("tsm")].tolist() == [0.08]
 
 
 def test_a_panel_without_rows_is_left_out() -> None:

@@ -73,6 +73,7 @@ def episodes(case: Case, n: int, seed: int) -> Trajectories:
         0.02,
         names,
         ("m",) * len(names),
+        case.model(torch.float32).features.angles,
     )
 
 

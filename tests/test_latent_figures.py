@@ -110,6 +110,31 @@ def test_a_row_has_the_mean_over_seeds_of_each_model() -> None:
     assert marks(left, OURS) == [(2.0, 1)]
 
 
+def diamonds(ax: Axes) -> list[tuple[float, float]]:
+    """Where the reader's own hollow diamonds stand."""
+    return [(float(x), float(y)) for line in ax.lines if line.get_marker() == "D"
+            for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)]  # fmt: skip
+
+
+def test_yours_stand_below_the_published_use_of_codes_in_rows_of_their_own_too() -> None:
+    published = {"KL": {"Reacher": {TSM: np.array([0.001, 0.003])}}, "spread": {"Reacher": {}}}
+    own = {"KL": {"Reacher": {TSM: np.array([0.01])}, "Push": {OURS: np.array([1.0, 3.0])}}}
+    figure = figures.code_use(published, dict.fromkeys(published, ""), {}, yours=own)
+    left, right = figure.axes
+    assert diamonds(left) == [(0.01, 0.25), (2.0, 1.25)]
+    assert marks(left, TSM)[0] == (0.002, 0)
+    assert not diamonds(right)
+    assert [text.get_text() for text in left.get_yticklabels()] == ["Reacher", "Push"]
+
+
+def test_your_recall_and_precision_are_drawn_where_nothing_is_published_too() -> None:
+    own = {
+        "arm": {OURS: {"recall": np.full((1, 3), 0.7), "precision": np.full((1, 3), 0.4), "chance": np.zeros((1, 3))}}
+    }
+    figure = figures.contact_recall({"arm": {}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}, yours=own)
+    assert sorted(y for _, y in diamonds(figure.axes[0])) == [0.4] * 3 + [0.7] * 3
+
+
 def test_every_sample_of_figure_9_is_drawn_from_where_the_object_was() -> None:
     figure = EVERY["figure9"]()
     fans = [part for ax in figure.axes for part in ax.collections if isinstance(part, LineCollection)]
@@ -172,6 +197,17 @@ def test_sliders_and_picture_fit_a_small_screen_together_and_are_not_stretched()
         assert shown.height + 2 * 40 < 900 - 250  # what JupyterLab has above and below a notebook of 900 pixels
     assert panel.layout.align_items == "flex-start"
     assert first.layout.width == f"{shown.width}px"
+
+
+def test_a_figure_that_moves_is_drawn_over_what_stays_as_if_drawn_whole() -> None:
+    picture_of = figures.code_fan(DRAW, START, fan(9), PATH, TSM)
+    panel = figures.slider_panel(lambda a: picture_of(fan(6) + 0.02 * a), {"a": (-3.0, 3.0, 0.25)})
+    slider, picture = panel.children
+    for value in (1.5, -2.0, 0.0):
+        slider.value, whole = value, BytesIO()
+        picture_of(fan(6) + 0.02 * value).savefig(whole, format="png", dpi=100)
+        with Image.open(BytesIO(picture.value)) as shown, Image.open(whole) as expected:
+            np.testing.assert_array_equal(np.asarray(shown), np.asarray(expected)[..., :3])
 
 
 def test_a_slider_moves_the_whole_fan_and_leaves_the_rest() -> None:

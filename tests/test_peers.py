@@ -50,7 +50,7 @@ def data() -> Trajectories:
     walk = torch.randn(20, 31, DX, generator=generator).cumsum(1) * torch.logspace(-2, 0, DX)
     walk[..., FIXED] = walk[:, :1, FIXED]
     actions = torch.rand(20, 30, DU, generator=generator)
-    return Trajectories(walk.numpy(), actions.numpy(), "arm", 0.02, ("x",) * DX, ("m",) * DX)
+    return Trajectories(walk.numpy(), actions.numpy(), "arm", 0.02, ("x",) * DX, ("m",) * DX, (0, 1))
 
 
 @pytest.fixture

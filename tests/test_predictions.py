@@ -54,21 +54,13 @@ def test_scores_of_another_version_are_not_taken(run: Run, monkeypatch) -> None:
         study.scores(run, ENV, "ensemble")
 
 
-def test_at_scale_laptop_an_environment_that_is_not_published_shows_its_own_rows(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(study.predictions, "RESULTS", tmp_path)
-    row = dict(sim="mujoco", model="tsm", metric="nrmse", value=1.0, n=1, seed=0, scale="paper")
-    tables.save(tmp_path / "03_predict.csv", [dict(row, env="tsm/Reacher-v0")])
-    own = [dict(row, env=env, value=2.0) for env in ("tsm/Reacher-v0", "tsm/PymunkPush-v1")]
-    drawn = study.published_rows(Run("03_predict", "laptop", 0, tmp_path / "seed0"), own)
-    assert dict(zip(drawn["env"], drawn["value"], strict=True)) == {"tsm/Reacher-v0": 1.0, "tsm/PymunkPush-v1": 2.0}
-    assert study.published_rows(Run("03_predict", "smoke", 0, tmp_path / "seed0"), own).equals(tables.frame(own))
-
-
 def test_at_scale_paper_the_other_seeds_are_drawn_too_once_they_are_complete(tmp_path) -> None:
     row = dict(env=ENV, sim="mujoco", model="tsm", metric="nrmse", value=1.0, n=1, scale="paper")
     tables.save(tmp_path / "seed1" / "metrics" / "03_predict.csv", [dict(row, seed=1)])
     run, own = Run("03_predict", "paper", 0, tmp_path / "seed0"), [dict(row, seed=0)]
     with pytest.raises(RunError, match="03_predict in .*seed1 is not run, expected complete. Run it: .* --seed 1"):
-        study.published_rows(run, own)
+        study.pooled_rows(run, own)
     manifest.write_json(tmp_path / "seed1" / "status.json", {"03_predict": {"state": "complete"}})
-    assert study.published_rows(run, own)["seed"].tolist() == [0, 1]
+    assert study.pooled_rows(run, own)["seed"].tolist() == [0, 1]
+    laptop = Run("03_predict", "laptop", 0, tmp_path / "seed0")
+    assert study.pooled_rows(laptop, own).equals(tables.frame(own))  # seeds are pooled at scale paper alone

@@ -23,15 +23,16 @@ ANGLES = pytest.mark.parametrize("angles", [(0, 1), (), (3, 1)], ids=str)
 
 def plain(net: Any, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
     """The equations of ``models.recurrence``, one operation after the other."""
+    layers = net.decoders[0] if isinstance(net, RecurrentTSM) else net
 
     def advance(x: Tensor, u: Tensor, h: Tensor, c: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = torch.cat([net.features(x), u], dim=-1)
-        q = net.cell(torch.cat([seen, h], dim=-1))
-        q = q + net.codes(code) if hasattr(net, "codes") else q
+        q = layers.cell(torch.cat([seen, h], dim=-1))
+        q = q + layers.codes(code) if hasattr(layers, "codes") else q
         forget, write, read, new = q.chunk(4, dim=-1)
         c = forget.sigmoid() * c + write.sigmoid() * new.tanh()
         h = read.sigmoid() * c.tanh()
-        change = net.head(torch.cat([h, seen], dim=-1)) if hasattr(net, "head") else net.out(h)
+        change = layers.head(torch.cat([h, seen], dim=-1)) if hasattr(layers, "head") else layers.out(h)
         return x + net.features.step_std * change, h, c
 
     h = c = actions.new_zeros(len(actions), net.hidden)

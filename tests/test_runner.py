@@ -30,7 +30,9 @@ PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast =
 
 
 def write_notebook(path: Path, *cells: str, parameters: str = PARAMETERS) -> Path:
-    notebook = nbformat.v4.new_notebook(metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}})
+    notebook = nbformat.v4.new_notebook(
+        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}, "language_info": {"name": "python"}}
+    )
     notebook.cells = [nbformat.v4.new_code_cell(source) for source in (parameters, *cells)]
     notebook.cells[0].metadata["tags"] = ["parameters"]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -467,6 +469,34 @@ def test_papermill_itself_refuses_before_it_runs_anything(clone: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.strip().startswith("error: 01_tiny has no parameter 'scal'; the closest is scale,")
     assert not (clone / "out.ipynb").exists()
+
+
+@pytest.mark.parametrize("given", [{"sed": 3}, {"seed": 3}], ids=str)
+def test_papermill_in_python_is_refused_the_same_by_the_notebook(
+    place: Path, given: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import papermill
+
+    monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
+    own = "from tsmlib.study.runs import resolve\nresolve('01_x', scale=scale, seed=seed)"
+    path = write_notebook(place / "01_x.ipynb", own)
+    if "sed" in given:
+        with pytest.raises(papermill.PapermillExecutionError, match="01_x has no parameter 'sed'; the closest is seed"):
+            papermill.execute_notebook(path, place / "out.ipynb", parameters=given, progress_bar=False)
+        assert not list(place.glob("runs*"))
+    else:
+        papermill.execute_notebook(path, place / "out.ipynb", parameters=given, progress_bar=False)
+        assert "seed=3" in (place / "out.ipynb").read_text()
+
+
+def test_cells_that_only_begin_like_papermills_are_left_alone() -> None:
+    ours, injected = 'scale = ""\nseed = 0', "# Parameters\nfoo = 1\n"
+    others = [], ["", injected], ["", "data = 3", injected], ["", ours, "# Parameters\nseed = 3"], ["", ours, "1 +"]
+    for cells in others:
+        parameters.require_declared(cells, "01_x")
+    with pytest.raises(ParameterError, match="01_x has no parameter 'foo'; it has scale, seed."):
+        parameters.require_declared(["", ours, injected, "1 +"], "01_x")
+    parameters.require_declared(["", ours, injected, "# Parameters\nseed = 3"], "01_x")  # mended, in the same kernel
 
 
 def test_the_installed_package_registers_the_entry_point() -> None:

@@ -21,7 +21,7 @@ import torch
 
 from tsmlib.storage import artifacts, files, tables
 from tsmlib.storage import manifest as manifest_storage
-from tsmlib.storage.files import StoreError
+from tsmlib.storage.files import Json, StoreError
 from tsmlib.study.notebooks import _note, require
 from tsmlib.study.runs import Run, RunError
 from tsmlib.trajectory import Trajectories
@@ -106,6 +106,31 @@ def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
     assert (after.env, after.dt, after.names, after.units, after.angles) == (
         (before.env, before.dt, before.names, before.units, before.angles)
     )
+
+
+def test_episodes_of_different_length_come_back_with_their_ends(tmp_path: Path) -> None:
+    t = some_trajectories()
+    states, actions = (
+        [t.states[0], t.states[1, :3], t.states[2, :5]],
+        [t.actions[0], t.actions[1, :2], t.actions[2, :4]],
+    )
+    before = Trajectories.ragged(states, actions, t.env, t.dt, NAMES, UNITS, terminated=(False, True, False))
+    artifacts.save_trajectories(tmp_path / "x.safetensors", before)
+    after = artifacts.load_trajectories(tmp_path / "x.safetensors")
+    np.testing.assert_array_equal(after.states, before.states)
+    assert (after.lengths, after.terminated) == ((5, 2, 4), (False, True, False))
+    artifacts.save_trajectories(tmp_path / "y.safetensors", t)
+    assert {"lengths", "terminated"}.isdisjoint(artifacts.read_header(tmp_path / "y.safetensors")["trajectories"])
+
+
+@pytest.mark.parametrize("lengths", [[5, 2], [5, 2, 99], [5, 2, "4"], "abc", 7, [5, 1, 4]])
+def test_a_file_whose_ends_do_not_fit_is_refused(tmp_path: Path, lengths: Json) -> None:
+    t = some_trajectories()
+    fields = {"env": t.env, "dt": t.dt, "names": NAMES, "units": UNITS, "angles": [], "lengths": lengths}
+    arrays = {"states": t.states, "actions": t.actions}
+    artifacts.save(tmp_path / "x.safetensors", arrays, kind="trajectories", header={"trajectories": fields})
+    with pytest.raises(StoreError, match="holds no usable trajectories"):
+        artifacts.load_trajectories(tmp_path / "x.safetensors")
 
 
 def test_a_loaded_model_computes_the_same(tmp_path: Path) -> None:

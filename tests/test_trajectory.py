@@ -9,9 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from tsmlib.evaluation.prediction import sample_states
+from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import as_dynamics, rollout, stepper
+from tsmlib.models.features import Features
+from tsmlib.models.tsm import TSM
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.sampling import Noise
+from tsmlib.training.fit import fixed_windows
 from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, batches, initial_past, windows
 
 A = torch.tensor([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]])
@@ -195,3 +200,121 @@ def test_arrays_that_do_not_fit_each_other_are_refused(data: Trajectories) -> No
             replace(data, states=states)
     with pytest.raises(TrajectoryError, match="3 state dimensions, 2 names, 3 units"):
         replace(data, names=("a", "b"))
+
+
+# Episodes of different length ----------------------------------------------------------------------------------------
+
+ENDS = (20, 6, 2, 13)  # steps of each episode
+
+
+@pytest.fixture
+def ragged(data: Trajectories) -> Trajectories:
+    """The linear system's episodes, cut where they end; the second and the third were ended by the environment."""
+    states = [data.states[i, : n + 1] for i, n in enumerate(ENDS)]
+    actions = [data.actions[i, :n] for i, n in enumerate(ENDS)]
+    return Trajectories.ragged(
+        states, actions, data.env, data.dt, data.names, data.units, terminated=(False, True, True, False)
+    )
+
+
+def test_an_episode_is_padded_by_its_last_state_and_zero_actions(data: Trajectories, ragged: Trajectories) -> None:
+    assert (ragged.lengths, ragged.horizon, len(ragged)) == (ENDS, T, N)
+    for episode, steps in enumerate(ENDS):
+        np.testing.assert_array_equal(ragged.states[episode, : steps + 1], data.states[episode, : steps + 1])
+        np.testing.assert_array_equal(ragged.actions[episode, :steps], data.actions[episode, :steps])
+        assert (ragged.states[episode, steps:] == data.states[episode, steps]).all()
+        assert (ragged.actions[episode, steps:] == 0).all()
+
+
+def test_windows_are_all_those_within_an_episode_and_as_often_each(ragged: Trajectories) -> None:
+    marked = replace(ragged, states=ragged.states + 100 * np.arange(N, dtype=np.float32)[:, None, None])
+    known = {  # a double loop, by their last state
+        tuple(marked.states[i, start + H].tolist()) for i, n in enumerate(ENDS) for start in range(n - H + 1)
+    }
+    draw = batches(
+        marked.padded(L), past_len=L, future_len=H, batch_size=4000,
+        generator=torch.Generator().manual_seed(0), lengths=marked.lengths,
+    )  # fmt: skip
+    seen = [tuple(state) for state in next(draw).future.states[:, -1].tolist()]
+    counts = np.array([seen.count(window) for window in known])
+    assert counts.sum() == len(seen), "a window crosses the end of an episode"
+    assert len(known) == 16 + 2 + 0 + 9
+    assert np.abs(counts - 4000 / len(known)).max() < 5 * np.sqrt(4000 / len(known))
+
+
+def test_equal_lengths_draw_the_windows_that_they_always_drew(data: Trajectories) -> None:
+    def first(lengths: tuple[int, ...]) -> Window:
+        options = {"past_len": L, "future_len": H, "batch_size": 8, "lengths": lengths}
+        return next(batches(data.padded(L), generator=torch.Generator().manual_seed(3), **options))  # type: ignore[arg-type]
+
+    told = replace(data, lengths=(T,) * N)
+    assert told.lengths == ()
+    assert torch.equal(first(told.lengths).future.states, first(()).future.states)
+
+
+def test_no_window_at_all_is_an_error(ragged: Trajectories) -> None:
+    short = ragged.take(np.array([1, 2]))
+    with pytest.raises(TrajectoryError, match="episodes of 6 steps are too short for windows of 7 future steps"):
+        next(batches(
+            short.padded(L), past_len=L, future_len=7, batch_size=3, generator=torch.Generator(), lengths=short.lengths
+        ))  # fmt: skip
+
+
+def test_a_choice_of_episodes_keeps_where_they_end(ragged: Trajectories) -> None:
+    few = ragged.take(np.array([3, 1]))
+    assert (few.lengths, few.terminated, few.horizon) == ((13, 6), (False, True), 13)
+    assert ragged.take(slice(0, 1)).lengths == ragged.take(slice(0, 1)).terminated == ()
+    long = ragged.cut(6)
+    assert (long.lengths, long.terminated, long.states.shape) == ((), (False, True, False), (3, 7, 3))
+    with pytest.raises(TrajectoryError, match="no episode of tsm/Linear-v0 has 21 steps: 4 episodes, the longest of"):
+        ragged.cut(21)
+    with pytest.raises(TrajectoryError, match=r"a map needs .*; those of tsm/Linear-v0 have 2 to 20 steps.*data\.cut"):
+        ragged.require_equal_lengths("a map")
+    long.require_equal_lengths("a map")
+
+
+def test_statistics_are_of_real_steps(ragged: Trajectories) -> None:
+    real = [ragged.states[i, : n + 1] for i, n in enumerate(ENDS)]
+    for features in (Features(3, ()).fit(torch.from_numpy(ragged.states), ragged.lengths),
+                     TSM.for_data(ragged, channels=8).features):  # fmt: skip
+        np.testing.assert_allclose(features.mean, np.concatenate(real).mean(0), rtol=1e-5)
+        np.testing.assert_allclose(features.std, np.concatenate(real).std(0, ddof=1), rtol=1e-5)
+        steps = np.concatenate([np.diff(x, axis=0) for x in real])
+        np.testing.assert_allclose(features.step_std, steps.std(0, ddof=1), rtol=1e-4)
+    actions = np.concatenate([ragged.actions[i, :n] for i, n in enumerate(ENDS)])
+    np.testing.assert_allclose(ActionPrior.for_data(ragged).std, actions.std(0, ddof=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lengths": (20, 6, 2)}, "lengths of .* expected a tuple of 4 ints"),
+        ({"lengths": (20, 6.0, 2, 13)}, "lengths of .* expected a tuple of 4 ints"),
+        ({"terminated": (1, 0, 0, 0)}, "terminated of .* expected a tuple of 4 bools"),
+        ({"lengths": (20, 0, 2, 13)}, "lengths of tsm/Linear-v0 go from 0 to 20; expected at least 1"),
+        ({"lengths": (19, 6, 2, 13)}, "the longest to fill the 20 steps"),
+        ({"lengths": (20, 5, 2, 13)}, "episode 1 of tsm.Linear-v0 ends after 5 steps, but its arrays go on at step 5"),
+    ],
+)
+def test_ends_that_do_not_fit_the_arrays_are_refused(ragged: Trajectories, change: dict, message: str) -> None:
+    with pytest.raises(TrajectoryError, match=message):
+        replace(ragged, **change)
+    with pytest.raises(TrajectoryError, match=r"states \(3, 3\) and actions \(3, 2\) of episode 0"):
+        Trajectories.ragged([np.zeros((3, 3))], [np.zeros((3, 2))], "mine", 1.0, ("a", "b", "c"), ("", "", ""))
+
+
+def test_scores_are_of_windows_within_their_episode(ragged: Trajectories) -> None:
+    options = {"samples": 1, "horizon": 4, "starts": (1, 5, 9)}
+    found = sample_states(Linear(H), ragged, **options)  # type: ignore[arg-type]
+    slow = [
+        ragged.states[i, start + 1 : start + 5] for i, n in enumerate(ENDS) for start in (1, 5, 9) if start + 4 <= n
+    ]
+    assert len(slow) == 3 + 1 + 0 + 3
+    np.testing.assert_allclose(found[0], np.stack(slow), rtol=1e-4, atol=1e-5)
+
+
+def test_held_out_windows_never_cross_an_end(ragged: Trajectories) -> None:
+    found = fixed_windows(ragged, L, H)
+    predicted = Linear(H).predict_segment(found.past, found.future.actions)
+    assert found.future.states.shape == (27, H, 3)
+    torch.testing.assert_close(predicted, found.future.states, rtol=1e-4, atol=1e-5)

@@ -29,7 +29,9 @@ def test_a_shipped_model_was_trained_by_its_entry(path: Path) -> None:
     for key, stage in zip(zoo.keys(planned), planned, strict=True):
         steps = header["curves"][key]["step"][-1]
         assert steps == stage.steps or (stage.patience and steps < stage.steps)
-    assert list(header["curves"]) == zoo.keys(planned)
+    decoders = header["config"].get("members", 1) if path.stem == "rtsm" else 1
+    keys = [f"{key}@{k}" if k else key for k in range(decoders) for key in zoo.keys(planned)]
+    assert list(header["curves"]) == keys
     stated = [stage.stated() for stage in planned]
     assert zoo.stated(header.get("schedule", stated)) == stated  # the oldest do not say
 
@@ -96,8 +98,8 @@ def test_a_model_is_added_in_one_entry(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_what_ships_is_loaded_by_word_and_environment() -> None:
-    model, prior = (tsmlib.load_pretrained(word, env="tsm/ReacherPush-v1") for word in ("tsm", "prior"))
-    assert (type(model), type(prior)) == (tsmlib.TSM, tsmlib.ActionPrior)
+    model, prior = (tsmlib.load_pretrained(word, env="tsm/ReacherPush-v1") for word in ("rtsm", "prior"))
+    assert (type(model), type(prior)) == (tsmlib.RecurrentTSM, tsmlib.ActionPrior)
     assert tsmlib.load_task("tsm/ReacherPush-v1").target.shape == (100, 2)
     with pytest.raises(ValueError, match=r"no pretrained tsm\+full of tsm/ReacherPush-v1 in .*: there are .*lstm"):
         tsmlib.load_pretrained("tsm+full", env="tsm/ReacherPush-v1")

@@ -1,4 +1,5 @@
 from .collection import collect as collect
+from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop
 from .collection import smooth_torques as smooth_torques
 from .evaluation.prediction import score as score

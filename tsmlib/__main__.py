@@ -1,7 +1,8 @@
-"""Command line: run, notebooks, verify, bench and publish; ``tsmlib`` and ``python -m tsmlib`` are the same.
+"""Command line: run, notebooks, explore, verify, bench and publish; ``tsmlib`` and ``python -m tsmlib`` are the same.
 
 ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``run NOTEBOOK --help`` lists its parameters.
 ``python -m tsmlib notebooks FOLDER`` copies the notebooks out, to be opened, changed and run by their paths.
+``python -m tsmlib explore`` serves the explorer, a page in the browser, to this machine.
 ``python -m tsmlib verify [PATH]`` hashes again.
 ``python -m tsmlib bench [NAME]`` measures speed; ``bench table`` writes docs/speed.md from what was measured.
 ``python -m tsmlib publish`` copies a paper-scale run to what ships.
@@ -37,6 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
     copy.add_argument("folder", type=Path)
+    explore = commands.add_parser("explore", help="serve the explorer, a page in the browser, on 127.0.0.1")
+    explore.add_argument("--port", type=int, default=8765, help="default 8765; 0 is any that is free")
+    explore.add_argument("--open", action="store_true", help="open it in a browser")
     verify = commands.add_parser("verify", help="hash an artefact, a run, or everything that ships, again")
     verify.add_argument("path", type=Path, nargs="?", default=runs.ROOT / "data", help="default: what ships")
     bench = commands.add_parser("bench", help="measure speed, against a reference in the same run")
@@ -51,6 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _help(run, arguments.notebook)
             case "notebooks":
                 return _copy_notebooks(arguments.folder)
+            case "explore":
+                return _explore(arguments.port, browser=arguments.open)
             case "verify":
                 return _verify(arguments.path)
             case "bench":
@@ -121,6 +127,14 @@ def _run(arguments: argparse.Namespace) -> int:
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
     for execution in executions:  # all of them are checked before the first one starts
         print(notebooks.execute(execution))
+    return 0
+
+
+def _explore(port: int, *, browser: bool) -> int:
+    from tsmlib.study import explorer
+
+    _require_checkout("explore")
+    explorer.serve(port=port, browser=browser)
     return 0
 
 

@@ -4,56 +4,82 @@ Random data, a running planner and a policy under test are the same call with an
 """
 
 from collections.abc import Callable
-from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from tsmlib.envs.stepping import Seeds, Simulation, make_simulation, simulation
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
 Controller = Callable[[Segment], Tensor]  # the past (N, L, .) -> the next K actions (N, K, du), then asked again
 
 
 def collect(
-    env: gymnasium.vector.VectorEnv,
+    env: VectorEnv | Simulation,
     controller: Controller,
     *,
     horizon: int = 100,  # section 5.1
     past_len: int = 10,
-    seed: int | None = None,
+    seed: Seeds = None,
     states: np.ndarray | None = None,
 ) -> Trajectories:
-    """Run one episode in each of ``env``'s N copies for ``horizon`` steps (dt 0.02 s).
+    """Run one episode in each of ``env``'s N copies for ``horizon`` steps, or until the environment ends it.
 
-    Episodes start from the environment's own distribution, drawn from ``seed``, or from ``states`` (N, dx).
+    env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations and actions. Actions
+    in [-1, 1] are scaled to the bounds of its action space. Episodes start from the environment's own distribution,
+    drawn from ``seed`` (seed + i in episode i, or a seed for each), or, in the arm's, from ``states`` (N, dx).
+    UnsupportedEnvironment, naming what is supported, for anything else.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
-    start, _ = env.reset(seed=seed, options=None if states is None else {"states": states})
-    arms: Any = env  # they have rollout
-    arm: Any = env.unwrapped  # an ArmVectorEnv: it has dt, names, units and angles
-    past = initial_past(torch.from_numpy(start).float(), past_len, arm.single_action_space.shape[0])
+    episodes: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
+    start = episodes.reset(seed=seed, states=states)
+    past = initial_past(torch.from_numpy(start).float(), past_len, episodes.action_dim)
     seen, done, taken = [start[:, None]], [], 0
-    while taken < horizon:
+    while taken < horizon and not episodes.ended.all():
         actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
         if actions.shape[1] < 1:
             raise ValueError(f"the controller gave no actions when asked at step {taken} of {horizon}")
-        reached = arms.rollout(actions.numpy())
+        reached = episodes.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)
         done.append(actions.numpy())
         taken += actions.shape[1]
+    longest = int(episodes.steps.max())
+    inside = np.arange(longest) < episodes.steps[:, None]
     return Trajectories(
-        states=np.concatenate(seen, axis=1, dtype=np.float32),
-        actions=np.concatenate(done, axis=1, dtype=np.float32),
-        env=arm.spec.id,
-        dt=arm.dt,
-        names=tuple(arm.names),
-        units=tuple(arm.units),
-        angles=tuple(arm.angles),
+        states=np.concatenate(seen, axis=1, dtype=np.float32)[:, : longest + 1],
+        actions=np.where(inside[..., None], np.concatenate(done, axis=1, dtype=np.float32)[:, :longest], np.float32(0)),
+        env=episodes.id,
+        dt=episodes.dt,
+        names=episodes.names,
+        units=episodes.units,
+        angles=episodes.angles,
+        lengths=tuple(episodes.steps.tolist()),
+        terminated=tuple(episodes.terminated.tolist()),
     )
+
+
+def collect_random(
+    env_id: str,
+    episodes: int,
+    *,
+    horizon: int = 100,
+    seed: int = 0,
+    rms: float = 0.5,  # of full action
+    time_constant: float | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
+) -> Trajectories:
+    """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone."""
+    run = make_simulation(env_id, episodes)
+    actions = smooth_torques(
+        episodes, horizon, generator=torch.Generator().manual_seed(seed), action_dim=run.action_dim, rms=rms,
+        time_constant=time_constant or 1.5 * run.dt, dt=run.dt,
+    )  # fmt: skip
+    data = collect(run, open_loop(actions), horizon=horizon, seed=seed)
+    run.close()
+    return data
 
 
 def smooth_torques(

@@ -35,6 +35,19 @@ def _approach(position: slice, target: Tensor, torque_weight: float) -> Reward:
     return reward
 
 
+def until(ended: Callable[[Tensor], Tensor], reward: Reward) -> Reward:
+    """``reward`` up to and with the first step after which the episode is over, and nothing from there on.
+
+    ended: states (..., T, dx) -> (..., T) bool, what the environment ends an episode by: a model does not know.
+    """
+
+    def counted(states: Tensor, actions: Tensor) -> Tensor:
+        over = ended(states).to(states.dtype)
+        return reward(states, actions) * (over.cumsum(-1) - over < 1)
+
+    return counted
+
+
 def final_distance(states: Tensor, target: Tensor, position: slice) -> Tensor:
     """Metres between ``position`` (TIP or BLOCK) and ``target`` (B, 2) in the last state of (..., B, T, dx)."""
     return (states[..., -1, position] - target).norm(dim=-1)

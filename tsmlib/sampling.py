@@ -1,4 +1,4 @@
-"""Sources of standard normal noise: one generator, common random numbers, separate generators."""
+"""Sources of standard normal noise: one generator, common random numbers, separate generators, none."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +25,20 @@ class SeparateNoise:
     generators: tuple[torch.Generator, ...]
 
 
-Noise = torch.Generator | SharedNoise | SeparateNoise
+@dataclass(frozen=True)
+class NoNoise:
+    """Zeros; of an ensemble each member in turn, the first for ``period`` rows, then the second, and so on."""
+
+    period: int
+
+
+Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
 
 
 def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
     """Draw N(0, 1) of ``shape`` with the device and type of ``like``: the same numbers on any device."""
+    if isinstance(noise, NoNoise):
+        return like.new_zeros(tuple(shape))
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])
         return torch.cat([standard_normal(share, generator, like) for generator in noise.generators])
@@ -37,3 +46,11 @@ def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
     return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(like.device)
+
+
+def draw_members(n_members: int, rows: int, noise: Noise, like: Tensor) -> Tensor:
+    """A member of an ensemble for each row, (rows,) from 0 to ``n_members`` - 1."""
+    if isinstance(noise, NoNoise):
+        return torch.arange(rows, device=like.device) // noise.period % n_members
+    uniform = torch.special.ndtr(standard_normal((rows,), noise, like))
+    return (n_members * uniform).long().clamp(max=n_members - 1)

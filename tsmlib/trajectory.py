@@ -13,7 +13,7 @@ Letters in shapes: N trajectories, T steps, B batch, L past length, H segment le
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -53,12 +53,15 @@ class TrajectoryError(ValueError):
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Equally long episodes of one environment.
+    """Episodes of one environment.
 
     states: (N, T + 1, dx) float32, physical units, joint angles not wrapped; actions: (N, T, du) float32 in [-1, 1].
     env: the ``gymnasium.make`` id; dt: seconds per step; names, units: one word per state dimension.
     angles: state dimensions that are angles in radians (models see their cosine and sine); none unless they are named.
-    Raises TrajectoryError where shapes disagree or a value is not finite.
+    lengths: steps of each episode, T of the longest; none: all have T. Beyond its end an episode is padded: its last
+    state repeats, and actions are zero. terminated: whether the environment ended the episode, as opposed to a limit of
+    time; none: it ended none of them. Both are empty where they would say just that, whatever was given.
+    Raises TrajectoryError where shapes disagree, a value is not finite, or the padding is something else.
     """
 
     states: np.ndarray
@@ -68,6 +71,8 @@ class Trajectories:
     names: tuple[str, ...]
     units: tuple[str, ...]
     angles: tuple[int, ...] = ()
+    lengths: tuple[int, ...] = ()
+    terminated: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
         states, actions = self.states, self.actions
@@ -95,17 +100,97 @@ class Trajectories:
                 f"actions of {self.env} go up to {most:g}; expected them within [-1, 1]. "
                 "Divide them by the bounds of the action space first: actions / env.action_space.high"
             )
+        self._check_ends()
 
     def __len__(self) -> int:
         return len(self.states)
 
+    @classmethod
+    def ragged(
+        cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], env: str, dt: float, names: tuple[str, ...],
+        units: tuple[str, ...], angles: tuple[int, ...] = (), *, terminated: Sequence[bool] = (),
+    ) -> Trajectories:  # fmt: skip
+        """Episodes of states (T_i + 1, dx) and actions (T_i, du), padded to the longest of them."""
+        for episode, (x, u) in enumerate(zip(states, actions, strict=True)):
+            if x.ndim != 2 or u.ndim != 2 or len(x) != len(u) + 1:
+                raise TrajectoryError(
+                    f"states {x.shape} and actions {u.shape} of episode {episode} of {env} do not fit: expected "
+                    "(T + 1, dx) and (T, du)"
+                )
+        lengths = tuple(len(u) for u in actions)
+        longest = max(lengths, default=0)
+        x = np.stack([np.pad(part, ((0, longest + 1 - len(part)), (0, 0)), mode="edge") for part in states])
+        u = np.stack([np.pad(part, ((0, longest - len(part)), (0, 0))) for part in actions])
+        return cls(x, u, env, dt, names, units, angles, lengths, tuple(map(bool, terminated)))
+
     @property
     def horizon(self) -> int:
-        """Steps per episode, T."""
+        """Steps of the longest episode, T."""
         return self.actions.shape[1]
 
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps of each episode (N,)."""
+        return np.array(self.lengths or [self.horizon] * len(self), np.int64)
+
     def take(self, index: slice | np.ndarray) -> Trajectories:
-        return replace(self, states=self.states[index], actions=self.actions[index])
+        """Some of the episodes, padded to the longest of them."""
+        lengths = self.steps[index]
+        longest = int(lengths.max(initial=0)) if self.lengths else self.horizon
+        return replace(
+            self,
+            states=self.states[index][:, : longest + 1],
+            actions=self.actions[index][:, :longest],
+            lengths=tuple(lengths.tolist()),
+            terminated=tuple(np.array(self.terminated)[index].tolist()) if self.terminated else (),
+        )
+
+    def cut(self, steps: int) -> Trajectories:
+        """The first ``steps`` steps of every episode that has as many; TrajectoryError where none has."""
+        among = np.flatnonzero(self.steps >= steps)
+        if steps < 1 or not len(among):
+            raise TrajectoryError(
+                f"no episode of {self.env} has {steps} steps: {len(self)} episodes, the longest of {self.horizon}"
+            )
+        ended = [bool(self.terminated and self.terminated[i] and self.steps[i] == steps) for i in among]
+        states, actions = self.states[among][:, : steps + 1], self.actions[among][:, :steps]
+        return replace(self, states=states, actions=actions, lengths=(), terminated=tuple(ended))
+
+    def require_equal_lengths(self, purpose: str) -> None:
+        """TrajectoryError where episodes differ in length, for a ``purpose`` that compares them step by step."""
+        if self.lengths:
+            raise TrajectoryError(
+                f"{purpose} needs episodes of equal length; those of {self.env} have {min(self.lengths)} to "
+                f"{self.horizon} steps. Take the beginning of those that are long enough: data.cut(steps)"
+            )
+
+    def _check_ends(self) -> None:
+        """Lengths and terminations that fit the arrays, and padding that is what it has to be."""
+        n, horizon = len(self), self.horizon
+        for field, values, kind in (("lengths", self.lengths, int), ("terminated", self.terminated, bool)):
+            if values and (len(values) != n or any(type(value) is not kind for value in values)):
+                raise TrajectoryError(
+                    f"{field} of {self.env} is {values!r:.80}; expected a tuple of {n} {kind.__name__}s, one each"
+                )
+        if self.lengths and not (min(self.lengths) >= 1 and max(self.lengths) == horizon):
+            raise TrajectoryError(
+                f"lengths of {self.env} go from {min(self.lengths)} to {max(self.lengths)}; expected at least 1, and "
+                f"the longest to fill the {horizon} steps of the arrays"
+            )
+        after = np.arange(horizon) >= self.steps[:, None]  # (N, T), of actions and of the states that they lead to
+        last = np.take_along_axis(self.states, self.steps[:, None, None], axis=1)
+        wrong = after & ((self.states[:, 1:] != last).any(-1) | (self.actions != 0).any(-1))
+        if wrong.any():
+            episode, step = np.argwhere(wrong)[0]
+            raise TrajectoryError(
+                f"episode {episode} of {self.env} ends after {self.lengths[episode]} steps, but its arrays go on at "
+                f"step {step}; expected its last state repeated and zero actions. Trajectories.ragged(...) pads them"
+            )
+        # One way to say that all are of equal length, and that none was ended.
+        if all(length == horizon for length in self.lengths):
+            object.__setattr__(self, "lengths", ())
+        if not any(self.terminated):
+            object.__setattr__(self, "terminated", ())
 
     def padded(self, past_len: int) -> Segment:
         """All episodes as one segment (N, past_len + T, .) whose column ``past_len + t`` holds x_{t+1} and u_t."""
@@ -130,10 +215,32 @@ def windows(segment: Segment, episodes: Tensor, starts: Tensor, past_len: int, f
     )
 
 
+def real_steps(lengths: Sequence[int], horizon: int) -> Tensor:
+    """(N, T) bool: the steps of episodes of these lengths, as opposed to their padding."""
+    return torch.arange(horizon) < torch.tensor(lengths)[:, None]
+
+
+def window_at(index: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Episode and start of the windows ``index`` (B,), counted episode by episode; ``counts`` (N,) windows of each."""
+    ends = counts.cumsum(0)
+    episodes = torch.searchsorted(ends, index, right=True)
+    return episodes, index - (ends - counts)[episodes]
+
+
 def batches(
-    segment: Segment, *, past_len: int, future_len: int, batch_size: int, generator: torch.Generator
+    segment: Segment,
+    *,
+    past_len: int,
+    future_len: int,
+    batch_size: int,
+    generator: torch.Generator,
+    lengths: Sequence[int] = (),
 ) -> Iterator[Window]:
-    """Endless random windows: episode and start are uniform over everything ``segment`` (N, L + T, .) holds."""
+    """Endless random windows: uniform over everything that ``segment`` (N, L + T, .) holds.
+
+    lengths: steps of each episode, as of ``Trajectories``. No window crosses an end, so an episode that is shorter than
+    a window has none; TrajectoryError where all are.
+    """
     n, steps = segment.actions.shape[:2]
     last_start = steps - past_len - future_len
     if last_start < 0:
@@ -141,9 +248,15 @@ def batches(
             f"episodes of {steps - past_len} steps are too short for windows of {future_len} future steps; "
             f"collect episodes of at least {future_len} steps"
         )
+    # Starts of each episode, for episodes of different length.
+    counts = (torch.tensor(lengths) + (1 + last_start - max(lengths))).clamp_min(0) if lengths else None
     while True:
-        episodes = torch.randint(n, (batch_size,), generator=generator)
-        starts = torch.randint(last_start + 1, (batch_size,), generator=generator)
+        if counts is None:
+            episodes = torch.randint(n, (batch_size,), generator=generator)
+            starts = torch.randint(last_start + 1, (batch_size,), generator=generator)
+        else:
+            index = torch.randint(int(counts.sum()), (batch_size,), generator=generator)
+            episodes, starts = window_at(index, counts)
         yield windows(segment, episodes, starts, past_len, future_len)
 
 

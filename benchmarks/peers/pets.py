@@ -16,24 +16,25 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
-from tsmlib.sampling import Noise, standard_normal
+from tsmlib.models.one_step_ensemble import OneStepEnsemble
+from tsmlib.planning.mbrl_lib import transition_batch
 from tsmlib.storage import tables
 from tsmlib.study import parameters, runs
 from tsmlib.study.results import prediction as prediction_results
-from tsmlib.trajectory import Segment, Trajectories
+from tsmlib.trajectory import Trajectories
 
 MODELS = {"gaussian": "pets", "mse": "pets+mse"}  # --form -> word in the column "model"
 MEMBERS = 5
@@ -62,52 +63,21 @@ def transitions(data: Trajectories, unit: Tensor) -> tuple[np.ndarray, np.ndarra
     return before, data.actions.reshape(-1, data.actions.shape[2]), after
 
 
-class Peer:
-    """An ensemble of one-step networks as a ``DynamicsModel``, by trajectory sampling with a fixed member (TS-inf).
+class Peer(OneStepEnsemble):
+    """An ensemble of one-step networks fed by ``Features``, by trajectory sampling with a fixed member (TS-inf).
 
     network: mean and log variance of the increments in ``unit_of(features)``, log variance None where none is stated.
     """
 
-    segment_len = 100  # the length of an episode: a whole rollout is one call, within which a row keeps its member
-    past_len, stochastic = 1, True
-
     def __init__(self, network: Network, features: Features, *, members: int = MEMBERS) -> None:
         self.network, self.features, self.members, self.unit = network, features, members, unit_of(features)
 
+    @torch.no_grad()
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
         """(M, R, dx), (M, R, du) -> mean and standard deviation of the increments (M, R, dx), physical units."""
         mean, log_variance = self.network(torch.cat([self.features(x), u], dim=-1))
         scale = self.unit * self.features.moving  # what never changes stays exactly as it is
         return scale * mean, None if log_variance is None else scale * (0.5 * log_variance).exp()
-
-    @torch.no_grad()
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-        """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx).
-
-        No generator: every step takes the mean of all members. With one: each row keeps a member of its own, and the
-        Gaussian form adds the noise which that member states.
-        """
-        n_rows, start = len(actions), past.states[:, -1]
-        if generator is None:
-            rows = torch.arange(n_rows).expand(self.members, -1)
-        else:
-            member = (self.members * torch.special.ndtr(standard_normal((n_rows,), generator, start))).long()
-            member = member.clamp(max=self.members - 1)
-            groups = [(member == m).nonzero()[:, 0] for m in range(self.members)]
-            rows = pad_sequence(groups, batch_first=True, padding_value=-1)  # (M, R), -1 where a group is shorter
-        real, rows = rows >= 0, rows.clamp(min=0)
-        x, states = start[rows], []
-        for u in actions.unbind(1):
-            mean, std = self.step(x, u[rows])
-            if generator is None:
-                mean = mean.mean(0).expand_as(mean)
-            elif std is not None:
-                mean = mean + std * standard_normal(start.shape, generator, start)[rows]
-            x = x + mean
-            states.append(x)
-        predicted = start.new_empty(n_rows, len(states), start.shape[1])
-        predicted[rows[real]] = torch.stack(states, dim=2)[real]
-        return predicted
 
 
 # Theirs --------------------------------------------------------------------------------------------------------------
@@ -130,12 +100,8 @@ def wrapped(form: str, features: Features, action_dim: int) -> Any:
 
 
 def batch_of(data: Trajectories, features: Features) -> Any:
-    """All transitions of ``data`` as mbrl-lib takes them."""
-    from mbrl.types import TransitionBatch
-
-    before, actions, after = transitions(data, unit_of(features))
-    nothing = np.zeros(len(actions), np.float32)  # no rewards, no ends
-    return TransitionBatch(before, actions, after, nothing, nothing.astype(bool), nothing.astype(bool))
+    """All transitions of ``data``, in units of their increments, as mbrl-lib takes them."""
+    return transition_batch(replace(data, states=data.states / unit_of(features).numpy()))
 
 
 def initialise(form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH) -> tuple[Any, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+from itertools import cycle
 from pathlib import Path
 
 from tsmlib.storage import artifacts
@@ -24,7 +25,7 @@ def lines(path: Path) -> list[dict[str, str]]:
     header = artifacts.read_header(path)
     schedule = zoo.stated(header["schedule"])
     found = []
-    for (stage, curve), planned in zip(header["curves"].items(), schedule, strict=True):
+    for (stage, curve), planned in zip(header["curves"].items(), cycle(schedule), strict=False):  # of each decoder
         best = min(range(len(curve["step"])), key=lambda i: curve["validation"][i])
         found.append({
             "env": header["fingerprint"]["env"], "model": header["model"], "seed": str(header["seed"]),

@@ -29,7 +29,7 @@ def main() -> None:
     starts = torch.from_numpy(study.random_data(arguments.env, 1000, seed=0).states[:, 0])
     reward = task.reward_for
     for name, (iterations, decay) in TRIES.items():
-        policy = OneStepPolicy(starts.shape[1], 2, copies=3)
+        policy = OneStepPolicy(starts.shape[1], 2, angles=model.features.angles, copies=3)
         policy.features.load_state_dict(model.features.state_dict())
         curve = learn_policy(
             policy, model, reward, episodes_from(starts),

@@ -33,11 +33,10 @@ from torch import Tensor
 
 from tsmlib import rewards
 from tsmlib.collection import collect, open_loop, smooth_torques
-from tsmlib.envs import geometry, mujoco_arm, pymunk_arm, render
-from tsmlib.envs.geometry import DT, START_VELOCITY, closest_gap, fingertip
-from tsmlib.evaluation import contacts, exploitation
+from tsmlib.envs import geometry, mujoco_arm, pymunk_arm, render, variant
+from tsmlib.envs.geometry import BLOCK_MASS, DT, START_VELOCITY, closest_gap, fingertip
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.planning import tasks
 from tsmlib.planning.base import Plan, Predictor
 from tsmlib.planning.planners import cem
 from tsmlib.planning.search_spaces import LatentActions
@@ -47,7 +46,7 @@ from tsmlib.study.runs import ROOT
 ENV, OTHER = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"  # whose numbers are changed
 # Every module that has the numbers by name. All are imported before a number is changed: what is imported after it
 # would keep the changed one.
-PLACES = (geometry, mujoco_arm, pymunk_arm, render, tasks, contacts, exploitation)
+PLACES = (geometry, mujoco_arm, pymunk_arm, render)
 HERE = Path(__file__).resolve().parent
 SEED = {"random": 2_000_001, "targets": 2_000_002}
 MOVED = 0.005  # m
@@ -73,8 +72,8 @@ class Setting:
 
 @contextlib.contextmanager
 def physics(setting: Setting) -> Iterator[None]:
-    """The package's pushing environments, both simulators, with these numbers in place of their own."""
-    numbers = dict(BLOCK_DECAY=setting.decay, BLOCK_RADIUS=setting.radius, WALL=setting.wall, BLOCK_MASS=setting.mass)
+    """The pushing environments, both simulators, with this drag and these walls; mass and radius are a variant's."""
+    numbers = dict(BLOCK_DECAY=setting.decay * BLOCK_MASS / setting.mass, WALL=setting.wall)
     places = [(module, name) for module in PLACES for name in numbers if hasattr(module, name)]
     before = [getattr(module, name) for module, name in places]
     caches = (mujoco_arm.load_model, mujoco_arm.physics_hash)
@@ -91,6 +90,11 @@ def physics(setting: Setting) -> Iterator[None]:
             kept.cache_clear()
 
 
+def named(setting: Setting, env_id: str = ENV) -> str:
+    """The id of the variant with this mass and radius."""
+    return variant(env_id, mass=setting.mass, object_radius=setting.radius)
+
+
 def draw(setting: Setting, n: int, seed: int) -> tuple[np.ndarray, Tensor]:
     """``n`` starts (n, 10) in which arm and object do not touch, and targets (n, 2). Within ``physics``."""
     starts, targets = [], []
@@ -101,7 +105,7 @@ def draw(setting: Setting, n: int, seed: int) -> tuple[np.ndarray, Tensor]:
         targets.append(in_ring(rng, *setting.target))
         while True:
             state = np.concatenate([arm, in_ring(rng, *setting.start), np.zeros(2)])
-            if closest_gap(state, ENV) > 0.005:
+            if closest_gap(state, named(setting)) > 0.005:
                 break
         starts.append(state)
     return np.stack(starts).astype(np.float32), torch.from_numpy(np.stack(targets)).float()
@@ -115,7 +119,7 @@ def in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray:
 
 def simulate(starts: np.ndarray, actions: Tensor, env_id: str = ENV) -> np.ndarray:
     """States (N, T + 1, 10) from ``starts`` (N, 10) under ``actions`` (N, T, 2), by one thread."""
-    threads: dict[str, Any] = {"threads": 1} if env_id == ENV else {}
+    threads: dict[str, Any] = {"threads": 1} if EnvSpec.parse(env_id).simulator == "mujoco" else {}
     env = gymnasium.make_vec(env_id, num_envs=len(starts), **threads)
     seen = collect(env, open_loop(actions), horizon=actions.shape[1], states=starts)
     env.close()
@@ -137,10 +141,10 @@ def of_random_torques(setting: Setting, n: int, env_id: str = ENV) -> dict[str, 
     """What happens in ``n`` episodes of the training data's kind."""
     starts, _ = draw(setting, n, SEED["random"])
     torques = smooth_torques(n, setting.horizon, generator=torch.Generator().manual_seed(SEED["random"]))
-    states = simulate(starts, torques, env_id)
+    states = simulate(starts, torques, named(setting, env_id))
     way = np.linalg.norm(states[..., 6:8] - states[:, :1, 6:8], axis=-1)
     moved = way.max(1) > MOVED
-    gap = closest_gap(states, ENV)
+    gap = closest_gap(states, named(setting))
     return {
         "episodes": n,
         "moved": float(moved.mean()),
@@ -157,12 +161,12 @@ def action_prior() -> ActionPrior:
     return artifacts.load_model(ROOT / "data" / "pretrained" / "ReacherObstacle" / "prior.safetensors", ActionPrior)
 
 
-def simulator_predictor(starts: np.ndarray) -> Predictor:
+def simulator_predictor(starts: np.ndarray, env_id: str = ENV) -> Predictor:
     """As ``planning.predictors.simulator_predictor``, by one thread."""
 
     def predict(actions: Tensor) -> Tensor:
         n, n_targets = actions.shape[:2]
-        states = simulate(np.tile(starts, (n, 1)), actions.flatten(0, 1))
+        states = simulate(np.tile(starts, (n, 1)), actions.flatten(0, 1), env_id)
         return torch.from_numpy(states[:, 1:]).unflatten(0, (n, n_targets))[None]
 
     return predict
@@ -173,7 +177,7 @@ def oracle(setting: Setting, n: int, *, seed: int, candidates: int = 96, iterati
     starts, targets = draw(setting, n, SEED["targets"])
     space = LatentActions(action_prior(), setting.horizon)
     plan = cem(
-        simulator_predictor(starts), rewards.push(targets), space, n,
+        simulator_predictor(starts, named(setting)), rewards.push(targets), space, n,
         candidates=candidates, elites=max(2, candidates // 10), iterations=iterations, seed=seed,
     )  # fmt: skip
     return plan, targets

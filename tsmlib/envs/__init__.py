@@ -3,18 +3,17 @@
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose ``rollout`` simulates
 whole action sequences at once; ``gymnasium.make("tsmlib.envs:tsm/ReacherPush-v1")`` imports this module by itself.
 The state is the observation, and its layout is the same in both simulators. ``imperfect`` names the same arms with
-noisy sensors or delayed actions (section 5.3.3). A simulator is imported when an arm in it is first made.
+noisy sensors or delayed actions (section 5.3.3), ``variant`` arms with other physics, as
+``gymnasium.make(id, mass=2.0)`` makes them. A simulator is imported when an arm in it is first made.
 """
 
 from dataclasses import replace
 from importlib import import_module
-
-from gymnasium.envs.registration import register, registry
+from typing import Unpack
 
 from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
+from tsmlib.envs.physics import STANDARD, Changes
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
-
-_VECTOR_ARMS = {"mujoco": "tsmlib.envs.mujoco_arm:MujocoArm", "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm"}
 
 
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
@@ -23,40 +22,56 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
     noise: sigma, in units of data scaled to [-1, 1] (``geometry.HALF_RANGE``). delay: tau in steps. Both of the
     paper's, ``NOISE`` and ``DELAY``, are registered for every arm. ValueError where they make no sense.
     """
-    if env_id not in ENV_IDS:
-        raise ValueError(f"{env_id!r} is none of {', '.join(ENV_IDS)}; noise and delay are added to one of these")
+    plain = _spec(env_id)
+    if plain is None or plain != plain.arm:
+        raise ValueError(
+            f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor a variant; noise and delay are added to one of these"
+        )
     whole = isinstance(delay, int) and not isinstance(delay, bool)
     if not 0.0 <= noise <= 10.0 or round(noise, 4) != noise or not (whole and 0 <= delay <= 100):
         raise ValueError(
             f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four decimals, and a "
             "whole number of steps from 0 to 100"
         )
-    name = replace(EnvSpec.parse(env_id), noise=noise, delay=delay).id
-    if name not in registry:
-        register(
-            name, entry_point="tsmlib.envs.wrappers:imperfect_arm",
-            vector_entry_point="tsmlib.envs.wrappers:imperfect_arms",
-            kwargs={"env_id": env_id, "noise": noise, "delay": delay}, max_episode_steps=100,
-        )  # fmt: skip
-    return name
+    return _known(replace(plain, noise=noise, delay=delay))
+
+
+def variant(env_id: str, **changes: Unpack[Changes]) -> str:
+    """The id of the same arm with other physics (`Physics`), registered where it is not yet.
+
+    ``gymnasium.make(env_id, **changes)`` makes the same environment. ValueError where a value makes no sense.
+    """
+    return _known(EnvSpec.parse(env_id).varied(**changes))
 
 
 def fingerprint(env_id: str) -> dict[str, object]:
-    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit."""
+    """What data or a model of an environment belong to, as JSON values: anything that says otherwise does not fit.
+
+    Of a variant, the values that it changes are fields of their own, and ``standard`` holds those of the standard arm.
+    """
     spec = EnvSpec.parse(env_id)
-    physics = import_module(_VECTOR_ARMS[spec.simulator].partition(":")[0])
+    simulator = import_module(f"tsmlib.envs.{spec.simulator}_arm").physics_hash(spec.arm.id)
     names, units = (list(part[: spec.state_dim]) for part in (STATE_NAMES, STATE_UNITS))
+    changed = spec.physics.changed
+    varied = {**changed, "standard": {name: STANDARD[name] for name in changed}} if changed else {}
     return {
         "env": env_id, "dt": DT, "names": names, "units": units, "angles": [0, 1],
-        "noise": spec.noise, "delay": spec.delay, "simulator": physics.physics_hash(spec.arm.id),
+        "noise": spec.noise, "delay": spec.delay, **varied, "simulator": simulator,
     }  # fmt: skip
 
 
+def _known(spec: EnvSpec) -> str:
+    return EnvSpec.parse(spec.id).id
+
+
+def _spec(env_id: str) -> EnvSpec | None:
+    try:
+        return EnvSpec.parse(env_id)
+    except ValueError:
+        return None
+
+
 for _id in ENV_IDS:
-    if _id not in registry:
-        register(
-            _id, entry_point="tsmlib.envs.arm:ArmEnv", vector_entry_point=_VECTOR_ARMS[EnvSpec.parse(_id).simulator],
-            kwargs={"env_id": _id}, max_episode_steps=100,
-        )  # fmt: skip
+    EnvSpec.parse(_id)
     imperfect(_id, noise=NOISE)
     imperfect(_id, delay=DELAY)

@@ -4,17 +4,21 @@ Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A sim
 its abstract methods. One arm, `ArmEnv`, is N = 1 of the same code.
 """
 
+import dataclasses
 import secrets
 from abc import ABC, abstractmethod
+from typing import Unpack
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tsmlib.envs import geometry
 from tsmlib.envs.geometry import DT, MAX_OVERLAP, closest_gap, fingertip
+from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.spec import EnvSpec
 
 Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
@@ -36,6 +40,9 @@ class ArmVectorEnv(VectorEnv, ABC):
 
     ``reset(seed, options)``: ``options["states"]`` (N, dx) starts the episodes there, ``options["target"]`` (2,) or
     (N, 2) sets the target. Without them, episode i is drawn from (seed, i) alone, so it does not depend on N.
+
+    mass, damping, link_lengths, object_radius, torque_gain: those of `Physics`; ``env_id`` and Gymnasium's ``spec.id``
+    name the variant that they make.
     """
 
     metadata = {  # noqa: RUF012 - as Gymnasium declares it
@@ -47,15 +54,17 @@ class ArmVectorEnv(VectorEnv, ABC):
     dt = DT
 
     def __init__(
-        self, num_envs: int, env_id: str, *, max_episode_steps: int = 100, render_mode: str | None = None
-    ) -> None:
+        self, num_envs: int, env_id: str, *, max_episode_steps: int = 100, render_mode: str | None = None,
+        **changes: Unpack[Changes],
+    ) -> None:  # fmt: skip
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-        self.num_envs, self.env_id, self.task = num_envs, env_id, EnvSpec.parse(env_id).task
+        self._arm = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id)
+        self.num_envs, self.env_id, self.task, self.physics = num_envs, self._arm.id, self._arm.task, self._arm.physics
         self.max_episode_steps, self.render_mode = max_episode_steps, render_mode
-        dx = EnvSpec.parse(env_id).state_dim
+        dx = self._arm.state_dim
         self.names, self.units = geometry.STATE_NAMES[:dx], geometry.STATE_UNITS[:dx]
         self.single_observation_space = Box(-np.inf, np.inf, (dx,), np.float64)
         self.single_action_space = Box(-1.0, 1.0, (2,), np.float32)
@@ -66,6 +75,15 @@ class ArmVectorEnv(VectorEnv, ABC):
         self._elapsed: int | None = None  # steps since reset; None before the first
         self._states = np.zeros((num_envs, dx))
         self.target = np.zeros((num_envs, 2))
+
+    @property
+    def spec(self) -> GymnasiumSpec | None:
+        """Gymnasium's record of how this was made, under the id of the variant that it is."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made: GymnasiumSpec | None) -> None:
+        self._spec = _named(made, self.physics)
 
     @abstractmethod
     def _start(self, states: np.ndarray) -> None:
@@ -103,9 +121,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         self._resets += 1
         if "states" in options:
             states = self._checked(options["states"], self._states.shape, "states")
-            states[:, 4:6] = fingertip(states[:, :2])
+            states[:, 4:6] = fingertip(states[:, :2], self.physics.link_lengths)
             self._require_apart(states)
-            target = np.stack([_in_ring(rng, *geometry.TARGET_RING[self.task]) for rng in rngs])
+            target = np.stack([_in_ring(rng, *geometry.target_ring(self._arm)) for rng in rngs])
         else:
             states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
         if "target" in options:
@@ -169,12 +187,12 @@ class ArmVectorEnv(VectorEnv, ABC):
         most = np.array(geometry.START_ANGLES[self.task])
         q = rng.uniform(-most, most)
         dq = rng.uniform(-geometry.START_VELOCITY, geometry.START_VELOCITY, 2)
-        state = np.concatenate([q, dq, fingertip(q)])
-        target = _in_ring(rng, *geometry.TARGET_RING[self.task])
+        state = np.concatenate([q, dq, fingertip(q, self.physics.link_lengths)])
+        target = _in_ring(rng, *geometry.target_ring(self._arm))
         if self.task == "reach":
             return state, target
         while True:  # the block must not touch the arm
-            with_block = np.concatenate([state, _in_ring(rng, *geometry.BLOCK_RING), np.zeros(2)])
+            with_block = np.concatenate([state, _in_ring(rng, *geometry.block_ring(self._arm)), np.zeros(2)])
             if closest_gap(with_block, self.env_id) > geometry.BLOCK_CLEARANCE:
                 return with_block, target
 
@@ -206,6 +224,15 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
     return radius * np.array([np.cos(angle), np.sin(angle)])
 
 
+def _named(made: GymnasiumSpec | None, physics: Physics) -> GymnasiumSpec | None:
+    """Gymnasium's record of an environment with the id that says its physics."""
+    if made is None or EnvSpec.parse(made.id).physics == physics:
+        return made
+    return dataclasses.replace(
+        made, id=EnvSpec.parse(dataclasses.replace(EnvSpec.parse(made.id), physics=physics).id).id
+    )
+
+
 class ArmEnv(gymnasium.Env):
     """One arm: the vector environment of the same id with N = 1, so single and bulk simulation agree bit for bit."""
 
@@ -213,12 +240,22 @@ class ArmEnv(gymnasium.Env):
     angles = (0, 1)
     dt = DT
 
-    def __init__(self, env_id: str, render_mode: str | None = None) -> None:
-        vector = gymnasium.make_vec(env_id, num_envs=1, render_mode=render_mode).unwrapped
+    def __init__(self, env_id: str, render_mode: str | None = None, **changes: Unpack[Changes]) -> None:
+        name = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id).id
+        vector = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode).unwrapped
         assert isinstance(vector, ArmVectorEnv)
-        self.vector, self.env_id, self.render_mode = vector, env_id, render_mode
+        self.vector, self.env_id, self.render_mode = vector, name, render_mode
         self.names, self.units, self.task = vector.names, vector.units, vector.task
         self.observation_space, self.action_space = vector.single_observation_space, vector.single_action_space
+
+    @property
+    def spec(self) -> GymnasiumSpec | None:
+        """Gymnasium's record of how this was made, under the id of the variant that it is."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made: GymnasiumSpec | None) -> None:
+        self._spec = _named(made, self.vector.physics)
 
     @property
     def target(self) -> np.ndarray:

@@ -8,10 +8,12 @@ State (float64, all in one horizontal plane):
 
 import numpy as np
 
+from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 
-# The arm is Gymnasium's Reacher; a test compares these lengths with its model (m).
-LINK_LENGTHS = (0.1, 0.11)  # shoulder to elbow, elbow to centre of the fingertip
+# The arm is Gymnasium's Reacher; a test compares these lengths with its model (m). What can differ in a variant is
+# that of the standard arm here; ``EnvSpec.parse(env_id).physics`` knows it of every arm.
+LINK_LENGTHS = Physics.link_lengths  # shoulder to elbow, elbow to centre of the fingertip
 LINK1_CAPSULE = 0.1  # the second link's capsule ends before the fingertip's sphere begins
 ARM_RADIUS = 0.01  # links and fingertip alike
 ELBOW_LIMIT = 3.0  # rad; the shoulder turns freely
@@ -19,9 +21,9 @@ GEAR = 200.0  # N m per unit of action
 DT = 0.02  # s per step
 
 # The block: the object to push, or the obstacle (a disc seen from above).
-BLOCK_RADIUS = 0.03
+BLOCK_RADIUS = Physics.object_radius
 WALL = 0.24  # the walls' faces on push; the object's centre stays within 0.21 m along x and y
-BLOCK_MASS = 1.0  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
+BLOCK_MASS = Physics.mass  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
 BLOCK_DECAY = 0.05  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
 FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
@@ -45,17 +47,50 @@ STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
 HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.21, 0.21, 4.8, 4.6)  # in random data; angles: of cosine, sine
 
 
-def arm_points(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def arm_points(
+    angles: np.ndarray, lengths: tuple[float, float] = LINK_LENGTHS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Forward kinematics: angles (..., 2) to elbow, end of the second capsule, and fingertip (each (..., 2), m)."""
     shoulder, reach = angles[..., 0], angles[..., 0] + angles[..., 1]
-    elbow = LINK_LENGTHS[0] * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=-1)
+    elbow = lengths[0] * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=-1)
     direction = np.stack([np.cos(reach), np.sin(reach)], axis=-1)
-    return elbow, elbow + LINK1_CAPSULE * direction, elbow + LINK_LENGTHS[1] * direction
+    return elbow, elbow + capsule_length(lengths) * direction, elbow + lengths[1] * direction
 
 
-def fingertip(angles: np.ndarray) -> np.ndarray:
+def capsule_length(lengths: tuple[float, float]) -> float:
+    """Length of the second link's capsule, m."""
+    return LINK1_CAPSULE if lengths == LINK_LENGTHS else lengths[1] - ARM_RADIUS
+
+
+def fingertip(angles: np.ndarray, lengths: tuple[float, float] = LINK_LENGTHS) -> np.ndarray:
     """Fingertip position (..., 2) of joint angles (..., 2)."""
-    return arm_points(angles)[2]
+    return arm_points(angles, lengths)[2]
+
+
+def slide_time(physics: Physics) -> float:
+    """Seconds in which a free object slows down by a factor e: its mass over its drag."""
+    return BLOCK_DECAY * physics.mass / BLOCK_MASS
+
+
+def room(physics: Physics) -> float:
+    """Largest coordinate of the object's centre along x and y, between the walls, m."""
+    return WALL - physics.object_radius
+
+
+def target_ring(spec: EnvSpec) -> tuple[float, float]:
+    """Radii between which targets are drawn, m: those of the task, as far as this arm and its object can get."""
+    inner, outer = TARGET_RING[spec.task]
+    near, far = sorted(spec.physics.link_lengths)
+    inner = max(
+        inner, far - near - 0.01
+    )  # of the hole around the shoulder, the standard arm's 1 cm are part of its task
+    return inner, min(outer, near + far, room(spec.physics)) if spec.task == "push" else min(outer, near + far)
+
+
+def block_ring(spec: EnvSpec) -> tuple[float, float]:
+    """Radii between which obstacle or object are at reset, m."""
+    inner, outer = BLOCK_RING
+    return inner, min(outer, sum(spec.physics.link_lengths))
 
 
 def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
@@ -63,16 +98,17 @@ def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
 
     Negative where they penetrate. The same geometry for both simulators. ValueError where there is no block.
     """
-    if not EnvSpec.parse(env_id).has_block:
+    spec = EnvSpec.parse(env_id)
+    if not spec.has_block:
         raise ValueError(f"{env_id} has no block; closest_gap needs an obstacle or push environment")
     states = np.asarray(states, np.float64)
     block = states[..., 6:8]
-    elbow, capsule_end, tip = arm_points(states[..., :2])
+    elbow, capsule_end, tip = arm_points(states[..., :2], spec.physics.link_lengths)
     distance = np.minimum(
         np.minimum(_to_segment(block, np.zeros_like(elbow), elbow), _to_segment(block, elbow, capsule_end)),
         np.linalg.norm(block - tip, axis=-1),
     )
-    return distance - (ARM_RADIUS + BLOCK_RADIUS)
+    return distance - (ARM_RADIUS + spec.physics.object_radius)
 
 
 def _to_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:

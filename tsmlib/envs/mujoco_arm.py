@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Unpack
 
 if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
     os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
@@ -27,7 +28,17 @@ import mujoco.rollout
 import numpy as np
 
 from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
-from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_MASS, BLOCK_RADIUS, DT, RESTITUTION, WALL, fingertip
+from tsmlib.envs.geometry import (
+    BLOCK_DECAY,
+    BLOCK_MASS,
+    DT,
+    LINK_LENGTHS,
+    RESTITUTION,
+    WALL,
+    capsule_length,
+    fingertip,
+)
+from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
 
@@ -47,15 +58,17 @@ _gl_works = True  # until the first failure to get a context
 @cache
 def load_model(env_id: str) -> mujoco.MjModel:
     """The compiled model of an environment id; shared, so treat it as read-only."""
-    task = EnvSpec.parse(env_id).task
-    if task == "reach":
+    arm = EnvSpec.parse(env_id)
+    if arm.id == arm.standard.id and arm.task == "reach":
         model = mujoco.MjModel.from_xml_path(str(ASSET))
     else:
         spec = mujoco.MjSpec.from_file(str(ASSET))
-        spec.delete(spec.body("target"))
-        spec.option.timestep = TIMESTEP
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        _add_block(spec, moving=task == "push")
+        if arm.task != "reach":
+            spec.delete(spec.body("target"))
+            spec.option.timestep = TIMESTEP
+            spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+            _add_block(spec, arm.physics, moving=arm.task == "push")
+        _change_arm(spec, arm.physics)
         model = spec.compile()
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
     return model
@@ -77,7 +90,21 @@ def physics_hash(env_id: str) -> str:
     return found.hexdigest()
 
 
-def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
+def _change_arm(spec: mujoco.MjSpec, physics: Physics) -> None:
+    """Joint damping, gears and lengths of a variant; Reacher's own damping is 1 N m s/rad."""
+    for joint in (spec.joint("joint0"), spec.joint("joint1")):
+        joint.damping = physics.damping * joint.damping
+    for motor in spec.actuators:
+        motor.gear = physics.torque_gain * motor.gear
+    if physics.link_lengths != LINK_LENGTHS:
+        first, second = physics.link_lengths
+        for name, length in (("link0", first), ("link1", capsule_length(physics.link_lengths))):
+            spec.geom(name).fromto = [0.0, 0.0, 0.0, length, 0.0, 0.0]
+        spec.body("body1").pos = [first, 0.0, 0.0]
+        spec.body("fingertip").pos = [second, 0.0, 0.0]
+
+
+def _add_block(spec: mujoco.MjSpec, physics: Physics, *, moving: bool) -> None:
     """A disc among the arm's links: on two damped slides between four walls, or fixed at its mocap position.
 
     It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and
@@ -86,11 +113,11 @@ def _add_block(spec: mujoco.MjSpec, *, moving: bool) -> None:
     """
     block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
     block.add_geom(
-        name="block", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[BLOCK_RADIUS, 0, 0], mass=BLOCK_MASS,
+        name="block", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[physics.object_radius, 0, 0], mass=physics.mass,
         contype=1, conaffinity=0, condim=1, solref=[CONTACT_TIME, 1.0], solimp=RIGID, priority=1, group=3,
     )  # fmt: skip
     block.add_geom(
-        name="block_drawn", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[BLOCK_RADIUS, 0.012, 0], mass=0,
+        name="block_drawn", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[physics.object_radius, 0.012, 0], mass=0,
         contype=0, conaffinity=0, rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
     )  # fmt: skip
     if moving:
@@ -131,10 +158,10 @@ class MujocoArm(ArmVectorEnv):
 
     def __init__(
         self, num_envs: int, env_id: str, *, threads: int | None = None,
-        max_episode_steps: int = 100, render_mode: str | None = None,
+        max_episode_steps: int = 100, render_mode: str | None = None, **changes: Unpack[Changes],
     ) -> None:  # fmt: skip
-        super().__init__(num_envs, env_id, max_episode_steps=max_episode_steps, render_mode=render_mode)
-        self.model = load_model(env_id)
+        super().__init__(num_envs, env_id, max_episode_steps=max_episode_steps, render_mode=render_mode, **changes)
+        self.model = load_model(self.env_id)
         self.frame_skip = round(DT / self.model.opt.timestep)
         threads = min(threads or min(os.cpu_count() or 1, 8), num_envs)
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
@@ -194,7 +221,7 @@ class MujocoArm(ArmVectorEnv):
         """MuJoCo states (n, T, ...) to states (n, T, dx)."""
         nq, nv = self.model.nq, self.model.nv
         q, dq = physics[..., 1 : 1 + nq], physics[..., 1 + nq : 1 + nq + nv]
-        parts = [q[..., :2], dq[..., :2], fingertip(q[..., :2])]
+        parts = [q[..., :2], dq[..., :2], fingertip(q[..., :2], self.physics.link_lengths)]
         if self.task == "push":
             parts += [q[..., 2:], dq[..., 2:]]
         elif self.task == "obstacle":

@@ -19,14 +19,15 @@ import pymunk
 
 from tsmlib.envs import geometry
 from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
-from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_DECAY, BLOCK_MASS, BLOCK_RADIUS, DT, ELBOW_LIMIT, LINK_LENGTHS, WALL
+from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_DECAY, BLOCK_MASS, DT, ELBOW_LIMIT, WALL, capsule_length
+from tsmlib.envs.physics import Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
 
 SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies
 ITERATIONS = 20
 ARMATURE = 1.0  # kg m^2 and
-DAMPING = 1.0  # N m s / rad, both Reacher's
+DAMPING = Physics.damping  # N m s / rad, both Reacher's
 ELBOW_MASS = 10.0  # kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together
 ANCHOR_MASS = 1e9  # kg; nothing moves the first link off the shoulder, it only turns
 STIFF = 1e-60  # share of an overlap or joint error left after a second: a quarter is corrected in a substep
@@ -41,12 +42,14 @@ ARM, BLOCK, WALLS = 0b001, 0b010, 0b100  # the arm meets the block only, and pas
 
 def physics_hash(env_id: str) -> str:
     """SHA-256 of the numbers that decide how an environment moves; the same on every machine."""
+    arm = EnvSpec.parse(env_id)
+    lengths, physics = arm.physics.link_lengths, arm.physics
     # Nothing slides and there are no walls but on push; the others keep the numbers that their files were made with.
-    decay, wall = (BLOCK_DECAY, WALL) if EnvSpec.parse(env_id).task == "push" else (0.2, 0.28)
+    decay, wall = (geometry.slide_time(physics), WALL) if arm.task == "push" else (0.2, 0.28)
     numbers = (
-        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, geometry.GEAR, LINK_LENGTHS, geometry.LINK1_CAPSULE, ARM_RADIUS,
-        ARMATURE, DAMPING, ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT, BLOCK_RADIUS, BLOCK_MASS, decay,
-        geometry.FRICTION, geometry.RESTITUTION, wall,
+        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, geometry.GEAR * physics.torque_gain, lengths,
+        capsule_length(lengths), ARM_RADIUS, ARMATURE, physics.damping, ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT,
+        physics.object_radius, physics.mass, decay, geometry.FRICTION, geometry.RESTITUTION, wall,
     )  # fmt: skip
     return hashlib.sha256(repr(numbers).encode()).hexdigest()
 
@@ -67,7 +70,7 @@ class PymunkArm(ArmVectorEnv):
         history = np.concatenate([self._history, actions], axis=1)
         over = self._history.shape[1] < self.max_episode_steps <= history.shape[1]
         live, self._live = self._live, [None] * self.num_envs  # after a fault every episode is replayed
-        for i, torques in enumerate((geometry.GEAR * actions).tolist()):
+        for i, torques in enumerate((geometry.GEAR * self.physics.torque_gain * actions).tolist()):
             episode = live[i] or self._replayed(i)
             for t, (shoulder, elbow) in enumerate(torques):
                 state = episode.step(shoulder, elbow)
@@ -80,8 +83,8 @@ class PymunkArm(ArmVectorEnv):
 
     def _replayed(self, i: int) -> _Episode:
         """Episode i, built at its start and brought to the present."""
-        episode = _Episode(self.task, self._starts[i].tolist())
-        for shoulder, elbow in (geometry.GEAR * self._history[i]).tolist():
+        episode = _Episode(self.task, self.physics, self._starts[i].tolist())
+        for shoulder, elbow in (geometry.GEAR * self.physics.torque_gain * self._history[i]).tolist():
             episode.step(shoulder, elbow)
         return episode
 
@@ -104,7 +107,8 @@ class PymunkArm(ArmVectorEnv):
 class _Episode:
     """One arm and what it can touch, in a space of its own. ``state`` is a list of dx numbers."""
 
-    def __init__(self, task: str, state: list[float]) -> None:
+    def __init__(self, task: str, physics: Physics, state: list[float]) -> None:
+        self.physics = physics
         self.space = pymunk.Space()
         self.space.iterations = ITERATIONS
         self.space.collision_slop = SLOP
@@ -127,13 +131,14 @@ class _Episode:
             link2.torque = elbow
             step(DT / SUBSTEPS)
         q, w, reach = link1.angle, link1.angular_velocity, link2.angle
-        tip_x = LINK_LENGTHS[0] * math.cos(q) + LINK_LENGTHS[1] * math.cos(reach)
-        tip_y = LINK_LENGTHS[0] * math.sin(q) + LINK_LENGTHS[1] * math.sin(reach)
+        first, second = self.physics.link_lengths
+        tip_x = first * math.cos(q) + second * math.cos(reach)
+        tip_y = first * math.sin(q) + second * math.sin(reach)
         arm = (q, reach - q, w, link2.angular_velocity - w, tip_x, tip_y)
         return (*arm, *self.block.position, *self.block.velocity) if self.block else arm + self.obstacle
 
     def _add_arm(self, q0: float, q1: float, dq0: float, dq1: float) -> None:
-        length = LINK_LENGTHS[0]
+        (length, second), damping = self.physics.link_lengths, self.physics.damping
         self.link1, self.link2 = pymunk.Body(ANCHOR_MASS, ARMATURE), pymunk.Body(ELBOW_MASS, ARMATURE)
         self.link1.angle, self.link1.angular_velocity = q0, dq0
         self.link2.angle, self.link2.angular_velocity = q0 + q1, dq0 + dq1
@@ -142,12 +147,12 @@ class _Episode:
         elbow = pymunk.PivotJoint(self.link1, self.link2, (length, 0.0), (0.0, 0.0))
         limit = pymunk.RotaryLimitJoint(self.link1, self.link2, -ELBOW_LIMIT, ELBOW_LIMIT)
         elbow.error_bias = limit.error_bias = STIFF
-        shoulder_damper = pymunk.DampedRotarySpring(self.space.static_body, self.link1, 0.0, 0.0, DAMPING)
-        elbow_damper = pymunk.DampedRotarySpring(self.link1, self.link2, 0.0, 0.0, DAMPING)
+        shoulder_damper = pymunk.DampedRotarySpring(self.space.static_body, self.link1, 0.0, 0.0, damping)
+        elbow_damper = pymunk.DampedRotarySpring(self.link1, self.link2, 0.0, 0.0, damping)
         shapes = (
             pymunk.Segment(self.link1, (0.0, 0.0), (length, 0.0), ARM_RADIUS),
-            pymunk.Segment(self.link2, (0.0, 0.0), (geometry.LINK1_CAPSULE, 0.0), ARM_RADIUS),
-            pymunk.Circle(self.link2, ARM_RADIUS, (LINK_LENGTHS[1], 0.0)),  # the fingertip
+            pymunk.Segment(self.link2, (0.0, 0.0), (capsule_length(self.physics.link_lengths), 0.0), ARM_RADIUS),
+            pymunk.Circle(self.link2, ARM_RADIUS, (second, 0.0)),  # the fingertip
         )
         for shape in shapes:
             shape.filter = pymunk.ShapeFilter(categories=ARM, mask=BLOCK)
@@ -155,16 +160,16 @@ class _Episode:
         self.space.add(self.link1, self.link2, elbow, limit, shoulder_damper, elbow_damper, *shapes)
 
     def _add_block(self, position: tuple[float, float], velocity: tuple[float, float]) -> None:
-        self.block = pymunk.Body(BLOCK_MASS, math.inf)  # it slides and does not turn
+        self.block = pymunk.Body(self.physics.mass, math.inf)  # it slides and does not turn
         self.block.position, self.block.velocity = position, velocity
         self.space.add(self.block)
         self._add_disc(self.block, (0.0, 0.0))
-        for anchor in ((FAR, 0.0), (0.0, FAR)):  # a dashpot along x and one along y: drag m / tau without a callback
+        for anchor in ((FAR, 0.0), (0.0, FAR)):  # a dashpot along x and one along y: drag without a callback
             drag = BLOCK_MASS / BLOCK_DECAY
             self.space.add(pymunk.DampedSpring(self.space.static_body, self.block, anchor, (0.0, 0.0), 0.0, 0.0, drag))
 
     def _add_disc(self, body: pymunk.Body, centre: tuple[float, float]) -> None:
-        disc = pymunk.Circle(body, BLOCK_RADIUS, centre)
+        disc = pymunk.Circle(body, self.physics.object_radius, centre)
         disc.filter = pymunk.ShapeFilter(categories=BLOCK)
         disc.friction, disc.elasticity = geometry.FRICTION, 1.0
         self.space.add(disc)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_RADIUS, LINK_LENGTHS, WALL, arm_points
+from tsmlib.envs.geometry import ARM_RADIUS, WALL, arm_points
 from tsmlib.envs.spec import EnvSpec
 
 if TYPE_CHECKING:
@@ -37,8 +37,14 @@ def draw_scene(
     """
     from matplotlib.patches import Circle, Rectangle
 
-    state, task = np.asarray(state, np.float64), EnvSpec.parse(env_id).task
-    expected = EnvSpec.parse(env_id).state_dim
+    arm = EnvSpec.parse(env_id)
+    state, task, radius, lengths = (
+        np.asarray(state, np.float64),
+        arm.task,
+        arm.physics.object_radius,
+        arm.physics.link_lengths,
+    )
+    expected = arm.state_dim
     if state.shape != (expected,):
         raise ValueError(f"the state is {state.shape}; {env_id} expected ({expected},)")
 
@@ -46,7 +52,7 @@ def draw_scene(
         solid = task == "push"  # elsewhere the frame is only there to look at
         ax.add_patch(Rectangle((-EXTENT, -EXTENT), 2 * EXTENT, 2 * EXTENT, fc=STEEL if solid else FRAME, ec="none"))
         ax.add_patch(Rectangle((-WALL, -WALL), 2 * WALL, 2 * WALL, fc=FLOOR, ec="none"))
-        reach = sum(LINK_LENGTHS)
+        reach = sum(lengths)
         ax.add_patch(Circle((0, 0), reach, fc="none", ec=FRAME, lw=0.8, ls=(0, (4, 3)), zorder=1.1))
         ax.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
         ax.set_axis_off()
@@ -55,14 +61,14 @@ def draw_scene(
             path = np.asarray(path)
             ax.plot(path[:, 0], path[:, 1], color=colour, lw=1.6, alpha=0.8, solid_capstyle="round", zorder=2)
     if target is not None:
-        _target(ax, np.asarray(target), BLOCK_RADIUS if task == "push" else 1.2 * ARM_RADIUS)
+        _target(ax, np.asarray(target), radius if task == "push" else 1.2 * ARM_RADIUS)
     if task != "reach":
         fixed = task == "obstacle"
         face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
-        ax.add_patch(Circle((state[6], state[7]), BLOCK_RADIUS, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))
+        ax.add_patch(Circle((state[6], state[7]), radius, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))
         if fixed:  # a bolt: it does not move
-            ax.add_patch(Circle((state[6], state[7]), 0.25 * BLOCK_RADIUS, fc=INK, ec="none", alpha=alpha, zorder=3))
-    elbow, _, tip = arm_points(state[:2])
+            ax.add_patch(Circle((state[6], state[7]), 0.25 * radius, fc=INK, ec="none", alpha=alpha, zorder=3))
+    elbow, _, tip = arm_points(state[:2], lengths)
     ax.add_patch(Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9))  # the pedestal
     _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)

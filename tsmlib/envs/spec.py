@@ -1,11 +1,20 @@
-"""Environment ids, and what each says: simulator, task, noise and delay. The version is the task's."""
+"""Environment ids, and what each says: simulator, task, physics, noise and delay. The version is the task's.
+
+Gymnasium knows the six standard arms, and each with the paper's noise or delay. Another one is registered when its id
+is first parsed, so that data and models bring their environment with them.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Literal, get_args
+from typing import Literal, Unpack, get_args
+
+from gymnasium.envs.registration import register, registry
+
+from tsmlib.envs import physics
+from tsmlib.envs.physics import STANDARD, Changes, Physics
 
 Simulator = Literal["mujoco", "pymunk"]
 TaskName = Literal["reach", "obstacle", "push"]
@@ -16,6 +25,11 @@ _ARMS = {
     "pymunk": {"reach": "PymunkReacher", "obstacle": "PymunkObstacle", "push": "PymunkPush"},
 }
 _VERSION = {"reach": 0, "obstacle": 0, "push": 1}
+_NOTHING_TO_CHANGE: dict[TaskName, dict[str, str]] = {
+    "reach": {"mass": "it has no object", "object_radius": "it has no object"},
+    "obstacle": {"mass": "its obstacle does not move"},
+    "push": {},
+}
 _CHANGED = {
     "push": "the physics of pushing changed (a free object slows down by e in 0.05 s, before in 0.2 s; walls at 0.24 m "
     "from the shoulder, before at 0.28 m; first poses in every direction; T = 100 steps, before 50)"
@@ -30,23 +44,42 @@ class EnvSpec:
     task: TaskName
     noise: float = 0.0
     delay: int = 0
+    physics: Physics = field(default_factory=Physics)
 
     @staticmethod
     @cache
     def parse(env_id: str) -> EnvSpec:
-        """The environment of an id. ValueError for another id; of one that is gone, why, and what took its place."""
-        arm, noise, delay, version = _parts(env_id)
+        """The environment of an id, which Gymnasium knows from then on.
+
+        ValueError for another id; of one that is gone, why, and what took its place.
+        """
+        arm, changed, noise, delay, version = _parts(env_id)
         if f"{arm}-v{version}" not in _PLAIN:
             raise ValueError(
-                gone(env_id) or f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them"
+                gone(env_id)
+                or f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them, "
+                "nor a variant()"
             )
-        return replace(_PLAIN[f"{arm}-v{version}"], noise=float(noise or 0.0), delay=int(delay or 0))
+        spec = replace(_PLAIN[f"{arm}-v{version}"], noise=float(noise or 0.0), delay=int(delay or 0))
+        spec = spec.varied(**physics.parse(changed))
+        if any(changed) and spec.id != env_id:
+            raise ValueError(f"{env_id} is written {spec.id}")
+        _register(spec)
+        return spec
+
+    def varied(self, **changes: Unpack[Changes]) -> EnvSpec:
+        """The same environment with other physics. ValueError where a value, or it in this task, makes no sense."""
+        allowed = [name for name in STANDARD if name not in _NOTHING_TO_CHANGE[self.task]]
+        if refused := [name for name in changes if name not in allowed]:
+            why = _NOTHING_TO_CHANGE[self.task].get(refused[0], "there is no such quantity")
+            raise ValueError(f"{refused[0]} of {self.id} cannot be chosen: {why}. It takes {', '.join(allowed)}")
+        return replace(self, physics=replace(self.physics, **changes))
 
     @property
     def name(self) -> str:
-        """Name in folders and titles: ``"ReacherPush"``, ``"Reacher-delay5"``."""
+        """Name in folders and titles: ``"ReacherPush"``, ``"ReacherPush-mass2"``, ``"Reacher-delay5"``."""
         noise, delay = f"-noise{self.noise:g}" if self.noise else "", f"-delay{self.delay}" if self.delay else ""
-        return f"{_ARMS[self.simulator][self.task]}{noise}{delay}"
+        return f"{_ARMS[self.simulator][self.task]}{self.physics.word}{noise}{delay}"
 
     @property
     def id(self) -> str:
@@ -59,6 +92,11 @@ class EnvSpec:
         return replace(self, noise=0.0, delay=0)
 
     @property
+    def standard(self) -> EnvSpec:
+        """The standard arm with this task, without noise and delay."""
+        return EnvSpec(self.simulator, self.task)
+
+    @property
     def has_block(self) -> bool:
         """Whether there is an obstacle or object, and so something that the arm can touch."""
         return self.task != "reach"
@@ -69,6 +107,21 @@ class EnvSpec:
         return 10 if self.has_block else 6
 
 
+_VECTOR_ARMS = {"mujoco": "tsmlib.envs.mujoco_arm:MujocoArm", "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm"}
+
+
+def _register(spec: EnvSpec) -> None:
+    """Make an environment known to Gymnasium. A simulator is imported when an arm in it is first made."""
+    if spec.id in registry:
+        return
+    made_by = ("tsmlib.envs.arm:ArmEnv", _VECTOR_ARMS[spec.simulator])
+    kwargs: dict[str, object] = {"env_id": spec.arm.id}
+    if spec != spec.arm:
+        made_by = ("tsmlib.envs.wrappers:imperfect_arm", "tsmlib.envs.wrappers:imperfect_arms")
+        kwargs |= {"noise": spec.noise, "delay": spec.delay}
+    register(spec.id, entry_point=made_by[0], vector_entry_point=made_by[1], kwargs=kwargs, max_episode_steps=100)
+
+
 _PLAIN = {spec.id: spec for sim in get_args(Simulator) for task in get_args(TaskName) for spec in [EnvSpec(sim, task)]}
 ENV_IDS = tuple(_PLAIN)
 MUJOCO_IDS, PYMUNK_IDS = ENV_IDS[:3], ENV_IDS[3:]
@@ -76,15 +129,20 @@ MUJOCO_IDS, PYMUNK_IDS = ENV_IDS[:3], ENV_IDS[3:]
 
 def gone(env_id: str) -> str:
     """Why an id of an older version is refused, and which took its place; '' for any other text."""
-    arm, noise, delay, version = _parts(env_id)
+    arm, changed, noise, delay, version = _parts(env_id)
     for spec in _PLAIN.values():
         if arm == f"tsm/{spec.name}" and int(version) < _VERSION[spec.task]:
-            present = replace(spec, noise=float(noise or 0.0), delay=int(delay or 0)).id
+            present = replace(
+                spec.varied(**physics.parse(changed)), noise=float(noise or 0.0), delay=int(delay or 0)
+            ).id
             return f"{env_id} is gone: {_CHANGED[spec.task]}. {present} took its place"
     return ""
 
 
-def _parts(env_id: str) -> tuple[str, str | None, str | None, str]:
-    """Arm, noise, delay and version as they stand in an id; empty where it is none."""
-    parts = re.fullmatch(r"(.*?)(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v([0-9]+)", env_id)
-    return (parts[1], parts[2], parts[3], parts[4]) if parts else ("", None, None, "")
+def _parts(env_id: str) -> tuple[str, tuple[str | None, ...], str | None, str | None, str]:
+    """Arm, changed physics, noise, delay and version as they stand in an id; empty where it is none."""
+    parts = re.fullmatch(rf"(.*?){physics.PATTERN}(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v([0-9]+)", env_id)
+    if not parts:
+        return "", (None,) * len(STANDARD), None, None, ""
+    arm, *changed, noise, delay, version = parts.groups()
+    return arm, tuple(changed), noise, delay, version

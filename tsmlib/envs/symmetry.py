@@ -45,4 +45,6 @@ def symmetric(data: Trajectories) -> Trajectories:
         data,
         states=np.concatenate([turned(each, quarters) for quarters in range(4) for each in states]),
         actions=np.concatenate([each for _ in range(4) for each in actions]),
+        lengths=data.lengths * COPIES,
+        terminated=data.terminated * COPIES,
     )

@@ -1,6 +1,7 @@
 """Imperfect sensors and actuators, as ordinary Gymnasium wrappers (the paper's robustness study, section 5)."""
 
 from collections import deque
+from typing import Unpack
 
 import gymnasium
 import numpy as np
@@ -9,6 +10,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 
 from tsmlib.envs.arm import ArmVectorEnv, Info
 from tsmlib.envs.geometry import HALF_RANGE
+from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
 
 NOISE_STREAM = 1  # keeps the noise apart from the draws that the environment makes from the same seed
@@ -129,18 +131,22 @@ class ImperfectArms(VectorWrapper):
         return states + self.sigma * self.scale * drawn
 
 
-def imperfect_arm(env_id: str, noise: float, delay: int, render_mode: str | None = None) -> ActionDelay:
+def imperfect_arm(
+    env_id: str, noise: float, delay: int, render_mode: str | None = None, **changes: Unpack[Changes]
+) -> ActionDelay:
     """One arm behind both wrappers, as Gymnasium makes it."""
-    arm = gymnasium.make(env_id, disable_env_checker=True, render_mode=render_mode).unwrapped
+    arm = gymnasium.make(env_id, disable_env_checker=True, render_mode=render_mode, **changes).unwrapped
     return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
 
 
 def imperfect_arms(
     num_envs: int, env_id: str, noise: float, delay: int, *,
-    max_episode_steps: int = 100, render_mode: str | None = None,
+    max_episode_steps: int = 100, render_mode: str | None = None, **changes: Unpack[Changes],
 ) -> ImperfectArms:  # fmt: skip
     """N arms with both, as Gymnasium makes them."""
-    arms = gymnasium.make_vec(env_id, num_envs=num_envs, max_episode_steps=max_episode_steps, render_mode=render_mode)
+    arms = gymnasium.make_vec(
+        env_id, num_envs=num_envs, max_episode_steps=max_episode_steps, render_mode=render_mode, **changes
+    )
     return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.envs.geometry import BLOCK_DECAY, BLOCK_RADIUS, DT, WALL, closest_gap
+from tsmlib.envs.geometry import DT, closest_gap, room, slide_time
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.exploitation import NEAR
 from tsmlib.evaluation.futures import HORIZON, Coded, SampledFutures
@@ -61,7 +61,7 @@ def windows_before_contact(
     """
     near = closest_gap(test.states, test.env) < NEAR
     begin = near.argmax(1) - LEAD  # the state that is observed last
-    episodes = np.flatnonzero(near.any(1) & (begin >= model.past_len) & (begin + horizon <= test.horizon))
+    episodes = np.flatnonzero(near.any(1) & (begin >= model.past_len) & (begin + horizon <= test.steps))
     if not len(episodes):
         raise ValueError(
             f"none of the {len(test)} episodes of {test.env} has a first touch between steps {model.past_len + LEAD} "
@@ -95,12 +95,14 @@ def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
     past, truth = seen.window.past.states[:, -2:], seen.window.future.states
     every = torch.cat([truth[None], seen.samples])  # (1 + S, N, T, dx)
     states = torch.cat([past.expand(len(every), *past.shape), every], dim=2).numpy()  # two states before the first step
-    slides = BLOCK_DECAY * (1 - math.exp(-DT / BLOCK_DECAY))
+    physics = EnvSpec.parse(seen.env).physics
+    decay = slide_time(physics)
+    slides = decay * (1 - math.exp(-DT / decay))
     position, velocity = states[..., 6:8], states[..., 8:10]
     reached = np.maximum(
         np.abs(position[..., 1:, :]).max(-1), np.abs(position[..., :-1, :] + slides * velocity[..., :-1, :]).max(-1)
     )
-    near = {"object": closest_gap(states[..., 1:, :], seen.env) < NEAR, "wall": WALL - BLOCK_RADIUS - reached < NEAR}
+    near = {"object": closest_gap(states[..., 1:, :], seen.env) < NEAR, "wall": room(physics) - reached < NEAR}
     begins = {event: torch.from_numpy(at[..., 1:] & ~at[..., :-1]) for event, at in near.items()}
     return {event: (at[0], at[1:]) for event, at in begins.items()}
 

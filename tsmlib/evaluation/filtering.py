@@ -11,12 +11,13 @@ Letters in shapes: N episodes, T steps, K steps predicted, dx = 6 state size of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from tsmlib.envs.geometry import HALF_RANGE, LINK_LENGTHS, fingertip
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import cut, sample_states
 from tsmlib.models.base import DynamicsModel
 from tsmlib.trajectory import Trajectories
@@ -59,8 +60,8 @@ def filter_errors(estimate: KalmanFilter, noisy: Trajectories, clean: Trajectori
     x = now
     for step in range(10):
         x = estimate.ahead(x, actions[:, step])
-        ahead.append(_with_tip(x))
-    return errors(_with_tip(now), truth), errors(np.stack(ahead, 1), _segments(clean.states[:, 1:]))
+        ahead.append(estimate.with_tip(x))
+    return errors(estimate.with_tip(now), truth), errors(np.stack(ahead, 1), _segments(clean.states[:, 1:]))
 
 
 def exponential_errors(keep: float, noisy: Trajectories, clean: Trajectories) -> np.ndarray:
@@ -84,13 +85,14 @@ class KalmanFilter:
     """Extended Kalman filter of angles and velocities s (4,) of the plain arm, behind noisy sensors.
 
     s' = A [s, u, 1] + N(0, Q), fitted by least squares on clean states; it observes s and the fingertip, whose
-    position follows from the angles. weight: what Q is multiplied with. sigma: the sensors' noise.
+    position follows from the angles. weight: what Q is multiplied with. sigma: the sensors' noise. lengths: links.
     """
 
     transition: np.ndarray  # (7, 4)
     process: np.ndarray  # (4, 4)
     sigma: float
     weight: float = 1.0
+    lengths: tuple[float, float] = LINK_LENGTHS
 
     @classmethod
     def fitted(cls, clean: Trajectories, sigma: float) -> KalmanFilter:
@@ -101,11 +103,16 @@ class KalmanFilter:
         )
         after = clean.states[:, 1:, :4].reshape(-1, 4).astype(np.float64)
         transition = np.linalg.lstsq(inputs, after, rcond=None)[0]
-        return cls(transition, np.cov((after - inputs @ transition).T), sigma)
+        return cls(
+            transition,
+            np.cov((after - inputs @ transition).T),
+            sigma,
+            lengths=EnvSpec.parse(clean.env).physics.link_lengths,
+        )
 
     def tuned(self, noisy: Trajectories, clean: Trajectories) -> KalmanFilter:
         """The filter with the weight of its process noise that is best on validation episodes."""
-        tried = [KalmanFilter(self.transition, self.process, self.sigma, w) for w in (0.1, 0.3, 1.0, 3.0, 10.0)]
+        tried = [replace(self, weight=weight) for weight in (0.1, 0.3, 1.0, 3.0, 10.0)]
         return min(tried, key=lambda one: rmse(filter_errors(one, noisy, clean)[0]))
 
     def ahead(self, x: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -121,26 +128,24 @@ class KalmanFilter:
         for step in range(noisy.horizon):
             x = self.ahead(x, noisy.actions[:, step])
             covariance = a @ covariance @ a.T + self.weight * self.process
-            h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), _tip_jacobian(x)], 1)  # (N, 6, 4)
-            seen = noisy.states[:, step + 1] - _with_tip(x)
+            h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1)  # (N, 6, 4)
+            seen = noisy.states[:, step + 1] - self.with_tip(x)
             gain = covariance @ h.mT @ np.linalg.inv(h @ covariance @ h.mT + noise)
             x = x + (gain @ seen[..., None])[..., 0]
             covariance = covariance - gain @ h @ covariance
             found.append(x)
         return np.stack(found, 1)
 
+    def with_tip(self, x: np.ndarray) -> np.ndarray:
+        """Angles and velocities (..., 4) and the fingertip (..., 6) that they imply."""
+        return np.concatenate([x, fingertip(x[..., :2], self.lengths)], -1)
 
-def _with_tip(x: np.ndarray) -> np.ndarray:
-    """Angles and velocities (..., 4) and the fingertip (..., 6) that they imply."""
-    return np.concatenate([x, fingertip(x[..., :2])], -1)
-
-
-def _tip_jacobian(x: np.ndarray) -> np.ndarray:
-    """Derivative of the fingertip by angles and velocities: (N, 4) -> (N, 2, 4)."""
-    both = x[:, 0] + x[:, 1]
-    second = LINK_LENGTHS[1] * np.stack([-np.sin(both), np.cos(both)], 1)
-    first = LINK_LENGTHS[0] * np.stack([-np.sin(x[:, 0]), np.cos(x[:, 0])], 1)
-    return np.stack([first + second, second, 0 * second, 0 * second], 2)
+    def _tip_jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Derivative of the fingertip by angles and velocities: (N, 4) -> (N, 2, 4)."""
+        both = x[:, 0] + x[:, 1]
+        second = self.lengths[1] * np.stack([-np.sin(both), np.cos(both)], 1)
+        first = self.lengths[0] * np.stack([-np.sin(x[:, 0]), np.cos(x[:, 0])], 1)
+        return np.stack([first + second, second, 0 * second, 0 * second], 2)
 
 
 def _segments(steps: np.ndarray) -> np.ndarray:
@@ -149,6 +154,7 @@ def _segments(steps: np.ndarray) -> np.ndarray:
 
 
 def _require_same(noisy: Trajectories, clean: Trajectories) -> None:
+    noisy.require_equal_lengths("a comparison of filters")
     if not np.array_equal(noisy.actions, clean.actions):
         raise ValueError(
             f"the episodes of {noisy.env} and of {clean.env} hold other torques; draw both from one seed, so that they "

@@ -42,6 +42,7 @@ def sample_futures(
     model: Coded, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
 ) -> SampledFutures:
     """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
+    test.require_equal_lengths("a look at the futures of every episode")
     drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)
     episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
     begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len

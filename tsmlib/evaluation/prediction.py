@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, generator_of, measure
-from tsmlib.models.base import DynamicsModel, as_dynamics, predict_segment, rollout
+from tsmlib.models.base import DynamicsModel, Model, as_dynamics, predict_segment, rollout
 from tsmlib.models.features import Features
 from tsmlib.models.tsm import TSM
 from tsmlib.trajectory import Segment, Trajectories, Window
@@ -52,7 +52,7 @@ class Scores:
 
 @torch.no_grad()
 def score(
-    model: DynamicsModel,
+    model: Model,
     features: Features,
     test: Trajectories,
     validation: Trajectories,
@@ -67,7 +67,7 @@ def score(
 
     Open loop with the true actions after ``starts`` observed steps, for ``horizon`` steps. Teacher-forced segments are
     starts=range(10, 100, 10) and horizon=10: each predicts H steps from the true past, and N counts segments, those of
-    one trajectory after each other.
+    one trajectory after each other. Of episodes that end early, N counts the segments that lie within their episode.
 
     Memory: the validation samples (S, N, T, D), 0.4 GiB at the paper's sizes; test samples are never held together.
     Raises ValueError where model, test and validation data are not of one kind, naming both sides.
@@ -125,7 +125,7 @@ def _require_fit(features: Features, test: Trajectories, validation: Trajectorie
 
 
 def sample_states(
-    model: DynamicsModel,
+    model: Model,
     data: Trajectories,
     *,
     samples: int,
@@ -136,7 +136,8 @@ def sample_states(
 ) -> Tensor:
     """Open-loop samples (S, N, T, dx), physical units, with the true actions after ``starts`` observed steps.
 
-    Column k holds the prediction of x_{start + k + 1}. A deterministic model gives one sample, whatever S.
+    Column k holds the prediction of x_{start + k + 1}. N counts as in ``score``.
+    A deterministic model gives one sample, whatever S.
     """
     blocks = _rollouts(model, data, samples=samples, horizon=horizon, starts=starts, key=(0, seed), progress=progress)
     return torch.cat([states for states, _ in blocks], dim=1)
@@ -167,7 +168,7 @@ def physical_range(*data: Trajectories) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _rollouts(
-    model: DynamicsModel,
+    model: Model,
     data: Trajectories,
     *,
     samples: int,
@@ -182,13 +183,13 @@ def _rollouts(
             f"starts {list(starts)} and horizon {horizon} do not fit: at least one step is observed first, and "
             f"episodes have {data.horizon}"
         )
-    before = max(0, model.past_len - min(starts))  # steps that the model looks back beyond the first one
+    inside = torch.from_numpy(data.steps[:, None] >= np.array(starts) + horizon).flatten()  # (N len(starts),)
+    past_len = as_dynamics(model).past_len
+    before = max(0, past_len - min(starts))  # steps that the model looks back beyond the first one
     whole, stochastic = data.padded(before), as_dynamics(model).stochastic
-    past = Segment(
-        *(torch.cat([part[:, before + s - model.past_len : before + s] for s in starts], 1) for part in whole)
-    )
-    past = Segment(*(part.reshape(-1, model.past_len, part.shape[-1]) for part in past))
-    actions, truth = (cut(part[:, before:], starts, horizon) for part in (whole.actions, whole.states))
+    past = Segment(*(torch.cat([part[:, before + s - past_len : before + s] for s in starts], 1) for part in whole))
+    past = Segment(*(part.reshape(-1, past_len, part.shape[-1])[inside] for part in past))
+    actions, truth = (cut(part[:, before:], starts, horizon)[inside] for part in (whole.actions, whole.states))
     rows = torch.arange(len(truth))
     if not stochastic:
         point = torch.cat([rollout(model, Segment(*(p[b] for p in past)), actions[b]) for b in rows.split(ROWS)])

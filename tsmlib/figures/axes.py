@@ -92,13 +92,14 @@ def limits(points: np.ndarray, bars: np.ndarray, also: Sequence[float] = (), log
     return (10.0**low, 10.0**high) if log else (low, high)
 
 
-def log_axis(ax: Axes, low: float, high: float) -> None:
-    """A logarithmic y axis with numbers in words, and enough of them however little it spans."""
-    ax.set_yscale("log")
+def log_axis(ax: Axes, low: float, high: float, along: str = "y") -> None:
+    """A logarithmic axis, by default y, with numbers in words, and enough of them however little it spans."""
+    ax.set(**{f"{along}scale": "log"})
+    axis = {"x": ax.xaxis, "y": ax.yaxis}[along]
     subs = (1.0, 2.0, 5.0) if high < 100 * low else (1.0,)
-    ax.yaxis.set_major_locator(MaxNLocator(4) if high < 4 * low else LogLocator(subs=subs, numticks=9))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: spell(value)))
-    ax.yaxis.set_minor_locator(NullLocator())
+    axis.set_major_locator(MaxNLocator(4) if high < 4 * low else LogLocator(subs=subs, numticks=9))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: spell(value)))
+    axis.set_minor_locator(NullLocator())
 
 
 def arrow(ax: Axes, along: str, at: float, side: int, main: str) -> None:

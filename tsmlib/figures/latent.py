@@ -14,10 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import NullFormatter
 
 from tsmlib.figures import style
-from tsmlib.figures.axes import entries, log_axis, looks
+from tsmlib.figures.axes import YOURS, entries, log_axis, looks, yours_entry
 from tsmlib.figures.checks import Panels, finite, shaped
 from tsmlib.figures.method import Method
 from tsmlib.figures.style import WIDTH, Props, entry, legend, panels, styled, tint
@@ -32,15 +31,17 @@ THRESHOLD: Props = {"color": "#222222", "lw": 1, "ls": (0, (4, 2))}
 
 @styled
 def code_use(
-    values: Mapping[str, Panels], xlabels: Mapping[str, str], thresholds: Mapping[str, Mapping[str, float]]
-) -> Figure:
+    values: Mapping[str, Panels], xlabels: Mapping[str, str], thresholds: Mapping[str, Mapping[str, float]],
+    yours: Mapping[str, Panels] | None = None,
+) -> Figure:  # fmt: skip
     """Information in the codes and spread of sampled futures: one row per environment and subset.
 
     values: title -> row -> method -> (k,), one value per seed, above zero; xlabels: title -> text; thresholds: title ->
-    row -> a bound that was set beforehand, drawn as a tick.
+    row -> a bound that was set beforehand, drawn as a tick; yours: as values, drawn below them as hollow diamonds.
     """
-    rows = list(dict.fromkeys(row for panel in values.values() for row in panel))
-    look_of = looks(*values.values())
+    own = yours or {}
+    rows = list(dict.fromkeys(row for part in (values, own) for panel in part.values() for row in panel))
+    look_of = looks(*values.values(), *own.values())
     figure, axes = panels(len(values), len(values), 0.24 * len(rows) + 0.85, head=0, sharey=True)
     for ax, (title, panel) in zip(axes, values.items(), strict=True):
         for y, row in enumerate(rows):
@@ -52,14 +53,17 @@ def code_use(
                     low = max(mean - half, seeds.min() / 2)
                     ax.plot((low, mean + half), (y, y), color=look_of[method]["color"], lw=1, zorder=2)
                 ax.plot(mean, y, **{**look_of[method], "ls": "", "ms": 4.5}, zorder=3, clip_on=False)
+            for method, seeds in own.get(title, {}).get(row, {}).items():
+                seeds = finite(f"{title}, {row}, {method.label}, yours", seeds, "k")
+                ax.plot(seeds.mean(), y + 0.25, **YOURS, color=method.look.colour, zorder=3.5, clip_on=False)
             if bound := thresholds.get(title, {}).get(row):
                 ax.plot((bound, bound), (y - 0.36, y + 0.36), color="#222222", lw=1.2, zorder=2.5)
         ax.set(xscale="log", xlabel=xlabels[title], title=title)
-        ax.xaxis.set_minor_formatter(NullFormatter())
+        log_axis(ax, *ax.get_xlim(), along="x")
         style.rows_only(ax)
     axes[0].set_yticks(range(len(rows)), rows)
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    handles = entries(look_of, ls="", ms=4.5)
+    handles = [*entries(look_of, ls="", ms=4.5), *yours_entry(*own.values())]
     if any(thresholds.values()):
         handles.append(entry("threshold set beforehand", color="#222222", ls="", marker="|", ms=7, mew=1.2))
     legend(figure, handles)
@@ -144,32 +148,49 @@ def _from(start: np.ndarray, paths: np.ndarray) -> np.ndarray:
 
 @styled
 def contact_recall(
-    found: Mapping[str, Mapping[Method, Arrays]], stretches: Sequence[str], thresholds: Mapping[str, float]
-) -> Figure:
+    found: Mapping[str, Mapping[Method, Arrays]], stretches: Sequence[str], thresholds: Mapping[str, float],
+    yours: Mapping[str, Mapping[Method, Arrays]] | None = None,
+) -> Figure:  # fmt: skip
     """Recall and precision of predicted contacts, by steps ahead.
 
     found: title -> method -> {"recall", "precision", "chance"}: (k, g) shares over seeds and stretches of steps;
-    stretches (g,): their names; thresholds: title -> the recall that was aimed at.
+    stretches (g,): their names; thresholds: title -> the recall that was aimed at; yours: as found, drawn beside it as
+    hollow diamonds, small ones of precision.
     """
     figure, axes = panels(len(found), len(found), 2.1, width=2.9 * len(found), head=0, sharey=True)
-    look_of, places = looks(found), np.arange(len(stretches))
+    own = yours or {}
+    look_of, places = looks(found, own), np.arange(len(stretches))
     chance: Props = {"color": "#AAAAAA", "lw": 0.8, "ls": ":"}
+
+    def means(title: str, method: Method, shares: Arrays) -> dict[str, np.ndarray]:
+        return {word: shaped(f"{title}, {method.label}: {word}", values, f"k {len(stretches)}").mean(0)
+                for word, values in shares.items()}  # fmt: skip
+
     for ax, (title, panel) in zip(axes, found.items(), strict=True):
         if title in thresholds:
             ax.axhline(thresholds[title], **THRESHOLD, zorder=1)
-        for i, (method, shares) in enumerate(panel.items()):
-            mean = {word: shaped(f"{title}, {method.label}: {word}", values, f"k {len(stretches)}").mean(0)
-                    for word, values in shares.items()}  # fmt: skip
-            at, look = places + 0.12 * (i - (len(panel) - 1) / 2), {**look_of[method], "ms": 4.5}
+        shift = {method: 0.12 * (i - (len(look_of) - 1) / 2) for i, method in enumerate(look_of)}
+        for method, shares in panel.items():
+            mean, at, look = means(title, method, shares), places + shift[method], {**look_of[method], "ms": 4.5}
             ax.plot(at, mean["recall"], **{**look, "lw": 1.1}, zorder=3, clip_on=False)
             ax.plot(at, mean["precision"], **{**look, "mfc": "white", "lw": 0}, zorder=3, clip_on=False)
             ax.plot(places, mean["chance"], **chance, zorder=1)
+        for method, shares in own.get(title, {}).items():
+            mean = means(title, method, shares)
+            for word, size in (("recall", 3.4), ("precision", 2.2)):
+                look = {**YOURS, "ms": size, "color": method.look.colour}
+                ax.plot(places + shift[method] + 0.05, mean[word], **look, zorder=4, clip_on=False)
+            if method not in panel:
+                ax.plot(places, mean["chance"], **chance, zorder=1)
         ax.set(title=title, xlabel="steps ahead", ylim=(0, 1), xlim=(-0.3, len(stretches) - 0.7))
         ax.set_xticks(places, stretches)
     axes[0].set_ylabel("share")
     point: Props = {"ls": "", "marker": "o", "color": style.NOTE, "ms": 4.5}
     handles = [*entries(look_of, ms=4.5), entry("recall", **point), entry("precision", **point, mfc="white")]
-    legend(figure, [*handles, entry("by chance", **chance), entry("threshold set beforehand", **THRESHOLD)], columns=3)
+    handles += [entry("by chance", **chance), entry("threshold set beforehand", **THRESHOLD)]
+    if any(own.values()):
+        handles += [*yours_entry(own), entry("yours, precision", **{**YOURS, "ms": 2.2}, color=style.DARK)]
+    legend(figure, handles, columns=3)
     return figure
 
 
@@ -299,7 +320,8 @@ def code_grid(
     for i, value in enumerate(values):
         grid[-1, i].set_xlabel(f"{value:+.1f}".replace("-", "−"), fontsize=6.5)
         grid[n - 1 - i, 0].set_ylabel(f"{value:+.1f}".replace("-", "−"), fontsize=6.5)
-    figure.supxlabel("first direction of the code", fontsize=7)
+    middle_label = grid[-1, n // 2].get_xlabel()  # not a label of the figure, which would stand where its stamp does
+    grid[-1, n // 2].set_xlabel(f"{middle_label}\nfirst direction of the code", fontsize=6.5)
     figure.supylabel("second", fontsize=7)
     legend(figure, [entry("the object under this code", color=main, marker="o", ms=2.5),
                     entry("its true way", color="#BBBBBB", lw=0.8)])  # fmt: skip
@@ -311,12 +333,13 @@ def code_fan(
 ) -> Callable[[np.ndarray], Figure]:
     """A picture of the object's ways under some codes, over those under all: ways (S, T, 2) -> the figure.
 
-    It is one figure, drawn once, in which the ways are replaced, so that it follows a slider. draw paints the scene;
+    It is one figure in which the ways are replaced, so that it follows a slider; these, and what lies over them, are
+    its animated artists. draw paints the scene;
     start (dx,): the last observed state; every (n, T, 2): the ways under all codes; true (T, 2): what happened.
     """
     figure = _code_scene(draw, start, every, true, method)
     (ax,) = figure.axes
-    lines, (*_, ends) = ax.collections[-1], ax.lines
+    lines, ends = ax.collections[-1], ax.lines[-1]
 
     def drawn(ways: np.ndarray) -> Figure:
         ways = _from(start, finite("ways", ways, f"S {every.shape[1]} 2"))
@@ -336,10 +359,10 @@ def _code_scene(draw: Draw, start: np.ndarray, every: np.ndarray, true: np.ndarr
     ax = figure.add_axes((0.01, 0.01, 0.98, 0.98 * 4.6 / 4.85))
     draw(ax, start)
     ax.add_collection(LineCollection(list(every), colors=grey, linewidths=0.6, alpha=0.35, zorder=6))
-    ax.plot(*true.T, color="black", lw=1.4, zorder=8)
-    ax.plot(*true[-1], "o", color="black", ms=4, zorder=8)
-    ax.add_collection(LineCollection([], colors=main, linewidths=1, zorder=7))
-    ax.plot([], [], ".", color=main, ms=5, mew=0, zorder=7.5)
+    ax.plot(*true.T, color="black", lw=1.4, zorder=8, animated=True)
+    ax.plot(*true[-1], "o", color="black", ms=4, zorder=8, animated=True)
+    ax.add_collection(LineCollection([], colors=main, linewidths=1, zorder=7, animated=True))
+    ax.plot([], [], ".", color=main, ms=5, mew=0, zorder=7.5, animated=True)
     style.scene(ax)
     seen = np.concatenate([every.reshape(-1, 2), true])
     middle, span = (seen.max(0) + seen.min(0)) / 2, min(0.55, 1.1 * float(np.ptp(seen, axis=0).max()) + 0.08)

@@ -19,7 +19,7 @@ from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Trajectories, Window
+from tsmlib.trajectory import Trajectories, Window, real_steps
 
 
 class ActionPrior(Configured):
@@ -57,12 +57,13 @@ class ActionPrior(Configured):
         make = cast(Callable[..., Self], cls)
         with weights_from(seed):
             prior = make(data.actions.shape[2], **options)
-        prior.fit_scale(torch.from_numpy(data.actions))
+        prior.fit_scale(torch.from_numpy(data.actions), data.lengths)
         return prior
 
-    def fit_scale(self, actions: Tensor) -> ActionPrior:
-        """Take the scale of training actions (N, T, du)."""
-        self.std.copy_(actions.flatten(0, 1).std(0))
+    def fit_scale(self, actions: Tensor, lengths: Sequence[int] = ()) -> ActionPrior:
+        """Take the scale of training actions (N, T, du); padding beyond ``lengths`` has no part."""
+        steps = actions[real_steps(lengths, actions.shape[1])] if lengths else actions.flatten(0, 1)
+        self.std.copy_(steps.std(0))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:

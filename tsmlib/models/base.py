@@ -63,12 +63,24 @@ class SegmentModel(Protocol):
 
 
 Model = DynamicsModel | SegmentModel
+_LEAST = (
+    "The least that a model needs: segment_len, its number of steps H, and predict_segment(past, actions), which gives "
+    "the states (B, K, dx) that actions (B, K, du) of up to H steps lead to"
+)
 
 
 class Adapted:
-    """A SegmentModel as a DynamicsModel, to roll out: its steps are segments of one action with noise of their own."""
+    """A SegmentModel as a DynamicsModel, to roll out: its steps are segments of one action with noise of their own.
+
+    TypeError naming what the model lacks, or what is not as it has to be.
+    """
 
     def __init__(self, model: SegmentModel) -> None:
+        name = type(model).__name__
+        if missing := [word for word in ("segment_len", "predict_segment") if not hasattr(model, word)]:
+            raise TypeError(f"{name} cannot predict: it has no {' and no '.join(missing)}. {_LEAST}")
+        if type(model.segment_len) is not int or model.segment_len < 1:
+            raise TypeError(f"segment_len of {name} is {model.segment_len!r:.80}; expected a positive int. {_LEAST}")
         self.model, self.segment_len = model, model.segment_len
         self.samples = "generator" in inspect.signature(model.predict_segment).parameters
         self.past_len: int = getattr(model, "past_len", model.segment_len)
@@ -76,7 +88,15 @@ class Adapted:
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         noise = {"generator": generator} if self.samples else {}
-        return self.model.predict_segment(past, actions, **noise)
+        states = self.model.predict_segment(past, actions, **noise)
+        expected = (*actions.shape[:2], past.states.shape[2])
+        if not isinstance(states, Tensor) or states.shape != expected:
+            found = f"a tensor {tuple(states.shape)}" if isinstance(states, Tensor) else f"a {type(states).__name__}"
+            raise TypeError(
+                f"predict_segment of {type(self.model).__name__} gave {found} for actions {tuple(actions.shape)}; "
+                f"expected states {expected}"
+            )
+        return states
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Segments of one action, each after the last ``past_len`` steps."""
@@ -89,6 +109,11 @@ class Adapted:
             return states[:, 0]
 
         return step
+
+
+def members(model: Model) -> int:
+    """Members of an ensemble, of which a rollout takes one; 1 for any other model."""
+    return int(getattr(model, "members", 1))
 
 
 def as_dynamics(model: Model) -> DynamicsModel:

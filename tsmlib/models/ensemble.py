@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Featured, Features
-from tsmlib.sampling import Noise, standard_normal
+from tsmlib.sampling import Noise, draw_members, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
@@ -80,8 +80,7 @@ class Ensemble(Featured, Configured):
         if generator is None:
             place, noise = torch.arange(rows, device=x.device).repeat(self.members), None
         else:
-            uniform = torch.special.ndtr(standard_normal((rows,), generator, x))
-            member = (self.members * uniform).long().clamp(max=self.members - 1)  # of each row
+            member = draw_members(self.members, rows, generator, x)
             noise = standard_normal((rows, steps if self.gaussian else 0, x.shape[1]), generator, x)
             counts = member.bincount(minlength=self.members)
             order, block = member.argsort(stable=True), int(counts.max())

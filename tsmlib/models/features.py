@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Self, cast
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tsmlib.models.config import weights_from
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Trajectories
+from tsmlib.trajectory import Trajectories, real_steps
 
 
 class Features(nn.Module):
@@ -33,13 +33,18 @@ class Features(nn.Module):
         self.register_buffer("std", torch.ones(self.dim))
         self.register_buffer("step_std", torch.zeros(state_dim))  # of x_{t+1} - x_t, physical units; 0 until fitted
 
-    def fit(self, states: Tensor) -> Features:
-        """Take the statistics of training states (N, T + 1, dx)."""
-        raw = self._raw(states).flatten(0, 1)
+    def fit(self, states: Tensor, lengths: Sequence[int] = ()) -> Features:
+        """Take the statistics of training states (N, T + 1, dx); padding beyond ``lengths`` has no part."""
+        raw, steps = self._raw(states), states.diff(dim=1)
+        if lengths:
+            real = real_steps(lengths, steps.shape[1]).to(states.device)
+            raw, steps = raw[torch.nn.functional.pad(real, (1, 0), value=True)], steps[real]
+        else:
+            raw, steps = raw.flatten(0, 1), steps.flatten(0, 1)
         self.mean.copy_(raw.mean(0))
         std = raw.std(0)
         self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
-        self.step_std.copy_(states.diff(dim=1).flatten(0, 1).std(0))
+        self.step_std.copy_(steps.std(0))
         return self
 
     @property
@@ -89,7 +94,7 @@ class Featured:
         make = cast(Callable[..., Self], cls)
         with weights_from(seed):
             model = make(data.states.shape[2], data.actions.shape[2], angles=data.angles, **options)
-        model.features.fit(torch.from_numpy(data.states))
+        model.features.fit(torch.from_numpy(data.states), data.lengths)
         return model
 
 

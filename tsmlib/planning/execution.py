@@ -5,24 +5,23 @@ Open loop as in the paper (``execute``), or planning again every few steps from 
 
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib import rewards
 from tsmlib.collection import Controller, collect, open_loop
+from tsmlib.envs.stepping import Arms, Simulation, make_simulation
 from tsmlib.envs.wrappers import ImperfectArms
-from tsmlib.models.base import DynamicsModel
+from tsmlib.models.base import Model, as_dynamics
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.planners import reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
-from tsmlib.trajectory import Segment
+from tsmlib.trajectory import Segment, Trajectories, real_steps
 
 SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be repeated
 
@@ -32,8 +31,11 @@ class Trial:
     """Actions executed in the true simulator.
 
     actions (B, T, du); states (B, T + 1, dx) from the start on; executed_return (B,): undiscounted; final_distance
-    (B,): metres; plan: where the actions came from, with the predicted return, if from a plan; observed
-    (B, T + 1, dx): what the sensors said, where they are noisy.
+    (B,): metres, or as the task's measure of success has it, NaN where it has none; plan: where the actions came from,
+    with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
+
+    success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
+    returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none.
     """
 
     actions: Tensor
@@ -42,6 +44,9 @@ class Trial:
     final_distance: Tensor
     plan: Plan | None = None
     observed: Tensor | None = None
+    success: Tensor | None = None
+    lengths: tuple[int, ...] = ()
+    own_return: Tensor | None = None
 
     @property
     def gap(self) -> Tensor:
@@ -57,19 +62,26 @@ def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
     A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
     """
     actions = plan.actions if isinstance(plan, Plan) else plan
-    env = gymnasium.make_vec(task.env, num_envs=len(task))
     if isinstance(actions, Tensor):
-        seen = collect(env, open_loop(actions), horizon=actions.shape[1], seed=SENSORS, states=task.start)
+        seen, run = _run(task, open_loop(actions), actions.shape[1])
     else:
-        seen = collect(env, actions, horizon=task.horizon, seed=SENSORS, states=task.start)
+        seen, run = _run(task, actions, task.horizon)
         actions = torch.from_numpy(seen.actions)
-    env.close()
-    return _measured(task, env, seen.states, actions, plan if isinstance(plan, Plan) else None)
+    return _measured(task, run, seen, actions, plan if isinstance(plan, Plan) else None)
+
+
+def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:
+    """An episode from each of the task's starts, and the simulation that it ran in."""
+    run = make_simulation(task.env, len(task), returns=True)
+    begin: dict[str, Any] = {"seed": task.seeds} if task.seeds else {"seed": SENSORS, "states": task.start}
+    seen = collect(run, controller, horizon=horizon, past_len=past_len, **begin)
+    run.close()
+    return seen, run
 
 
 def mpc(
     task: Task,
-    model: DynamicsModel | None,
+    model: Model | None,
     space: SearchSpace,
     planner: Planner,
     *,
@@ -96,9 +108,8 @@ def mpc(
     """
     if every < 1:
         raise ValueError(f"every is {every}, expected a positive number of steps")
-    began, horizon, past_len = time.perf_counter(), task.horizon, 1 if model is None else model.past_len
+    began, horizon, past_len = time.perf_counter(), task.horizon, 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(task, model, planner, every, judge, seed, space, start=len(task), plan=plan)
-    env = gymnasium.make_vec(task.env, num_envs=len(task))
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
         def controller(past: Segment) -> Tensor:
@@ -106,14 +117,13 @@ def mpc(
             bar.update()
             return actions
 
-        seen = collect(env, controller, horizon=horizon, past_len=horizon + past_len, seed=SENSORS, states=task.start)
-    env.close()
+        seen, run = _run(task, controller, horizon, past_len=horizon + past_len)
     actions, returns = torch.from_numpy(seen.actions), torch.stack(planning.returns)
     made = Plan(
-        actions=actions, parameters=actions, states=torch.cat(planning.rollouts, 2), predicted_return=returns[0],
-        curve=returns, seconds=time.perf_counter() - began,
+        actions=actions, parameters=actions, states=torch.cat(planning.rollouts, 2)[:, :, : seen.horizon],
+        predicted_return=returns[0], curve=returns, seconds=time.perf_counter() - began,
     )  # fmt: skip
-    return _measured(task, env, seen.states, actions, made)
+    return _measured(task, run, seen, actions, made)
 
 
 @dataclass
@@ -121,7 +131,7 @@ class _Replanning:
     """The controller that plans to the end of the episode each time it is asked, and keeps what was predicted."""
 
     task: Task
-    model: DynamicsModel | None
+    model: Model | None
     planner: Planner
     every: int
     judge: Judge
@@ -151,9 +161,11 @@ class _Replanning:
     def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
         """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
-            simulator = simulator_predictor(self.task.env, past.states[:, -1].numpy())
+            simulator = simulator_predictor(
+                self.task, past.states[:, -1].numpy(), done=past.actions[:, past.actions.shape[1] - self.done :]
+            )
             return simulator, simulator
-        recent, seed = past.last(self.model.past_len), self.seed + 2 * self.done
+        recent, seed = past.last(as_dynamics(self.model).past_len), self.seed + 2 * self.done
         return self.judge(self.model, recent, seed=seed), fresh_predictor(self.model, recent, seed=seed + 1)
 
 
@@ -174,16 +186,25 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
     return total
 
 
-def _measured(task: Task, env: VectorEnv, seen: np.ndarray, actions: Tensor, plan: Plan | None) -> Trial:
-    """The trial that just ended in ``env``, of which the sensors said ``seen`` (B, T + 1, dx)."""
-    states = observed = torch.from_numpy(seen)
-    if isinstance(env, ImperfectArms) and env.sigma:
-        states = torch.from_numpy(env.truth).float()
+def _measured(task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None) -> Trial:
+    """The trial that just ended in ``run``, of which the sensors said ``seen``; its last state repeats up to T."""
+    missing = actions.shape[1] - seen.horizon
+    states = observed = torch.from_numpy(np.pad(seen.states, ((0, 0), (0, missing), (0, 0)), mode="edge"))
+    arms = run.env if isinstance(run, Arms) else None
+    if isinstance(arms, ImperfectArms) and arms.sigma:
+        states = torch.from_numpy(arms.truth).float()
+    per_step = rewarded(task.reward, states[:, 1:], actions)
+    if seen.lengths or missing:
+        per_step = per_step * real_steps(seen.steps.tolist(), actions.shape[1])
+    final_distance, success = task.judged(states)
     return Trial(
         actions=actions,
         states=states,
-        executed_return=rewarded(task.reward, states[:, 1:], actions).sum(-1),
-        final_distance=rewards.final_distance(states, task.target, task.position),
+        executed_return=per_step.sum(-1),
+        final_distance=final_distance,
         plan=plan,
         observed=None if states is observed else observed,
+        success=success,
+        lengths=seen.lengths or ((seen.horizon,) * len(seen) if missing else ()),
+        own_return=torch.from_numpy(run.returns).float(),
     )

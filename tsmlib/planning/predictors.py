@@ -2,15 +2,16 @@
 
 from functools import cache, partial
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
 
 from tsmlib.collection import collect, open_loop
-from tsmlib.models.base import Model, as_dynamics, rollout
+from tsmlib.envs.stepping import continued, make_simulation
+from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.planning.base import Predictor
-from tsmlib.sampling import SharedNoise
+from tsmlib.planning.tasks import Task
+from tsmlib.sampling import Noise, NoNoise, SharedNoise
 from tsmlib.trajectory import Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
@@ -19,8 +20,9 @@ FRESH = 32  # samples behind a predicted return that is reported
 def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
     """Predict by rolling out ``model`` from ``past`` (B, L, .): its mode, or samples of it.
 
-    samples: 0 rolls out the mode (z = 0) of every candidate, S = 1; n draws n samples of each, S = n, with the same
-    noise, a function of ``seed``, for every candidate and call. ValueError for samples of a deterministic model.
+    samples: 0 rolls out the mode (z = 0) of every candidate, S = 1, or of an ensemble the mode of each member, S of
+    them; n draws n samples of each, S = n, with the same noise, a function of ``seed``, for every candidate and call.
+    ValueError for samples of a deterministic model.
     """
     if samples < 0:
         raise ValueError(f"samples is {samples}, expected 0 (the mode) or a positive number of samples")
@@ -29,13 +31,20 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
             f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
             "mode, samples=0"
         )
-    draws = max(samples, 1)
+    draws = samples or members(model)
 
     def predict(actions: Tensor) -> Tensor:
-        n, n_targets = actions.shape[:2]
+        n, n_targets, _, du = actions.shape
+        if du != past.actions.shape[2]:
+            raise ValueError(
+                f"actions have {du} dimensions, those of the past {past.actions.shape[2]}; give the search space "
+                "the size of this robot's actions: DirectActions(task.horizon, task.action_dim)"
+            )
         rows = actions[:, None].expand(-1, draws, -1, -1, -1).flatten(0, 2)  # (C S B, T, du)
         pasts = Segment(*(part.repeat(n * draws, 1, 1) for part in past))
-        noise = SharedNoise(torch.Generator().manual_seed(seed), draws * n_targets) if samples else None
+        noise: Noise | None = None if draws == 1 else NoNoise(n_targets)
+        if samples:
+            noise = SharedNoise(torch.Generator().manual_seed(seed), draws * n_targets)
         states = rollout(model, pasts, rows, generator=noise)
         return states.unflatten(0, (n, draws, n_targets)).transpose(0, 1)
 
@@ -50,18 +59,32 @@ def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FR
     return model_predictor(model, past, samples=samples if as_dynamics(model).stochastic else 0, seed=seed)
 
 
-def simulator_predictor(env_id: str, start: np.ndarray) -> Predictor:
-    """Predict by executing in the true simulator, in bulk, from ``start`` (B, dx): S = 1. Not differentiable.
+def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, done: Tensor | None = None) -> Predictor:
+    """Predict by executing in the true simulator, in bulk: S = 1. Not differentiable.
 
-    Any state can be a start, also one in the middle of an episode. In MuJoCo what follows is what would have followed,
-    up to rounding; in pymunk, contacts that last forget the force with which they press.
+    env: a task, from its starts; ``done`` (B, t, du): after these actions. Of an episode that ended the last state
+    repeats; ``rewards.until`` says what counts then. UnsupportedEnvironment where no state can be set.
+
+    The id of an arm, from ``start`` (B, dx): any state can be one, also one in the middle of an episode. In MuJoCo what
+    follows is what would have followed, up to rounding; in pymunk, contacts that last forget the force with which they
+    press.
     """
-    make = cache(partial(gymnasium.make_vec, env_id))
+    if isinstance(env, Task) and env.seeds:
+        sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
+        begun = continued(env.env, env.seeds, sofar)
+
+        def outcomes(actions: Tensor) -> Tensor:
+            return torch.from_numpy(begun.outcomes(actions.numpy())).float()[None]
+
+        return outcomes
+    if isinstance(env, Task) and start is None:
+        start = env.start
+    make = cache(partial(make_simulation, env.env if isinstance(env, Task) else env))
 
     def predict(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
-        env = make(num_envs=n * n_targets)
-        seen = collect(env, open_loop(actions.flatten(0, 1)), horizon=horizon, states=np.tile(start, (n, 1)))
+        begin = None if start is None else np.tile(start, (n, 1))
+        seen = collect(make(n * n_targets), open_loop(actions.flatten(0, 1)), horizon=horizon, states=begin)
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
 
     return predict

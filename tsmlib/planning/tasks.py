@@ -1,4 +1,4 @@
-"""Tasks: frozen starts, targets and reward of an environment, and reference torques."""
+"""Tasks: frozen starts, reward and measure of success in an environment; targets of the arm's; reference torques."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from torch import Tensor
 
 from tsmlib import rewards
 from tsmlib.collection import smooth_torques
-from tsmlib.envs.geometry import BLOCK_RADIUS, LINK_LENGTHS, WALL
+from tsmlib.envs.geometry import room
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.stepping import Arms, make_simulation
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 
@@ -20,13 +21,20 @@ HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
 
 
+Success = Callable[[Tensor], Tensor]  # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
+
+
 @dataclass(frozen=True)
 class Task:
-    """B instances of one task in one environment. start (B, dx), target (B, 2) in metres, horizon in steps.
+    """B instances of one task in one environment. start (B, dx), horizon in steps.
 
-    reward_for: targets -> reward; position: what has to arrive, fingertip or object; tolerance: metres, of a success.
-    ``standard`` gives the paper's, ``with_reward`` one of one's own. ValueError where a target is out of reach, or the
-    reward is not one number per step; FloatingPointError where it is NaN.
+    reward_for: targets -> reward. seeds (B,): of the resets that ``start`` was seen after, where states cannot be set.
+    success: what an executed episode is judged by, if anything; tolerance: of a distance. target (B, dg), position: of
+    the arm's tasks, in metres, and what has to arrive there, fingertip or object; (B, 0) and None of others.
+
+    ``from_env`` makes one of any environment; ``standard`` gives the paper's, ``with_reward`` another reward from the
+    same starts. ValueError where a target is out of the arm's reach, or the reward is not one number per step;
+    FloatingPointError where it is NaN.
     """
 
     name: str
@@ -34,9 +42,31 @@ class Task:
     start: np.ndarray
     target: Tensor
     reward_for: Callable[[Tensor], Reward]
-    position: slice
+    position: slice | None = None
     horizon: int = HORIZON["reach"]
     tolerance: float = TOLERANCE["reach"]
+    seeds: tuple[int, ...] = ()
+    success: Success | None = None
+    action_dim: int = 2
+
+    @classmethod
+    def from_env(
+        cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 0, success: Success | None = None,
+        tolerance: float = 0.0, name: str = "",
+    ) -> Task:  # fmt: skip
+        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...
+
+        reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
+        environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
+        """
+        begun = make_simulation(env, n)
+        start = begun.reset(seed=seed).astype(np.float32)
+        begun.close()
+        seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
+        return cls(
+            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance, seeds, success,
+            begun.action_dim,
+        )  # fmt: skip
 
     @classmethod
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
@@ -46,18 +76,18 @@ class Task:
         return cls("reach", env, start, target, rewards.reach, rewards.TIP)
 
     def __post_init__(self) -> None:
-        if self.position.stop > self.start.shape[1]:
-            raise ValueError(f"there is nothing to push in {self.env}; its task is 'reach'")
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
-        if self.target.shape != (len(self), 2):
-            raise ValueError(f"target is {tuple(self.target.shape)}, expected ({len(self)}, 2): one per start")
-        self._check_reach()
+        if self.seeds and len(self.seeds) != len(self):
+            raise ValueError(f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each")
+        if self.position is not None:
+            require_reachable(self.env, self.start, self.target, self.position)
         # Standing still, in the shape in which planners ask.
         states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
-        found = rewarded(self.reward, states, states.new_zeros(1, len(self), self.horizon, 2))
+        found = rewarded(self.reward, states, states.new_zeros(1, len(self), self.horizon, self.action_dim))
         if not torch.isfinite(found).all():
-            raise ValueError(f"the reward of task {self.name!r} is infinite for an arm that stands still")
+            body = "a robot" if self.position is None else "an arm"
+            raise ValueError(f"the reward of task {self.name!r} is infinite for {body} that stands still")
 
     def __len__(self) -> int:
         return len(self.start)
@@ -81,43 +111,70 @@ class Task:
         step, (..., B, T), differentiable if it is to be planned for with Adam. It always sees the whole episode, so
         that it may depend on the time. target (2,) or (B, 2): where it should end, for final_distance and pictures.
         """
-        goal = self.target if target is None else target.float().expand(len(self), 2)
+        goal = self.target if target is None else target.float().expand(len(self), -1)
         return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=horizon or self.horizon)
 
-    def _check_reach(self) -> None:
-        if self.position == rewards.TIP:
-            within, what = self.target.norm(dim=1) <= sum(LINK_LENGTHS) + 1e-6, "fingertip"
-            limit = f"{sum(LINK_LENGTHS):g} m from the shoulder"
-        else:
-            within, what = self.target.abs().amax(1) <= WALL - BLOCK_RADIUS + 1e-6, "object"
-            limit = f"{WALL - BLOCK_RADIUS:g} m along x and y, where the walls are"
-        if not within.all():
-            i = int((~within).nonzero()[0])
+    def judged(self, states: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Final distance (B,), NaN where none is measured, and success (B,) bool, of executed states (B, T + 1, dx)."""
+        if self.success is None and self.position is not None:
+            away = rewards.final_distance(states, self.target, self.position)
+            return away, away <= self.tolerance
+        nothing = states.new_full((len(self),), torch.nan)
+        if self.success is None:
+            return nothing, None
+        found = self.success(states)
+        if not isinstance(found, Tensor) or found.shape != (len(self),):
+            what = f"a tensor {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
             raise ValueError(
-                f"target {i} at ({self.target[i, 0]:.3f}, {self.target[i, 1]:.3f}) m is out of reach: "
-                f"the {what} gets as far as {limit}"
+                f"success of task {self.name!r} is {what} for states {tuple(states.shape)}; expected ({len(self)},), "
+                "bool or a distance"
             )
+        return (nothing, found) if found.dtype == torch.bool else (found, found <= self.tolerance)
 
     def past(self, past_len: int) -> Segment:
         """The past before the first step: x_0 repeated, zero actions."""
-        return initial_past(torch.from_numpy(self.start).float(), past_len, 2)
+        return initial_past(torch.from_numpy(self.start).float(), past_len, self.action_dim)
 
     def take(self, n: int) -> Task:
         """The first ``n`` instances; ValueError if there are not as many."""
         if not 1 <= n <= len(self):
             raise ValueError(f"{n} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
-        return replace(self, start=self.start[:n], target=self.target[:n])
+        return replace(self, start=self.start[:n], target=self.target[:n], seeds=self.seeds[:n])
 
     def times(self, n: int) -> Task:
         """All instances n times over, for as many copies of a policy."""
-        return replace(self, start=np.tile(self.start, (n, 1)), target=self.target.repeat(n, 1))
+        start, target = np.tile(self.start, (n, 1)), self.target.repeat(n, 1)
+        return replace(self, start=start, target=target, seeds=self.seeds * n)
+
+
+def require_reachable(env: str, start: np.ndarray, target: Tensor, position: slice) -> None:
+    """ValueError unless there is one target (B, 2) per start, in metres, where the arm's fingertip or object gets."""
+    if position.stop > start.shape[1]:
+        raise ValueError(f"there is nothing to push in {env}; its task is 'reach'")
+    if target.shape != (len(start), 2):
+        raise ValueError(f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start")
+    physics = EnvSpec.parse(env).physics
+    if position == rewards.TIP:
+        reach = sum(physics.link_lengths)
+        within, what = target.norm(dim=1) <= reach + 1e-6, "fingertip"
+        limit = f"{reach:g} m from the shoulder"
+    else:
+        within, what = target.abs().amax(1) <= room(physics) + 1e-6, "object"
+        limit = f"{room(physics):g} m along x and y, where the walls are"
+    if not within.all():
+        i = int((~within).nonzero()[0])
+        raise ValueError(
+            f"target {i} at ({target[i, 0]:.3f}, {target[i, 1]:.3f}) m is out of reach: "
+            f"the {what} gets as far as {limit}"
+        )
 
 
 def zero_torques(task: Task) -> Tensor:
     """No torque at all: the floor below which a plan does harm. (B, T, du)."""
-    return torch.zeros(len(task), task.horizon, 2)
+    return torch.zeros(len(task), task.horizon, task.action_dim)
 
 
 def random_torques(task: Task, *, seed: int = 0) -> Tensor:
-    """Torques like the training data's. (B, T, du)."""
-    return smooth_torques(len(task), task.horizon, generator=torch.Generator().manual_seed(seed))
+    """Torques like the arm's training data's. (B, T, du)."""
+    generator = torch.Generator().manual_seed(seed)
+    return smooth_torques(len(task), task.horizon, generator=generator, action_dim=task.action_dim)

@@ -157,6 +157,8 @@ def save_trajectories(path: PathLike, trajectories: Trajectories, header: Mappin
     """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, fingerprint, ...)."""
     t = trajectories
     fields: dict[str, Json] = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
+    fields |= {"lengths": t.lengths} if t.lengths else {}
+    fields |= {"terminated": t.terminated} if t.terminated else {}
     arrays = {"states": t.states.astype(np.float32), "actions": t.actions.astype(np.float32)}
     save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": fields})
 
@@ -181,7 +183,8 @@ def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = Non
             raise TypeError(f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions")
         arrays = (tensors["states"].numpy(), tensors["actions"].numpy())
         meaning = (tuple(fields[name]) for name in ("names", "units", "angles"))
-        found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning)
+        ends = (tuple(fields.get(name, ())) for name in ("lengths", "terminated"))
+        found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning, *ends)
         fingerprint = {**about["header"].get("fingerprint", {}), **fields}
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
         raise StoreError(f"{path} holds no usable trajectories: {error}. {remedy(path)}") from error
@@ -272,9 +275,15 @@ def require_fit(path: Path, found: Mapping[str, Json], expect: Mapping[str, Json
 def differences(found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False) -> list[str]:
     """Fields of ``expected`` that ``found``, from a file, does not hold, naming both sides.
 
+    ``standard``, in either of both: values of fields that the other leaves out.
     only_stated: what ``found`` does not mention is not asked for, except the environment.
     """
     wanted = json.loads(json.dumps(dict(expected)))  # tuples become lists, as in a file
+    # Fields that only a variant of an environment states, with what the others mean by leaving them out.
+    stated, usual = found.get("standard"), wanted.pop("standard", {})
+    if "simulator" in wanted:  # a whole fingerprint
+        usual = {**(stated if isinstance(stated, Mapping) else {}), **usual}
+        wanted, found = usual | wanted, usual | dict(found)
     return [
         f"{name} is {found.get(name, 'not stated')!r} in the file, expected {value!r}"
         for name, value in wanted.items()

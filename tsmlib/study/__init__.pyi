@@ -32,8 +32,7 @@ from .policies import learned_rows as learned_rows
 from .policies import stored_budget as stored_budget
 from .policies import within_data as within_data
 from .predictions import RESULTS as RESULTS
-from .predictions import published_rows as published_rows
-from .predictions import save_rows as save_rows
+from .predictions import pooled_rows as pooled_rows
 from .predictions import score_all as score_all
 from .predictions import score_rows as score_rows
 from .predictions import scores as scores

@@ -15,7 +15,7 @@ from tsmlib.envs.spec import EnvSpec, gone
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError
 from tsmlib.study.parallel import precompute
-from tsmlib.study.parameters import ParameterError
+from tsmlib.study.parameters import ParameterError, standard_arm
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
@@ -24,9 +24,12 @@ HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for eve
 
 
 def parse_choice(parameter: str, text: str, known: Sequence[str]) -> list[str]:
-    """The value of a notebook parameter that names one of ``known``, several with commas between, or all."""
+    """The value of a notebook parameter that names one of ``known``, several with commas between, or all.
+
+    A variant of an environment is known where the standard one is.
+    """
     names = list(known) if text == "all" else [word.strip() for word in text.split(",")]
-    if unknown := [word for word in names if word not in known]:
+    if unknown := [word for word in names if word not in known and standard_arm(word) not in known]:
         raise ParameterError(f"{parameter} names {unknown[0]!r:.80}, expected some of {', '.join(known)}; or all.")
     return list(dict.fromkeys(names))
 

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, cast
 
@@ -17,6 +18,7 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
+from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import StoreError
@@ -125,7 +127,7 @@ def described(trained: Mapping[tuple[str, str], Trained]) -> pd.DataFrame:
 def precompute_models(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
     """``precompute`` for models: each (env, model) that is wanted, once, the longest trainings first."""
     pairs = list(dict.fromkeys((_trained_on(env, model), model) for env, model in wanted))
-    pairs.sort(key=lambda pair: -zoo.BUDGET[EnvSpec.parse(pair[0]).arm.name])
+    pairs.sort(key=lambda pair: -zoo.BUDGET[EnvSpec.parse(pair[0]).standard.name])
     precompute(run, [(load_or_train, *pair) for pair in pairs], progress="models")
 
 
@@ -148,18 +150,19 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     if (symmetries := _symmetries(env, model)) > 1:
         data = symmetric(data)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
-    stages, curves = schedule(run, env, model), {}
-    checkpoints = {key: path.with_name(f"{model}-{key}.checkpoint") for key in zoo.keys(stages)}
-    for (key, checkpoint), stage in zip(checkpoints.items(), stages, strict=True):
+    stages, curves, checkpoints = schedule(run, env, model), {}, []
+    for (k, part), (key, stage) in product(enumerate(_parts(net)), zip(zoo.keys(stages), stages, strict=True)):
+        key += f"@{k}" * bool(k)
+        checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
-            cast(torch.nn.Module, net), getattr(net, stage.loss), data, held_out,
+            cast(torch.nn.Module, part), getattr(part, stage.loss), data, held_out,
             TrainingOptions(
                 past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr, bf16=stage.bf16,
                 muon=stage.muon, weight_decay=stage.weight_decay, patience=stage.patience, span=stage.span,
                 batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
                 validate_every=run.pick(smoke=10, laptop=250, paper=250),
             ),
-            seed=run.seed, device=run.device, checkpoint=checkpoint,
+            seed=run.seed + 1000 * k, device=run.device, checkpoint=checkpoints[-1],
             progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
@@ -173,9 +176,14 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
         "inputs": _inputs(run, env, path),
     }  # fmt: skip
     artifacts.save_model(path, net, header)
-    for checkpoint in checkpoints.values():
+    for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)
     return Trained(net, artifacts.read_header(path))
+
+
+def _parts(net: TrainedModel) -> list[TrainedModel]:
+    """What is trained by itself, one after another: the decoders of a recurrent model, else the model."""
+    return [net.alone(k) for k in range(net.members)] if isinstance(net, RecurrentTSM) and net.members > 1 else [net]
 
 
 def _share(run: Run) -> float:
@@ -186,7 +194,8 @@ def _share(run: Run) -> float:
 def _duration(run: Run, env: str, model: str) -> str:
     """How long a training may take, in words."""
     spec = zoo.find(model)
-    seconds = _share(run) * (zoo.BUDGET[EnvSpec.parse(env).arm.name] if spec.budget is None else spec.budget)
+    seconds = _share(run) * (zoo.BUDGET[EnvSpec.parse(env).standard.name] if spec.budget is None else spec.budget)
+    seconds *= cast(int, spec.arguments(EnvSpec.parse(env)).get("members", 1))
     if not seconds:
         return "a few updates"
     return f"about {max(1, round(seconds / 60))} min of one core. Stopped, it goes on from there the next time"

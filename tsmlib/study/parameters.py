@@ -1,19 +1,20 @@
 """Parameters of the notebooks: names, types and ranges; one schema for every way in.
 
 ``python -m tsmlib run`` checks the text that was typed, and a notebook's first cell checks the values that arrived
-there. Both happen before any file exists. papermill executes every name as code, and only warns of unknown ones, which
-``papermill_plugin`` refuses where they were typed.
+there. Both happen before any file exists. papermill executes every name as code, and only warns of unknown ones:
+``papermill_plugin`` refuses them where they were typed, ``require_declared`` in the notebook, however they came.
 A notebook's ``parameters`` cell holds the defaults; a name in it that stands here too obeys the rule here.
 """
 
 import ast
+import contextlib
 import difflib
 import io
 import json
 import math
 import re
 import tokenize
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,6 +25,7 @@ SCALES = ("smoke", "laptop", "paper")
 ENVS = tuple(f"tsm/{arm}" for arm in ("Reacher-v0", "ReacherObstacle-v0", "ReacherPush-v1",
                                       "PymunkReacher-v0", "PymunkObstacle-v0", "PymunkPush-v1"))  # fmt: skip
 LONGEST = 1000  # characters
+INJECTED = "# Parameters\n"  # how the cell begins that papermill puts below the one tagged parameters
 Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
 _RESTORE = "Restore it: git checkout -- notebooks in a clone; where tsmlib is installed, install it again"
@@ -52,9 +54,23 @@ def _one_of(*known: str) -> Rule:
 
 def _some_of(*known: str) -> Rule:
     def allows(value: str) -> bool:
-        return value == "all" or all(word.strip(" ") in known for word in value.split(","))
+        words = [word.strip(" ") for word in value.split(",")]
+        return value == "all" or all(word in known or standard_arm(word) in known for word in words)
 
     return Rule(str, f"some of {', '.join(known)}, with commas between; or all", allows)
+
+
+def standard_arm(word: str) -> str:
+    """The id of the standard arm of which ``word`` is a variant, without noise and delay; '' for any other word."""
+    if not word.startswith("tsm/"):
+        return ""
+    from tsmlib.envs.spec import EnvSpec  # and with it Gymnasium, which most calls can do without
+
+    try:
+        spec = EnvSpec.parse(word)
+    except ValueError:
+        return ""
+    return spec.standard.id if spec == spec.arm else ""
 
 
 def _is_folder(value: str) -> bool:
@@ -63,7 +79,7 @@ def _is_folder(value: str) -> bool:
     return not value.startswith("~") and ".." not in path.parts and value.strip() == value and not reserved
 
 
-_REACH = "from -1 to 1; the fingertip gets as far as 0.21 from the shoulder"
+_REACH = 0.21  # m from the shoulder, the fingertip's
 
 SCHEMA: dict[str, Rule] = {
     "scale": _one_of(*SCALES),
@@ -77,8 +93,8 @@ SCHEMA: dict[str, Rule] = {
     "envs": _some_of(*ENVS),
     "models": _some_of(*zoo.words()),
     "model": Rule(str, f"{zoo.OURS} or {zoo.PAPERS}", lambda value: value in (zoo.OURS, zoo.PAPERS)),
-    "target_x": Rule(float, f"metres, {_REACH}", lambda value: abs(value) <= 1),
-    "target_y": Rule(float, f"metres, {_REACH}", lambda value: abs(value) <= 1),
+    "target_x": Rule(float, f"metres from -{_REACH} to {_REACH}", lambda value: abs(value) <= _REACH),
+    "target_y": Rule(float, f"metres from -{_REACH} to {_REACH}", lambda value: abs(value) <= _REACH),
     "n_targets": _whole(0, 100),
 }  # fmt: skip
 PLAIN = {  # for a parameter without a rule, by the type of its default
@@ -134,12 +150,36 @@ def explained(notebook: Path) -> str:
 
 def require_known(notebook: Path, names: Iterable[str]) -> None:
     """ParameterError for a name that is none of a notebook's parameters, naming the closest and all that there are."""
-    known = list(declared(notebook))
+    _require_among(list(declared(notebook)), names, notebook.stem)
+
+
+def require_declared(cells: Sequence[str], notebook: str) -> None:
+    """ParameterError for a name that papermill's own cell sets and no cell before it; cells: those executed so far.
+
+    Cells of others that begin like papermill's are left alone: before it stands a cell that sets scale and seed.
+    """
+    own = [index for index, cell in enumerate(cells) if cell.startswith(INJECTED)]
+    known = _set_by(*(cell for cell in cells[: own[-1]] if not cell.startswith(INJECTED))) if own else []
+    if {"scale", "seed"} <= set(known):
+        _require_among(known, _set_by(cells[own[-1]]), notebook)
+
+
+def _set_by(*cells: str) -> list[str]:
+    """The names that cells assign, in order; of one that is no Python none."""
+    found: list[str] = []
+    for cell in cells:
+        with contextlib.suppress(SyntaxError, ValueError):
+            nodes = [node for node in ast.walk(ast.parse(cell)) if isinstance(node, ast.Name)]
+            found += [node.id for node in nodes if isinstance(node.ctx, ast.Store)]
+    return found
+
+
+def _require_among(known: list[str], names: Iterable[str], notebook: str) -> None:
     for name in names:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             raise ParameterError(
-                f"{notebook.stem} has no parameter {_shown(name)}"
+                f"{notebook} has no parameter {_shown(name)}"
                 f"{f'; the closest is {close[0]}, and' if close else ';'} it has {', '.join(known)}."
             )
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES, Method
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import members
 from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi, plan_at, reevaluate, sampled_starts
@@ -164,6 +165,8 @@ class _Problem:
         """All that the plan is a function of."""
         nets = {"prior": self.prior, "model": self.model}
         judge: dict[str, Json] = {} if self.model is None else {"samples": SAMPLES}
+        if self.model is not None and members(self.model) > 1:
+            judge["members"] = members(self.model)
         return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
             "every": self.every, "seed": self.run.seed, "candidates": self.candidates, "iterations": self.iterations,

@@ -133,7 +133,7 @@ def _initialise(run: Run, data: Trajectories, prior: ActionPrior | None, budget:
         policy = OneStepPolicy(dx, du, angles=data.angles, copies=budget.copies, seed=seed)
     else:
         policy = SegmentPolicy(dx, prior, angles=data.angles, copies=budget.copies, seed=seed)
-    policy.features.fit(torch.from_numpy(data.states))
+    policy.features.fit(torch.from_numpy(data.states), data.lengths)
     return policy
 
 

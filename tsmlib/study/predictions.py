@@ -86,30 +86,19 @@ def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, ob
     return found
 
 
-def published_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
-    """The rows that this notebook's figures draw: all seeds there are, at the paper's sizes where they are to be had.
+def pooled_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
+    """The given rows, and at scale paper those of the other seeds beside this run.
 
-    Scale paper: the given rows and those of the other seeds beside this run; RunError where one of these did not come
-    to its end. Laptop: the published ones, and the given rows of environments that are not among them. Smoke: the given
-    rows. table: what follows the notebook's name in the table's, ``_rows`` for instance.
+    table: what follows the notebook's name in the table's, ``_rows`` for instance. RunError where another seed's
+    notebook did not come to its end.
     """
-    name, own = f"{run.notebook}{table}.csv", tables.frame(rows)
-    if run.scale == "laptop" and (RESULTS / name).exists():
-        published = tables.load(RESULTS / name)
-        return tables.frame(pd.concat([published, own[~own["env"].isin(published["env"])]]))
-    parts = [own]
+    name, parts = f"{run.notebook}{table}.csv", [tables.frame(rows)]
     for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.scale == "paper" else ():
         if run.dir not in path.parents:
             folder = path.parents[1]
             require(replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder), run.notebook)
             parts.append(tables.load(path))
     return tables.frame(pd.concat(parts))
-
-
-def save_rows(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFrame:
-    """Write the table of a notebook's run. Returns the rows that its figures draw (``published_rows``)."""
-    tables.save(run.metrics / f"{run.notebook}.csv", rows)
-    return published_rows(run, rows)
 
 
 def table(run: Run, name: str) -> pd.DataFrame:

@@ -67,16 +67,18 @@ def publish(run: Run) -> None:
 
 
 def _ships(path: Path) -> bool:
-    """Not checkpoints, nor models that only a table needs: of the paper's choices, and of the map of imperfect arms."""
+    """Not checkpoints, nor models that only a table needs: of the paper's choices, of the map of imperfect arms, and
+    ensembles, which are large, of the pymunk arm."""
     arms = {imperfect(arm, **how) for arm in ENV_IDS for how in ({}, {"noise": NOISE}, {"delay": DELAY})}
     table_only = path.stem in zoo.words("choice") or path.parent.name not in {EnvSpec.parse(arm).name for arm in arms}
+    table_only = table_only or (path.stem.startswith("ensemble") and path.parent.name.startswith("Pymunk"))
     return ".checkpoint" not in path.name and not (path.parents[1].name == "models" and table_only)
 
 
 def pooled(run: Run) -> dict[str, pd.DataFrame]:
     """Notebook -> the rows of this run and of every seed beside it. RunError where one did not come to its end."""
     own = {notebook: tables_storage.load(run.metrics / f"{notebook}.csv") for notebook in POOLED}
-    return {notebook: study.published_rows(replace(run, notebook=notebook), rows) for notebook, rows in own.items()}
+    return {notebook: study.pooled_rows(replace(run, notebook=notebook), rows) for notebook, rows in own.items()}
 
 
 def publish_claims() -> None:

@@ -9,6 +9,7 @@ package in the working directory.
 """
 
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -113,6 +114,8 @@ def resolve(
     others: the notebook's other parameters. All are checked here and nowhere else, whichever way they came.
     Raises ParameterError naming the value and what is allowed.
     """
+    if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()):
+        parameters.require_declared(shell.user_ns.get("In", []), notebook)
     parameters.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import artifacts
@@ -19,9 +20,12 @@ FROZEN = ROOT / "data" / "tasks"
 def load_task(env: str, split: str = "test") -> Task:
     """100 starts and targets of an environment's task. ``test`` ones are frozen in data/tasks and choose nothing.
 
-    The same with noisy sensors or delayed actions as without; starts are the true states.
+    The same with noisy sensors or delayed actions as without; starts are the true states. The same for a variant with
+    another mass, damping or gain, drawn from its own reset where lengths or radius are others.
     """
-    arm = EnvSpec.parse(env).arm.id
+    spec = EnvSpec.parse(env)
+    shape = Physics(link_lengths=spec.physics.link_lengths, object_radius=spec.physics.object_radius)
+    arm = replace(spec.arm, physics=shape).id
     if arm != env:
         return replace(load_task(arm, split), env=env)
     path = FROZEN / f"{EnvSpec.parse(env).name}.safetensors"

@@ -119,7 +119,7 @@ class ModelSpec:
 
     def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
         """How the model is trained in a share of its budget, on an imperfect arm as on the plain one."""
-        seconds = share * (BUDGET[env.arm.name] if self.budget is None else self.budget)
+        seconds = share * (BUDGET[env.standard.name] if self.budget is None else self.budget)
         stages = (env.task == "push" and self.pushing) or self.stages
         return [stage.within(seconds, env.has_block) for stage in stages]
 
@@ -178,7 +178,8 @@ _MODELS = (
         pushing=tuple(replace(stage, muon=0.006) for stage in PAPER),  # diverges at 0.02
     ),
     ModelSpec(
-        "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT, planned=True,
+        "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT,
+        lambda env: {"members": 3} if env.task == "push" else {}, planned=True,
         pushing=tuple(replace(stage, muon=0.01) for stage in RECURRENT),
     ),
     ModelSpec(  # the energy score in place of squared error and KL

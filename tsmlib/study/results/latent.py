@@ -32,9 +32,9 @@ from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
 from tsmlib.statistics import spearman
 from tsmlib.study.results import table
-from tsmlib.study.results.prediction import select, values
+from tsmlib.study.results.prediction import NAMES, select, values
 from tsmlib.study.results.table import Row
-from tsmlib.study.zoo import method
+from tsmlib.study.zoo import look, method
 
 THRESHOLDS = {  # set before any of it was measured: metric, subset, environment -> bound
     ("kl", "", "tsm/Reacher-v0"): ("at most", 0.1),
@@ -43,6 +43,8 @@ THRESHOLDS = {  # set before any of it was measured: metric, subset, environment
     ("recall", "object", "tsm/ReacherPush-v1"): ("at least", 0.8),
     ("recall", "wall", "tsm/ReacherPush-v1"): ("at least", 0.7),
 }
+SOURCES = {"error_posterior": "code from the encoder", "error_prior": "from the prior", "error_zero": "z = 0"}
+PARTS = {"": "all segments", "free": "no touch", "contact": "with a touch"}  # subsets, as readers meet them
 STRETCHES = tuple(range(10, HORIZON + 1, 10))  # last steps of the stretches of ten in which contacts are counted
 
 
@@ -187,15 +189,61 @@ def recall_panels(found: pd.DataFrame, env: str) -> dict[str, dict[Method, dict[
     return panels
 
 
-def thresholds_table(found: pd.DataFrame, models: Sequence[str]) -> str:
-    """THRESHOLDS and what was measured, in Markdown: mean over seeds, and for contacts by how far ahead they lie."""
+@table.sourced
+def codes_table(found: pd.DataFrame, env: str) -> pd.DataFrame:
+    """The KL and the importance of each unit of the code, in Markdown, from the rows of ``one_training``."""
+    lines = []
+    for metric, title in {"kl_dimension": "KL", "importance": "moves"}.items():
+        own = select(found, metric, env=env, execution="segments")
+        for model, part in table.groups(own, "model"):
+            units = {f"$z_{i + 1}$": f"{value:.3f}" for i, value in zip(part["dimension"], part["value"], strict=True)}
+            lines.append({"model": look(model).name, "what": title, "n": part["n"].max()} | units)
+    return pd.DataFrame(lines)
+
+
+def one_training(found: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the first training seed of each source: units of different trainings have nothing in common."""
+    if "source" not in found:
+        return table.select(found, seed=found["seed"].min())
+    return found[found["seed"] == found.groupby("source")["seed"].transform("min")]
+
+
+@table.sourced
+def errors_table(found: pd.DataFrame, envs: Sequence[str], model: str) -> pd.DataFrame:
+    """Errors of the next segment by where its code is from, and by subset, in Markdown: means over seeds."""
+    own = table.select(found, env=list(envs), model=model, metric=list(SOURCES), subset=list(PARTS))
+    if own.empty:
+        return own
+    own = own.assign(what=own["subset"].fillna("").map(PARTS))
+    wide = table.means(own, ["env", "what"])
+    counts = own.groupby(["env", "what"])["n"].max().reindex(wide.index).rename("n")
+    texts = table.printed(wide, {metric: (title, "{:.3f}") for metric, title in SOURCES.items()})
+    return texts.assign(n=counts.to_numpy())
+
+
+@table.told
+def directions_told(found: pd.DataFrame, env: str) -> Iterator[str]:
+    """A sentence per model on how much of where a moving object goes is linear in the encoder's code."""
+    for model, shares in values(found, "direction_told", env=env, execution="segments", subset="object moves").items():
+        yield (f"{look(model).name}: a linear function of the encoder's code explains {shares.mean():.0%} of where a "
+               "moving object goes.")  # fmt: skip
+
+
+@table.sourced
+def thresholds_table(found: pd.DataFrame, models: Sequence[str]) -> pd.DataFrame:
+    """THRESHOLDS and what was measured, in Markdown: mean over seeds, and for contacts by how far ahead they lie.
+
+    Thresholds of what was not measured are left out.
+    """
     lines = []
     for (metric, subset, env), (word, bound) in THRESHOLDS.items():
         contact = metric == "recall"
         for steps in (10, None) if contact else (None,):
             where: Row = dict(subset=subset, execution="open loop" if contact else "segments", steps_ahead=steps)
-            measured = {model: f"{v.mean():.3g}" for model, v in values(found, metric, env=env, **where).items()}
+            measured = values(found, metric, env=env, **where)
+            texts = {look(model).name: f"{measured[model].mean():.3g}" for model in models if model in measured}
             which = f" ({subset}), {'the next 10' if steps else 'all 30'} steps" if contact else ""
-            line = {"what": f"`{env}`: {metric.replace('_', ' ')}{which}", "threshold": f"{word} {bound:g}"}
-            lines.append(line | {model: measured.get(model, "") for model in models})
-    return table.markdown(pd.DataFrame(lines))
+            line = {"what": f"{EnvSpec.parse(env).name}: {NAMES[metric]}{which}", "threshold": f"{word} {bound:g}"}
+            if texts:
+                lines.append(line | texts)
+    return pd.DataFrame(lines)

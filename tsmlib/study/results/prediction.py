@@ -36,6 +36,13 @@ NAMES = {  # of metrics, as readers meet them
     "energy_score": "energy score, bare samples", "energy_score_noise": "energy score", "crps_noise": "CRPS",
     "nrmse": "error / data's s.d.", "coverage80": "truths in 80 % intervals", "diverged": "rollouts out of range",
     "spread": "spread of samples", "error": "error", "kl": "KL (nats)", "active_units": "active units",
+    "spread_ratio": "spread after / before a touch", "spearman": "rank correlation of spread and error",
+    "recall": "recall", "majority": "foretold by most samples", "precision": "precision", "chance": "recall by chance",
+    "deflection_error": "direction, error (°)", "deflection_spread": "spread (°)",
+    "deflection_spearman": "rank correlation", "deflection_coverage80": "truths in 80 % intervals",
+    "deflection_still": "samples that do not move it", "travel_error": "distance, error (m)",
+    "travel_spread": "spread (m)", "travel_spearman": "rank correlation",
+    "travel_coverage80": "truths in 80 % intervals",
 }  # fmt: skip
 
 

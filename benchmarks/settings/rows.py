@@ -1,0 +1,86 @@
+"""Published rows of single environments and models, made as the notebooks make them: for models that came later.
+
+    python benchmarks/settings/rows.py predict --scale paper --envs tsm/ReacherPush-v1 --models tsm rtsm lstm
+    python benchmarks/settings/rows.py control --scale paper --envs tsm/ReacherPush-v1 --models rtsm lstm --closed rtsm
+
+predict: open loop and on segments (03_predict). control: plans by the cross-entropy method in both search spaces, open
+loop, and in codes planned again every ten steps for --closed; with the oracle over codes, no torque and random torques
+beside them (05_control). Models, scores and plans are those of the run, so what is missing is made first.
+
+Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from tsmlib import study
+from tsmlib.envs.spec import ENV_IDS
+from tsmlib.figures.method import SEARCH_SPACES
+from tsmlib.storage import manifest, tables
+from tsmlib.study import runs, zoo
+from tsmlib.study.predictions import RESULTS
+from tsmlib.study.results import planning
+from tsmlib.study.results.table import Row
+
+KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "iteration", "seed", "scale")
+FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
+
+
+def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
+    """The published table with ``rows`` in place of those with the same key."""
+    new = tables.frame(rows)
+    old, own = (list(part[list(KEY)].astype(str).itertuples(index=False, name=None)) for part in (published, new))
+    kept = published[[key not in set(own) for key in old]]
+    return tables.frame(pd.concat([kept, new]))
+
+
+def publish(name: str, rows: Iterable[Row]) -> None:
+    """Merge rows into a table of data/results."""
+    path = RESULTS / f"{name}.csv"
+    table = merged(tables.load(path) if path.exists() else tables.frame([]), rows)
+    tables.save(path, table)
+    print(f"{path.name}: {len(table)} rows")
+
+
+def controlled(
+    run: runs.Run, envs: list[str], models: list[str], closed: list[str], spaces: list[str]
+) -> tuple[list[Row], list[Row]]:
+    """Rows of 05_control.csv and 05_control_rows.csv."""
+    tasks = [study.load_task(env) for env in envs]
+    trials = study.trials(run, tasks, [*zoo.methods(models, "cem", spaces), *FLOORS])
+    rows, targets = planning.rows(tasks, trials, run)
+    if closed:
+        loops = study.trials(run, tasks, zoo.methods(closed, "cem", ["latent"]), every=10)
+        more, more_targets = planning.rows(tasks, loops, run, execution=planning.CLOSED)
+        rows, targets = [*rows, *more], [*targets, *more_targets]
+    return rows, targets
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("predict", "control"))
+    parser.add_argument("--envs", nargs="+", required=True, choices=ENV_IDS, metavar="ENV")
+    parser.add_argument("--models", nargs="+", required=True, choices=zoo.words(), metavar="MODEL")
+    parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
+    parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
+    parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    notebook = "03_predict" if given.part == "predict" else "05_control"
+    run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    if given.part == "predict":
+        publish(notebook, study.score_rows(run, [(env, word) for env in given.envs for word in given.models]))
+    else:
+        rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces)
+        publish(notebook, rows)
+        publish(f"{notebook}_rows", targets)
+    manifest.write_manifest(Path(RESULTS).parent)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+// node test/engine.mjs < questions.json > answers.json: what the page computes, for tests in Python to compare.
+// Each question is { what: 'physics' | 'rollout' | 'decode' | 'plan', task, ... }; see the functions below.
+import { readFileSync } from 'node:fs';
+import { readManifest } from '../dist/src/files.js';
+import { loadMujoco } from '../dist/src/physics.js';
+import { Library, attempt } from '../dist/src/session.js';
+import factory from '../dist/vendor/mujoco.js';
+
+const reader = async path => {
+  const data = readFileSync(new URL(`../dist/${path}`, import.meta.url));
+  return data.buffer.slice(data.byteOffset, data.byteOffset + data.length);
+};
+const library = await Library.load(await readManifest(reader), await loadMujoco(factory), reader);
+const repeated = (values, n) => Float32Array.from(Array(n).fill(values).flat());
+
+/** { starts (N, dx), actions (N, T * 2) } -> states (N, T * dx) */
+async function physics({ task, starts, actions }) {
+  const arm = await library.world(task);
+  return starts.map((start, i) => {
+    arm.reset(start);
+    return [...arm.advance(actions[i])];
+  });
+}
+
+/** { model, pasts (N of { states, actions }), actions (N, T * 2), codes (N, K * dz)? } -> states (N, T * dx) */
+async function rollout({ task, model, pasts, actions, codes }) {
+  const net = await library.network(task, model);
+  return pasts.map((past, i) => {
+    const T = actions[i].length / 2, given = { states: Float32Array.from(past.states), actions: Float32Array.from(past.actions) };
+    const states = net.rollout(4, given, repeated(actions[i], 4), T, codes ? repeated(codes[i], 4) : null);
+    return [...states.subarray(0, states.length / 4)];
+  });
+}
+
+/** { past (10 * 2), codes (N, K * dz) } -> actions (N, K H * 2) */
+async function decode({ task, past, codes }) {
+  const prior = await library.network(task, 'prior');
+  return codes.map(code => {
+    const actions = prior.decode(4, Float32Array.from(past), repeated(code, 4));
+    return [...actions.subarray(0, actions.length / 4)];
+  });
+}
+
+/** { model, space, replan, starts, targets, seed, first?, again? } -> [{ predicted, executed, distance, success, ms }] */
+async function plan({ task, model, space, replan = false, starts, targets, seed, first, again }) {
+  const found = [];
+  for (const [i, start] of starts.entries()) {
+    const scene = { task, model, space, replan, start, target: targets[i], seed: seed + i }, ms = [];
+    for await (const event of attempt(library, scene, { first, again })) {
+      if (event.type === 'part') ms.push(event.ms);
+      if (event.type === 'done') found.push({ ...event, ms });
+    }
+  }
+  return found;
+}
+
+const answers = [];
+for (const question of JSON.parse(readFileSync(0))) {
+  answers.push(await { physics, rollout, decode, plan }[question.what](question));
+}
+process.stdout.write(JSON.stringify(answers));
