@@ -17,7 +17,6 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "pages",  # beside this file
@@ -32,6 +31,7 @@ myst_heading_slug_func = "pages.anchor"
 nb_execution_mode = "off"
 nitpicky = True
 nitpick_ignore_regex = [(r"py:.*", r"(?!tsmlib\.).*|.*\.[A-Z]")]  # types of other libraries, and type variables
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # a slider without its kernel shows nothing new
 suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets of executed notebooks
 
 # API
@@ -47,4 +47,5 @@ toc_object_entries = False
 html_theme = "furo"
 html_title = f"tsmlib {release}"
 html_copy_source = False
+html_math_renderer = "mathml"  # of pages.py
 html_static_path: list[str] = []

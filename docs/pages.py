@@ -1,4 +1,6 @@
-"""Sphinx extension of this site: pages of notebooks and modules, links into them, and docstrings as they are written.
+"""Sphinx extension of this site: pages of notebooks and modules, links into them, docstrings as written, formulas.
+
+Formulas become MathML, which browsers show by themselves, so that no page loads a script from elsewhere.
 
 Docstrings of tsmlib are plain text with ``code``, paragraphs and indented formulas. Read as reStructuredText,
 ``(C, B, *shape)`` would open an emphasis and ``E|X - x|`` a substitution.
@@ -9,13 +11,18 @@ import re
 import shutil
 from itertools import groupby
 from pathlib import Path
+from typing import NoReturn
 
 import nbformat
+from docutils import nodes
+from math_core import LatexToMathML
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 MARKUP = re.compile(r"(``.+?``)")
+MATHML = LatexToMathML(fancy_error=False)  # LatexError ends the build
 SPECIAL = re.compile(r"([\\*|_`])")
 
 
@@ -92,6 +99,22 @@ def copy_notebooks() -> None:
         nbformat.write(notebook, target / path.name)
 
 
+def inline_formula(page: HTML5Translator, node: nodes.math) -> NoReturn:
+    """A formula within a sentence. Sphinx's own signature."""
+    page.body.append(MATHML.convert_with_local_state(node.astext(), displaystyle=False))
+    raise nodes.SkipNode
+
+
+def display_formula(page: HTML5Translator, node: nodes.math_block) -> NoReturn:
+    """A formula on a line of its own; one with a number of the paper's stands in the environment that shows it."""
+    tex = node.astext()
+    if r"\tag" in tex:
+        tex = rf"\begin{{equation}}{tex}\end{{equation}}"
+    shown = MATHML.convert_with_local_state(tex, displaystyle=True)
+    page.body.append(f'<div class="math" style="margin: 1em 0; overflow-x: auto">{shown}</div>\n')
+    raise nodes.SkipNode
+
+
 def read(app: Sphinx, name: str, source: list[str]) -> None:
     """Sphinx's event source-read."""
     source[0] = linked(source[0])
@@ -112,6 +135,7 @@ def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     copy_notebooks()
     write_modules()
+    app.add_html_math_renderer("mathml", (inline_formula, None), (display_formula, None))
     app.connect("source-read", read)
     app.connect("autodoc-process-docstring", process)
     app.connect("build-finished", copy_explorer)

@@ -14,9 +14,26 @@ async function compile(name, features) {
   if (error) throw new Error(`kernel.ts does not compile: ${error.message}\n${stderr}`);
 }
 
+/** A WebAssembly module without its custom sections, which hold names and debug information: half of MuJoCo's. */
+function stripped(bytes) {
+  const parts = [bytes.subarray(0, 8)];
+  for (let from = 8, end; from < bytes.length; from = end) {
+    let at = from + 1, size = 0, shift = 0, byte;
+    do {
+      byte = bytes[at++];
+      size += (byte & 127) * 2 ** shift;
+      shift += 7;
+    } while (byte & 128);
+    end = at + size;
+    if (bytes[from]) parts.push(bytes.subarray(from, end));
+  }
+  return Buffer.concat(parts);
+}
+
 mkdirSync(at('dist/vendor'), { recursive: true });
 for (const path of ['index.html', 'style.css', 'src']) cpSync(at(path), at(`dist/${path}`), { recursive: true });
-for (const path of ['mujoco.js', 'mujoco.wasm']) cpSync(at(`node_modules/@mujoco/mujoco/${path}`), at(`dist/vendor/${path}`));
+cpSync(at('node_modules/@mujoco/mujoco/mujoco.js'), at('dist/vendor/mujoco.js'));
+writeFileSync(at('dist/vendor/mujoco.wasm'), stripped(readFileSync(at('node_modules/@mujoco/mujoco/mujoco.wasm'))));
 const licence = JSON.parse(readFileSync(at('node_modules/@mujoco/mujoco/package.json')));
 writeFileSync(at('dist/vendor/README.txt'), `mujoco.js and mujoco.wasm: ${licence.name} ${licence.version}, ${licence.license}\n`);
 await compile('kernel.wasm', ['simd']);

@@ -37,7 +37,7 @@ from tsmlib.study import zoo
 from tsmlib.study.models import TrainedModel, load_pretrained
 from tsmlib.study.tasks import draw_task
 
-FORMAT = 1  # of the manifest and of the files that it names; src/files.js asks for the same
+FORMAT = 2  # of the manifest and of the files that it names; src/files.js asks for the same
 PAST_LEN = 10
 TASKS = {"push": "tsm/ReacherPush-v1", "obstacle": "tsm/ReacherObstacle-v0", "reach": "tsm/Reacher-v0"}
 MODELS = ("rtsm", "tsm", "lstm", "onestep")
@@ -173,10 +173,11 @@ def write_physics(folder: Path, name: str, env: str) -> dict[str, Json]:
     return {"file": f"{name}.xml", "substeps": round(geometry.DT / model.opt.timestep), "exact": cast(Json, exact)}
 
 
-def carried(word: str, env: str) -> TrainedModel:
-    """The shipped model as the page has it: of several decoders the first. ValueError where none ships."""
-    model = load_pretrained(word, env=env)
-    return model.alone(0) if isinstance(model, RecurrentTSM) else model
+def decoders(model: TrainedModel) -> list[nn.Module]:
+    """Each decoder of a recurrent TSM as a model of its own; any other model alone."""
+    if isinstance(model, RecurrentTSM):
+        return [model.alone(k) for k in range(model.members)]
+    return [cast(nn.Module, model)]
 
 
 def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
@@ -187,14 +188,15 @@ def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
         models: dict[str, Json] = {}
         for word in MODELS:
             try:
-                model = carried(word, env)
+                model = load_pretrained(word, env=env)
             except ValueError:  # none ships
                 continue
             look = zoo.look(word)
-            models[word] = {
-                **write_network(folder, f"{spec.name}-{word}", cast(nn.Module, model)), "name": look.name,
-                "colour": look.colour, "knobs": cast(Json, strongest_codes(model, env)),
-            }  # fmt: skip
+            networks = [write_network(folder, f"{spec.name}-{word}-{k}", one) for k, one in enumerate(decoders(model))]
+            knobs = strongest_codes(model, env)
+            models[word] = cast(Json, {
+                "decoders": networks, "name": look.name, "colour": look.colour, "knobs": knobs,
+            })  # fmt: skip
         prior = write_network(folder, f"{spec.name}-prior", cast(nn.Module, load_pretrained("prior", env=env)))
         described[task] = {
             "env": env, "stateDim": spec.state_dim, "models": models, "prior": prior,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
+from scripts import run_script
 from untrained import in_units
 
 from tsmlib import study
@@ -25,6 +26,7 @@ from tsmlib.trajectory import initial_past
 sys.path.insert(0, str(runs.ROOT / "benchmarks" / "settings"))
 
 import as_published
+import decoders
 import judge
 import rows
 import spent
@@ -50,8 +52,7 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
     script, table = runs.ROOT / "benchmarks" / "settings" / f"{name}.py", tmp_path / "table.csv"
     options, columns, tries = TINY[name]
-    command = [sys.executable, script, "--scale", "smoke", "--out", str(table), *options]
-    subprocess.run(command, capture_output=True, text=True, check=True)
+    run_script(script, "--scale", "smoke", "--out", str(table), *options)
     rows = tables.records(tables.load(table))
     assert sorted({tuple(row[column] for column in columns) for row in rows}) == tries
     assert len({row["metric"] for row in rows}) * len(tries) == len(rows)
@@ -75,7 +76,7 @@ def test_a_run_is_held_against_the_published_seeds_that_are_not_its_own(
     assert "1 not compared" in capsys.readouterr().out
 
 
-def test_returns_are_those_of_plans_and_of_policies_when_they_are_lreturns(tmp_path: Path) -> None:
+def test_returns_are_those_of_plans_and_of_policies_when_they_are_learned(tmp_path: Path) -> None:
     path, returns = tmp_path / "own.csv", dict(metric="return_true")
     assert not table(path, (1, -4.0), **returns, iteration=3)
     assert not table(path, (1, -4.0), **returns, model="oracle", planner="cem")
@@ -150,3 +151,15 @@ def test_rows_take_the_place_of_those_of_the_same_model_and_method() -> None:
     found = rows.merged(published, [{**row, "value": 2.0}, {**row, "value": 3.0, "metric": "gap"}])
     kept = {(line["model"], line["seed"], line["metric"]): line["value"] for line in tables.records(found)}
     assert kept == {("tsm", 0, "cost"): 2, ("tsm", 0, "gap"): 3, ("lstm", 0, "cost"): 1, ("tsm", 1, "cost"): 1}
+
+
+def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:
+    about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0"}
+    lines = pd.DataFrame([
+        {"name": "ours", "cost": "10.0", "costs": "9 11", **about},
+        {"name": "worse", "cost": "13.0", "costs": "12 14", **about},
+        {"name": "better", "cost": "9.5", "costs": "8.5 10.5", **about},
+        {"name": "other targets", "cost": "1", "costs": "1", **about},
+    ])  # fmt: skip
+    found = decoders.compared(lines, "ours").set_index("judged by")["cost of ours minus this"]
+    assert found.to_dict() == {"better": "+0.50", "ours": "", "worse": "-3.00"}

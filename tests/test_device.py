@@ -1,4 +1,4 @@
-"""``--device``: models are trained, rolled out, planned with and lassessed in on an accelerator as on the processor."""
+"""``--device``: models are trained, rolled out, planned with and learned in on an accelerator as on the processor."""
 
 from __future__ import annotations
 
@@ -189,14 +189,14 @@ def test_it_finds_the_same_plan(planner: Planner, over: str, device: str) -> Non
 
 
 @pytest.mark.parametrize("through", ["codes", "actions"])
-def test_a_policy_lassessed_there_is_the_same_and_acts_here(through: str, device: str) -> None:
+def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: str) -> None:
     seen = motion(MODELS["tsm"], 8, 20)
     starts = seen.states[:, 0].float()
 
     def reward(target: Tensor) -> Reward:
         return lambda states, actions: -(states[..., :2] - target[:, None]).square().sum(-1)
 
-    def lassessed(place: str) -> tuple[Any, Tensor]:
+    def learned(place: str) -> tuple[Any, Tensor]:
         if through == "codes":
             policy: Any = SegmentPolicy(6, new_prior().float(), channels=8, copies=2)
         else:
@@ -210,7 +210,7 @@ def test_a_policy_lassessed_there_is_the_same_and_acts_here(through: str, device
         past = Segment(*(part[:4, :10].float() for part in seen))
         return policy, controller(policy, torch.zeros(4, 2))(past)
 
-    (there, act), (here, expected) = on(device, lassessed), on(PROCESSOR, lassessed)
+    (there, act), (here, expected) = on(device, learned), on(PROCESSOR, learned)
     assert agree(act, expected, device)
     for a, b in zip(there.cpu().parameters(), here.parameters(), strict=True):
         assert agree(a, b, device)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
 import subprocess
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -25,7 +28,7 @@ from tsmlib.models.base import rollout
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.execution import execute
-from tsmlib.planning.planners import cem
+from tsmlib.planning.planners import cem, evaluate
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
@@ -36,10 +39,11 @@ from tsmlib.study.tasks import load_task
 from tsmlib.trajectory import Segment
 
 NODE, BROWSER = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
+FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
 PAGE = ROOT / "explorer" / "dist"
 ENVS = {"push": "tsm/ReacherPush-v1", "obstacle": "tsm/ReacherObstacle-v0", "reach": "tsm/Reacher-v0"}
-DRIVEN = ("rtsm", "tsm", "lstm", "onestep")
-CARRIED = ("rtsm", "tsm", "lstm")  # beyond 50 steps the one-step model amplifies the rounding of float32, also in torch
+MODELS = ("rtsm", "tsm", "lstm", "onestep")
+STEPS = 50  # further on, contacts and the one-step model amplify the rounding of float32, also in torch
 
 pytestmark = [
     pytest.mark.skipif(NODE is None, reason="node is not installed"),
@@ -47,10 +51,10 @@ pytestmark = [
 ]
 
 
-def carried(word: str, env: str) -> Any:
-    """The shipped model as the page has it: of several decoders the first."""
+def decoders(word: str, env: str) -> list[Any]:
+    """Each decoder of a shipped model as a model of its own."""
     model = load_pretrained(word, env=env)
-    return model.alone(0) if isinstance(model, RecurrentTSM) else model
+    return [model.alone(k) for k in range(model.members)] if isinstance(model, RecurrentTSM) else [model]
 
 
 def ask(*questions: dict[str, Any]) -> list[Any]:
@@ -100,11 +104,12 @@ def test_the_arm_in_the_page_moves_as_in_python(task: str) -> None:
 def test_networks_in_the_page_predict_as_in_torch(task: str) -> None:
     frozen, questions, expected = load_task(ENVS[task]), [], []
     past = frozen.past(10)
-    for word in DRIVEN:
-        actions = torques(len(frozen), 100 if word in CARRIED else 50)
-        expected.append(rollout(carried(word, ENVS[task]), past, actions))
-        asked = {"what": "rollout", "task": task, "model": word, "pasts": as_pasts(past)}
-        questions.append(asked | {"actions": actions.flatten(1).tolist()})
+    actions = torques(len(frozen), STEPS)
+    for word in MODELS:
+        for k, decoder in enumerate(decoders(word, ENVS[task])):
+            expected.append(rollout(decoder, past, actions))
+            asked = {"what": "rollout", "task": task, "model": word, "decoder": k, "pasts": as_pasts(past)}
+            questions.append(asked | {"actions": actions.flatten(1).tolist()})
     for found, states in zip(ask(*questions), expected, strict=True):
         assert_near(found, states, 1e-4)
 
@@ -117,17 +122,29 @@ def test_codes_and_a_past_in_motion_are_read_as_in_torch() -> None:
     codes = torch.randn(8, 3, 8, generator=torch.Generator().manual_seed(1))
     asked = {"what": "rollout", "task": "push", "pasts": as_pasts(past), "codes": codes.flatten(1).tolist()}
     asked["actions"] = actions[:, 30:].flatten(1).tolist()
-    recurrent, tsm = (carried(word, ENVS["push"]) for word in ("rtsm", "tsm"))
-    assert isinstance(recurrent, RecurrentTSM)
+    recurrent, (tsm,) = (decoders(word, ENVS["push"]) for word in ("rtsm", "tsm"))
+    assert len(recurrent) == 3
     assert isinstance(tsm, TSM)
     chained, before = [], past
     for k in range(3):
         u = actions[:, 30 + 10 * k : 40 + 10 * k]
         chained.append(tsm.decode(before, u, codes[:, k]))
         before = Segment(chained[-1], u)
-    found = ask(asked | {"model": "rtsm"}, asked | {"model": "tsm"})
-    assert_near(found[0], recurrent.decode(past, actions[:, 30:], codes), 1e-4)
-    assert_near(found[1], torch.cat(chained, 1), 1e-4)
+    *found, stack = ask(*(asked | {"model": "rtsm", "decoder": k} for k in range(3)), asked | {"model": "tsm"})
+    for states, decoder in zip(found, recurrent, strict=True):
+        assert_near(states, decoder.decode(past, actions[:, 30:], codes), 1e-4)
+    assert_near(stack, torch.cat(chained, 1), 1e-4)
+
+
+@torch.no_grad()
+def test_a_candidate_is_worth_the_mean_over_the_modes_of_all_decoders() -> None:
+    task, model = load_task(ENVS["push"]).take(20), load_pretrained("rtsm", env=ENVS["push"])
+    space = LatentActions(load_pretrained("prior", env=task.env), task.horizon)  # type: ignore[arg-type]
+    codes = torch.randn(1, 20, 10, 8, generator=torch.Generator().manual_seed(3))
+    wanted = evaluate(model_predictor(model, task.past(10)), task.reward, space, codes)[0]
+    asked = {"what": "judge", "task": "push", "model": "rtsm", "pasts": as_pasts(task.past(10))}
+    (found,) = ask(asked | {"targets": task.target.tolist(), "codes": codes[0].flatten(1).tolist()})
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3)
 
 
 @torch.no_grad()
@@ -151,7 +168,7 @@ def test_a_plan_of_the_page_is_worth_what_it_is_in_python() -> None:
     )
     asked |= {"starts": frozen.start.astype(float).tolist(), "targets": frozen.target.tolist(), "seed": 1}
     (found,) = ask(asked | {"first": search})
-    model, prior = carried(word, frozen.env), load_pretrained("prior", env=frozen.env)
+    model, prior = load_pretrained(word, env=frozen.env), load_pretrained("prior", env=frozen.env)
     space, predict = LatentActions(prior, frozen.horizon), model_predictor(model, frozen.past(10))  # type: ignore[arg-type]
     executed = torch.stack([
         execute(frozen, cem(predict, frozen.reward, space, len(frozen), elites=3, seed=seed, **search)).executed_return
@@ -160,6 +177,26 @@ def test_a_plan_of_the_page_is_worth_what_it_is_in_python() -> None:
     mean, spread = float(executed.mean()), float(executed.mean(1).std())
     assert abs(np.mean([one["executed"] for one in found]) - mean) < 4 * spread
     assert all(one["success"] == (one["distance"] < frozen.tolerance) for one in found)
+
+
+def test_a_link_that_was_edited_by_hand_is_refused_in_one_sentence() -> None:
+    wrong = {
+        "task=fly": "it names a task that is none of push, obstacle, reach",
+        "model=pets": "it names a model that is none of rtsm, tsm, lstm, onestep",
+        "space=both": "its search space is neither latent nor direct",
+        "seed=1.5": "its seed is no whole number from 0 to 1,000,000,000",
+        "target=nowhere": "its target is not two numbers",
+        "target=0.1": "its target is not two numbers",
+        "block=0.1,": "its block is not two numbers",
+        "arm=0,9": "the arm does not bend that far",
+        "target=0.1,7": "its target is out of reach",
+        "block=0.1,-7": "its object lies outside the walls",
+        "arm=0,0&block=0.1,0": "its object overlaps the arm",
+    }
+    (found,) = ask({"what": "link", "links": ["", "#task=reach&seed=7", *wrong]})
+    assert found[:2] == ["", ""]
+    said = "This link cannot be restored: {}. Here is the first scene instead."
+    assert found[2:] == [said.format(what) for what in wrong.values()]
 
 
 @pytest.fixture
@@ -196,10 +233,104 @@ def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
         explorer.server(tmp_path)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed")
+def test_a_notebook_shows_the_page_where_it_is_served_and_else_how_to_serve_it(address: str) -> None:
+    assert explorer.frame(port=int(address.rpartition(":")[2].strip("/"))).src == address  # type: ignore[union-attr]
+    assert "make explorer" in str(explorer.frame(port=1).data)  # type: ignore[union-attr]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="Chromium is not installed; the page is tried in it")
 def test_a_person_can_use_the_page(address: str) -> None:
     """Drag, plan, plan again, switch, tour, link, keys, a small dark screen, what cannot work: see page.mjs."""
     command = [str(NODE), str(ROOT / "explorer" / "test" / "page.mjs"), address]
     env = {**os.environ, "CHROMIUM": str(BROWSER)}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+class Firefox:
+    """A page in Firefox without a window, by its Marionette protocol: length:[type, id, name, arguments]."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = connected(port)
+        self.stream = self.socket.makefile("rb")
+        self._read()  # it says what it is
+        self.ask("WebDriver:NewSession")
+        self.ask("WebDriver:SetTimeouts", script=120_000, pageLoad=120_000)
+
+    def ask(self, name: str, **arguments: Any) -> Any:
+        message = json.dumps([0, 1, name, arguments]).encode()
+        self.socket.sendall(str(len(message)).encode() + b":" + message)
+        _, _, error, result = self._read()
+        assert error is None, error
+        return result
+
+    def script(self, text: str) -> Any:
+        return self.ask("WebDriver:ExecuteScript", script=text, args=[])["value"]
+
+    def errors(self) -> list[str]:
+        """What the browser's console says of pages of this machine, warnings aside."""
+        self.ask("Marionette:SetContext", value="chrome")
+        found = self.script(
+            "return Services.console.getMessageArray().filter(m => m instanceof Ci.nsIScriptError && !(m.flags & 1)"
+            " && m.sourceName.includes('127.0.0.1')).map(m => m.errorMessage)"
+        )
+        self.ask("Marionette:SetContext", value="content")
+        return list(found)
+
+    def _read(self) -> Any:
+        length = b""
+        while (byte := self.stream.read(1)) != b":":
+            assert byte, "Firefox closed the connection"
+            length += byte
+        return json.loads(self.stream.read(int(length)))
+
+
+def connected(port: int) -> socket.socket:
+    for _ in range(600):
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=150)
+        except ConnectionRefusedError:
+            time.sleep(0.2)
+    raise AssertionError("Firefox did not start")
+
+
+@contextmanager
+def firefox(folder: Path) -> Iterator[Firefox]:
+    """A Firefox with a profile of its own, where nobody wants motion."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    folder.mkdir()
+    settings = {"marionette.port": port, "ui.prefersReducedMotion": 1}
+    (folder / "user.js").write_text("".join(f'user_pref("{name}", {value});\n' for name, value in settings.items()))
+    command = [str(FIREFOX), "--headless", "--marionette", "-remote-allow-system-access", "--profile", str(folder)]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield Firefox(port)
+    finally:
+        running.terminate()
+        running.wait(60)
+
+
+@pytest.mark.skipif(FIREFOX is None, reason="Firefox is not installed; the page is tried in it")
+def test_the_page_plans_in_firefox(address: str, tmp_path: Path) -> None:
+    with firefox(tmp_path / "profile") as page:
+        page.ask("WebDriver:Navigate", url=address)
+
+        def wait_for(condition: str) -> None:
+            for _ in range(600):
+                if page.script(f"return Boolean({condition})"):
+                    return
+                time.sleep(0.2)
+            raise AssertionError(page.script("return document.body.innerText"))
+
+        wait_for("document.body.dataset.ready === 'yes'")
+        for change in ("", "document.getElementById('replan').click();"):
+            page.script(f"{change} document.getElementById('plan').click()")
+            wait_for("!document.getElementById('numbers').hidden")
+            assert page.script("return document.getElementById('clock').textContent") == "2.00 s"
+        executed = page.script("return document.getElementById('executed-return').textContent")
+        assert -40 < float(executed.replace("−", "-")) < 0
+        assert page.script("return document.querySelectorAll('#returns .try').length") == 2
+        assert page.script("return document.getElementById('notice').hidden")
+        assert page.errors() == []

@@ -15,6 +15,7 @@ from torch import Tensor
 import tsmlib as tsm
 from tsmlib.models.base import rollout, stepper
 from tsmlib.planning.mbrl_lib import ForModelEnv, MbrlModel, model_env, never, reward_function, transition_batch
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.rewards import reach
 from tsmlib.trajectory import Segment, initial_past
 
@@ -98,6 +99,17 @@ def test_its_mode_is_the_mean_of_the_members_at_every_step(changes: dict[str, An
     torch.testing.assert_close(states, torch.stack(expected, 1))
 
 
+def test_planners_see_the_mode_of_every_member() -> None:
+    model = MbrlModel(stand_in())
+    past = Segment(torch.ones(1, 1, DX), torch.zeros(1, 1, DU))
+    modes = model_predictor(model, past)(torch.ones(1, 1, 4, DU))[:, 0, 0]  # (members, 4, dx)
+    for member, states in enumerate(modes):
+        x = torch.ones(DX)
+        for step in states:
+            x = x + torch.cat([x, torch.ones(DU)]) @ model.theirs.model.weight[member]
+            torch.testing.assert_close(step, x)
+
+
 def test_a_sample_keeps_its_member_and_elites_alone_predict() -> None:
     def row(member: int) -> Tensor:
         x, found = some_past().states[0, -1], []
@@ -126,7 +138,8 @@ def test_our_planners_plan_through_it(make: Callable[..., Any], planner: Callabl
     predict = tsm.model_predictor(MbrlModel(make()), past)
     budget = {"candidates": 40, "iterations": 6} if planner is tsm.cem else {"iterations": 20}
     plan = planner(predict, nearer, tsm.DirectActions(8, action_dim=DU), 2, **budget)
-    nothing = nearer(predict(torch.zeros(1, 2, 8, DU))[0], torch.zeros(1, 2, 8, DU)).sum(-1)[0]
+    zero = torch.zeros(1, 2, 8, DU)
+    nothing = nearer(predict(zero), zero).sum(-1).mean(0)[0]  # over the members
     assert (plan.predicted_return > nothing).all()
 
 

@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
     publish.add_argument("--seed", default="0")
     publish.add_argument("--claims", action="store_true", help="only judge the claims again, from the tables that ship")
+    publish.add_argument("--table", default="", help="only the table of this notebook, for example your_own")
     arguments = parser.parse_args(argv)
     try:
         match arguments.command:
@@ -62,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             case "bench":
                 return _bench(arguments.name)
             case "publish":
-                return _publish(arguments.seed, claims=arguments.claims)
+                return _publish(arguments.seed, claims=arguments.claims, table=arguments.table)
             case _:
                 return _run(arguments)
     except parameters.ParameterError as error:
@@ -148,14 +149,21 @@ def _verify(path: Path) -> int:
     return 0
 
 
-def _publish(seed: str, *, claims: bool) -> int:
+def _publish(seed: str, *, claims: bool, table: str) -> int:
     from tsmlib.study import publish
 
     _require_checkout("publish")
     if claims:
         publish.publish_claims()
         return 0
-    publish.publish(runs.resolve("publish", scale="paper", seed=parameters.convert("seed", seed)))  # type: ignore[arg-type]
+    run = runs.resolve("publish", scale="paper", seed=parameters.convert("seed", seed))  # type: ignore[arg-type]
+    if table:
+        pooled = {name: each.stem for name, each in runs.notebooks().items() if each.stem in publish.POOLED}
+        if table not in pooled:
+            raise parameters.ParameterError(f"no table is called {table!r:.80}; there are {', '.join(pooled)}.")
+        publish.publish_table(run, pooled[table])
+        return 0
+    publish.publish(run)
     return 0
 
 

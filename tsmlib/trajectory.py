@@ -145,6 +145,20 @@ class Trajectories:
             terminated=tuple(np.array(self.terminated)[index].tolist()) if self.terminated else (),
         )
 
+    def joined(self, other: Trajectories) -> Trajectories:
+        """The episodes of both, padded to the longest; TrajectoryError where they are not of one robot."""
+        for name in ("env", "dt", "names", "units", "angles"):
+            if (ours := getattr(self, name)) != (theirs := getattr(other, name)):
+                raise TrajectoryError(f"episodes with {name} {ours} and {theirs} cannot be joined; expected one robot")
+        both, longest = (self, other), max(self.horizon, other.horizon)
+        states = [np.pad(t.states, ((0, 0), (0, longest - t.horizon), (0, 0)), mode="edge") for t in both]
+        actions = [np.pad(t.actions, ((0, 0), (0, longest - t.horizon), (0, 0))) for t in both]
+        ended = [t.terminated or (False,) * len(t) for t in both]
+        return replace(
+            self, states=np.concatenate(states), actions=np.concatenate(actions), terminated=ended[0] + ended[1],
+            lengths=tuple(np.concatenate([t.steps for t in both]).tolist()),
+        )  # fmt: skip
+
     def cut(self, steps: int) -> Trajectories:
         """The first ``steps`` steps of every episode that has as many; TrajectoryError where none has."""
         among = np.flatnonzero(self.steps >= steps)

@@ -44,7 +44,7 @@ def main() -> None:
     known = list(csv.DictReader(arguments.out.open(newline=""))) if arguments.out.exists() else []
     for folder in arguments.folders:
         for path in sorted(folder.glob("*.safetensors")):
-            if path.stem in zoo.words("dynamics", "ablation", "choice"):
+            if path.stem.partition("_")[0] in zoo.words("dynamics", "ablation", "choice"):  # budgets.py adds what it is
                 known += [line for line in lines(path) if line not in known]
     with arguments.out.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

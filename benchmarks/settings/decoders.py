@@ -1,55 +1,52 @@
-"""Planning through the modes of several recurrent decoders, each from a file of its own: do errors that a plan exploits
-average out, and how well must each decoder be trained for that?
+"""Planning through models from files: do errors that a plan exploits average out over several decoders, how well must
+each be trained for that, and what does more training buy a baseline?
 
     python benchmarks/settings/decoders.py --name "three, full budget" --files a.safetensors b.safetensors c.safetensors
+    python benchmarks/settings/decoders.py --compare "three, full budget"
 
 The cross-entropy method over codes of the prior, 96 x 10, on validation targets, executed open loop; a candidate is
-judged by its mean return over the decoders' modes. A line in decoders.csv per call: validation loss of each decoder,
-cost with its standard error, share within 5 cm, what the judge promised beyond the executed return, and the costs of
-the single targets, for paired differences.
+judged by its mean return over the modes of all files' models. A line in decoders.csv per call: cost with its standard
+error, share within 5 cm, what the judge predicted beyond the executed return, and the costs of the single targets.
+--compare prints the table: the cost of that line minus those of the others, paired by target, with half the 95 % t
+interval over targets. ``budgets.py`` trains such files.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
+from typing import cast
 
+import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
 from tsmlib import study
-from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.models.base import Model
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.storage import artifacts
-from tsmlib.study import runs
+from tsmlib.study import runs, zoo
 from tsmlib.study.models import load_prior
+from tsmlib.study.results import table
 
 HERE = Path(__file__).resolve().parent
-COLUMNS = ("name", "decoders", "targets", "cpu_seconds", "cost", "cost_sem", "within_5cm", "gap_judge", "costs")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--name", required=True, help="of the line")
-    parser.add_argument("--files", nargs="+", type=Path, required=True, help="models, each with one decoder or several")
-    parser.add_argument("--env", default="tsm/ReacherPush-v1")
-    parser.add_argument("--targets", type=int, default=50, help="of the 100 of validation (default 50)")
-    parser.add_argument(
-        "--out", type=Path, default=HERE / "decoders.csv", help="default decoders.csv beside this script"
-    )
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    task = study.task(given.env, "validation").take(given.targets)
-    prior = load_prior(runs.resolve("05_control", scale="laptop"), given.env)
-    through = [
-        model_predictor(model, task.past(model.past_len))
-        for model in (artifacts.load_model(path, RecurrentTSM) for path in given.files)
-    ]
+def load(path: Path) -> Model:
+    """The model in a file, of the class that the file names."""
+    return cast(Model, artifacts.load_model(path, zoo.find(artifacts.read_header(path)["model"]).load()))
+
+
+def planned(name: str, files: list[Path], env: str, n_targets: int) -> dict[str, object]:
+    """A line of the table."""
+    task = study.task(env, "validation").take(n_targets)
+    prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
+    through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
 
     def modes(actions: Tensor) -> Tensor:
         return torch.cat([predict(actions) for predict in through])
@@ -59,21 +56,55 @@ def main() -> None:
     plan = cem(modes, task.reward, space, len(task), candidates=96, elites=9, iterations=10, seed=0)
     trial = execute(task, plan)
     cost = -trial.executed_return
-    row = {
-        "name": given.name, "decoders": str(len(plan.states)), "targets": str(len(task)),
+    return {
+        "name": name, "decoders": len(plan.states), "targets": len(task),
         "cpu_seconds": f"{time.process_time() - began:.0f}", "cost": f"{cost.mean():.4g}",
         "cost_sem": f"{cost.std() / len(task) ** 0.5:.3g}",
         "within_5cm": f"{(trial.final_distance < task.tolerance).float().mean():.3g}",
         "gap_judge": f"{(plan.predicted_return - trial.executed_return).mean():.3g}",
         "costs": " ".join(f"{value:.3f}" for value in cost.tolist()),
     }  # fmt: skip
-    new = not given.out.exists()
-    with given.out.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-    print({name: value for name, value in row.items() if name != "costs"})
+
+
+def compared(lines: pd.DataFrame, name: str) -> pd.DataFrame:
+    """The lines of as many targets as line ``name`` has, the cheapest first, with the paired difference to it."""
+    costs = {other: np.array(texts.split(), float) for other, texts in zip(lines["name"], lines["costs"], strict=True)}
+    same = lines[[len(costs[other]) == len(costs[name]) for other in lines["name"]]]
+    same = same.sort_values("cost", key=lambda texts: texts.astype(float))
+    minus = [
+        "" if other == name else table.spell(costs[name] - costs[other], "{:+.2f} ± {:.2f}") for other in same["name"]
+    ]
+    return pd.DataFrame({
+        "judged by": same["name"], "cost": same["cost"] + " ± " + same["cost_sem"],
+        "within 5 cm": [f"{float(share):.0%}" for share in same["within_5cm"]],
+        "predicted beyond executed": same["gap_judge"], f"cost of {name} minus this": minus,
+    })  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--name", help="of the line that is added")
+    what.add_argument("--compare", metavar="NAME", help="print the table, every line against this one")
+    parser.add_argument("--files", nargs="+", type=Path, default=[], help="models, each with one decoder or several")
+    parser.add_argument("--env", default="tsm/ReacherPush-v1")
+    parser.add_argument("--targets", type=int, default=50, help="of the 100 of validation (default 50)")
+    parser.add_argument(
+        "--out", type=Path, default=HERE / "decoders.csv", help="default decoders.csv beside this script"
+    )
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    lines = pd.read_csv(given.out, dtype=str) if given.out.exists() else pd.DataFrame({"name": []})
+    if given.compare:
+        if given.compare not in set(lines["name"]):
+            parser.error(f"{given.out} has no line {given.compare!r}; it has: {', '.join(lines['name'])}")
+        print(table.markdown(compared(lines, given.compare)))
+        return
+    if not given.files:
+        parser.error("--name wants --files: the models that a candidate is judged by")
+    line = planned(given.name, given.files, given.env, given.targets)
+    pd.concat([lines, pd.DataFrame([line])]).to_csv(given.out, index=False)
+    print({name: value for name, value in line.items() if name != "costs"})
 
 
 if __name__ == "__main__":

@@ -219,15 +219,17 @@ function show() {
   $('time').setAttribute('aria-valuetext', $('clock').textContent);
   const marks = outside(scene, about());
   $('outside').hidden = !marks.length;
-  $('outside').textContent = marks.length ? `Outside the training data: ${marks.join('; ')}. Expect the model to be wrong.` : '';
+  $('outside').textContent = marks.length ? `Outside the training data: ${marks.join('; ')}. The model may be wrong there.` : '';
   $('outcome').setAttribute('aria-busy', String(planning)); // a screen reader waits for the outcome
-  $('numbers').hidden = !done;
+  $('numbers').hidden = $('meaning').hidden = !done;
+  $('legend').textContent = legend();
   if (done) {
     $('predicted-return').textContent = signed(done.predicted);
     $('executed-return').textContent = signed(done.executed);
     $('gap').textContent = signed(Number(done.predicted.toFixed(2)) - Number(done.executed.toFixed(2))); // as the two above it say
     $('distance').textContent = `${(100 * done.distance).toFixed(1)} cm`;
   }
+  $('guide-result').textContent = done ? `Here: predicted return ${$('predicted-return').textContent}, executed ${$('executed-return').textContent}, gap ${$('gap').textContent}; ends ${$('distance').textContent} from the target.` : '';
   $('verdict').className = `verdict ${done ? (done.success ? 'good' : 'bad') : ''}`;
   $('verdict').textContent = verdict();
   const knobs = model.knobs, usable = knobs.length > 0 && done && !scene.replan;
@@ -236,18 +238,34 @@ function show() {
     $(`knob-name-${k}`).innerHTML = `<var>z</var><sub>${knobs.length ? knobs[k] + 1 : k + 1}</sub>`;
     $(`knob-value-${k}`).textContent = signed(Number($(`knob-${k}`).value), 1);
   });
-  $('knob-hint').textContent = knobs.length ? (scene.replan ? 'For a plan that is made once.' : 'In red: the same torques under another code.') : `The ${MODELS[scene.model]} has no code: it predicts one future.`;
+  $('knob-hint').textContent = knobs.length ? turned() : `The ${MODELS[scene.model]} has no code: it predicts one future.`;
   history.replaceState(null, '', toLink(scene));
   redraw();
+}
+
+/** What is drawn, in words. */
+function legend() {
+  const { scene } = state, what = { push: ' Brown: the object; dashed: where it starts.', obstacle: ' Grey disc: the obstacle.', reach: '' }[scene.task];
+  const fan = look(scene.model).knobs.length ? ` Thin lines: 32 sampled futures of the ${scene.task === 'push' ? 'object' : 'fingertip'}.` : '';
+  return `Red ring: the target.${what} Pale arm: its start.${fan}`;
+}
+
+/** What the knobs do. */
+function turned() {
+  const { scene } = state, many = look(scene.model).decoders.length > 1;
+  if (scene.replan) return 'For a plan that is made once.';
+  if (!state.result?.done) return 'Two of its eight numbers, which the planner does not search. Plan first, then turn them.';
+  return `Two of its eight numbers, in all segments; not what the planner searches. Red: the future of the same torques under this code${many ? ', by the first of its three networks' : ''}.`;
 }
 
 function verdict() {
   const { scene, result, planning } = state, done = result?.done;
   if (planning && result?.parts.length) {
-    const { candidates, ms } = result.parts.at(-1);
-    return `Executing and planning again: ${candidates} candidates in ${Math.round(ms)} ms.`;
+    const { candidates, iterations, ms } = result.parts.at(-1);
+    return `Executing and planning again: ${candidates} × ${iterations} candidates in ${Math.round(ms)} ms.`;
   }
-  if (planning) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} promised so far.` : 'Planning…';
+  if (planning) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} predicted so far.` : 'Planning…';
+  if (!done && state.tries.length) return 'Other settings: press Plan, or drag the target.';
   if (!done) return scene.task === 'push' ? 'Drag the target, the object or the fingertip; or press Plan.' : 'Drag the target or the fingertip; or press Plan.';
   const how = scene.replan ? 'planned again every ten steps' : 'open loop: planned once, executed without looking';
   const cm = `${Math.round(100 * about().tolerance)} cm`, what = scene.task === 'push' ? 'The object' : 'The fingertip';
@@ -407,7 +425,7 @@ function visit(k) {
 function options() {
   const fill = (id, entries) => $(id).replaceChildren(...entries.map(([value, text]) => new Option(text, value)));
   fill('task', Object.keys(state.manifest.tasks).map(task => [task, TASKS[task]]));
-  fill('model', Object.keys(about().models).map(word => [word, { tsm: 'TSM (the paper’s)', rtsm: 'recurrent TSM (ours, one decoder)' }[word] ?? MODELS[word]]));
+  fill('model', Object.keys(about().models).map(word => [word, { tsm: 'TSM (the paper’s)', rtsm: 'recurrent TSM (ours)' }[word] ?? MODELS[word]]));
 }
 
 function copyLink() {

@@ -5,6 +5,9 @@ export const CAPACITY = 64; // rows, a multiple of 4
 
 export class Kernel {
   static async load(reader = read) {
+    if (!globalThis.WebAssembly) {
+      throw new PageError('This browser lacks WebAssembly, or it is switched off; allow it, or open the page in Firefox 89, Chrome 91, Safari 16.4 or newer.');
+    }
     const fused = new Uint8Array(await reader('kernel-fused.wasm'));
     const bytes = WebAssembly.validate(fused) ? fused : new Uint8Array(await reader('kernel.wasm'));
     if (!WebAssembly.validate(bytes)) {

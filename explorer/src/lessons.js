@@ -12,28 +12,35 @@ export const LESSONS = [
     math: math('P of X plus given X minus, U minus, U plus and Z',
       `${i('P')}${o('(')}${sup('X', '+')}${o('|')}${sup('X', '−')}${o(',')}${sup('U', '−')}${o(',')}${sup('U', '+')}${o(',')}${i('Z')}${o(')')}`),
     text: 'A segment model predicts the next ten states X⁺ as a whole, from the ten before, the torques before, and the torques '
-      + 'to come U⁺. Chained, ten segments make two seconds. A one-step model predicts one state at a time.',
+      + 'to come U⁺. Chained, ten segments make two seconds. Here these are the TSM of the paper and our recurrent TSM, which for '
+      + 'pushing is three networks: plans are judged by their mean, and the arm shows the first. The one-step model and the LSTM '
+      + 'predict one state after the other.',
   },
   {
     title: '2. Code',
     math: math('Z is drawn from a standard normal distribution', `${i('Z')}${o('∼')}${i('N')}${o('(')}<mn>0</mn>${o(',')}${i('I')}${o(')')}`),
-    text: 'All that the model does not know about a segment is in its code Z, eight numbers. Z = 0 is drawn as the arm. The fan '
-      + 'is 32 futures with random codes: where it is wide, the model doubts. A model without codes cannot doubt.',
+    text: 'Past and torques do not decide everything: a slightly different touch sends the object elsewhere. What the model cannot '
+      + 'know it takes from eight random numbers for each segment, the code Z: another code, another future. The prediction '
+      + 'drawn as the arm has Z\u00a0=\u00a00; the thin lines are 32 futures with random codes. Where they spread, the model is uncertain. '
+      + 'The one-step model and the LSTM have no code, so they give one future and cannot say how sure they are.',
   },
   {
     title: '3. Prior',
-    math: math('Maximise over the codes z 1 to z K the expected sum of rewards, with torques from the action prior',
-      `<munder><mi>max</mi><mrow>${sub('z', '1')}<mo>…</mo>${sub('z', 'K')}</mrow></munder>${i('E')}<mo>[</mo><munder><mo>∑</mo><mi>t</mi></munder>`
-      + `${reward(sub('x', 't'), sub('u', 't'))}<mo>]</mo>${o(',')}<mspace width="0.6em"/>${sub('u', 't')}${o('∼')}${i('P')}${o('(')}${sub('u', 't')}${o('|')}${sub('u', '1:t−1')}${o(',')}${i('Z')}${o(')')}`),
-    text: 'The planner tries 64 plans, keeps the best, and tries again around them (CEM). Searching codes of an action prior (Eq. 3) '
-      + 'it can only find torques like those of the training data; searching torques (Eq. 2) it can find any.',
+    math: math('Maximise over the codes c 1 to c K the expected sum of rewards, with torques from the action prior',
+      `<munder><mi>max</mi><mrow>${sub('c', '1')}<mo>…</mo>${sub('c', 'K')}</mrow></munder>${i('E')}<mo>[</mo><munder><mo>∑</mo><mi>t</mi></munder>`
+      + `${reward(sub('x', 't'), sub('u', 't'))}<mo>]</mo>${o(',')}<mspace width="0.6em"/>${sub('u', 't')}${o('∼')}${i('P')}${o('(')}${sub('u', 't')}${o('|')}${sub('u', '1:t−1')}${o(',')}${i('c')}${o(')')}`),
+    text: 'The planner tries 64 plans in the model, keeps the best, and tries again around them, six times (cross-entropy method). '
+      + 'What it searches is your choice. The action prior is a second model: it turns codes c of its own, not the Z above, into torques '
+      + 'like those of the training data. Searching its codes, the planner finds only such torques; searching the torques themselves, it finds any.',
   },
   {
     title: '4. Exploitation',
     math: math('Gap: the sum of rewards of predicted states minus the sum of rewards of executed states',
       `<munder><mo>∑</mo><mi>t</mi></munder>${reward(hat, sub('u', 't'))}<mo>−</mo><munder><mo>∑</mo><mi>t</mi></munder>${reward(sub('x', 't'), sub('u', 't'))}`),
-    text: 'A plan is chosen because its prediction is good, so the search finds the model’s mistakes. The gap between predicted '
-      + 'and executed return says how much the model was fooled: a dot below the diagonal promised more than it got.',
+    text: 'A plan is chosen because its prediction is good, so the search finds the model’s mistakes: the model is fooled when a '
+      + 'plan leads to torques or states that are rare in its training data, where a wrong prediction can look better than the '
+      + 'truth. The gap, predicted minus executed return, says by how much: the third scene of the tour has a large one. A '
+      + 'negative gap is the other mistake, a model that was too pessimistic.',
   },
 ];
 
@@ -46,26 +53,26 @@ export const TOUR = [
   },
   {
     title: 'A bounce',
-    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=-3.1,2&target=0.17,-0.08&block=0.13,0.05',
+    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.53,-0.4&target=-0.15,-0.1&block=0.17,-0.01',
     text: 'Here the object meets a wall and bounces off it. What happens then depends on the last millimetre, so the thin lines '
-      + 'spread: the model says that it is less sure, and the execution falls among its futures rather than on their middle.',
+      + 'spread: the model is less certain, and the execution falls among its futures rather than on their middle.',
   },
   {
     title: 'A fooled one-step model',
     link: '#task=push&model=onestep&space=direct&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
     text: 'The first scene again, with a model that predicts one state at a time, and a planner free to choose any torques. It found '
-      + 'a plan that the model likes and the arm does not follow: the predicted return is far above the executed one.',
+      + 'a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
   },
   {
     title: 'What the prior forbids',
     link: '#task=push&model=onestep&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
     text: 'Same start, same one-step model, but the planner searches codes of the action prior. Torques unlike the training data, '
-      + 'which fooled the model, are out of its reach: what was promised is what is got.',
+      + 'which fooled the model, are out of its reach: what was predicted is what is executed.',
   },
   {
     title: 'Planning again',
-    link: '#task=push&model=rtsm&space=latent&replan=1&seed=1&arm=1.3,0.4&target=0.15,0.09&block=-0.11,-0.05',
-    text: 'A long way round. One plan, executed without looking, misses by 12 cm (untick “Plan again” and see). Looking every ten '
+    link: '#task=push&model=rtsm&space=latent&replan=1&seed=1&arm=-1.68,-2.45&target=-0.02,-0.12&block=0.04,0.09',
+    text: 'A long way round. One plan, executed without looking, misses by about 10 cm (untick “Plan again” and see). Looking every ten '
       + 'steps (0.2 s) and planning the rest anew, it ends far nearer; how near depends on the candidates this machine has time for.',
   },
 ];

@@ -69,18 +69,18 @@ export class Direct {
 /**
  * Cross-entropy method (planners.py): sample around a mean, refit it to the elites, keep the best ever seen.
  *
- * judge(rows, parameters) -> returns, rows a multiple of 4 up to CAPACITY. Yields after each iteration, so that whoever
- * asks can show it or stop; its last value is { parameters, value }.
+ * judge(rows, parameters) -> promise of returns, rows a multiple of 4 up to CAPACITY. Yields after each iteration, so
+ * that whoever asks can show it or stop; its last value is { parameters, value }.
  */
-export function* cem(space, judge, { start = new Float32Array(space.size), candidates = CAPACITY, iterations = 6, elites = Math.max(2, Math.floor(candidates / 10)), keep = 0.1, seed = 0 } = {}) {
+export async function* cem(space, judge, { start = new Float32Array(space.size), candidates = CAPACITY, iterations = 6, elites = Math.max(2, Math.floor(candidates / 10)), keep = 0.1, seed = 0 } = {}) {
   const n = space.size, draw = normal(seed), noise = new Float32Array(n);
   const mean = Float64Array.from(start), deviation = new Float64Array(n).fill(space.scale);
-  const judgeOne = parameters => {
+  const judgeOne = async parameters => {
     const four = new Float32Array(4 * n);
     for (let row = 0; row < 4; row++) four.set(parameters, row * n);
-    return judge(4, four)[0];
+    return (await judge(4, four))[0];
   };
-  let best = { parameters: Float32Array.from(start), value: judgeOne(start) };
+  let best = { parameters: Float32Array.from(start), value: await judgeOne(start) };
   const update = (parameters, value) => {
     if (value > best.value || !Number.isFinite(best.value)) best = { parameters: Float32Array.from(parameters), value };
   };
@@ -91,8 +91,8 @@ export function* cem(space, judge, { start = new Float32Array(space.size), candi
       for (let i = 0; i < n; i++) parameters[row * n + i] = mean[i] + deviation[i] * noise[i];
     }
     if (iteration) parameters.set(best.parameters, 0);
-    const found = judge(candidates, parameters);
-    const worst = Math.min(0, ...found.filter(Number.isFinite)); // a candidate on which the model diverges
+    const found = await judge(candidates, parameters);
+    const worst = Math.min(0, ...found.filter(Number.isFinite)); // a candidate on which the model diverges, or that was sorted out
     const order = [...found.keys()].sort((a, b) => (Number.isFinite(found[b]) ? found[b] : worst) - (Number.isFinite(found[a]) ? found[a] : worst));
     for (let i = 0; i < n; i++) {
       let average = 0, square = 0;
@@ -103,7 +103,7 @@ export function* cem(space, judge, { start = new Float32Array(space.size), candi
     }
     const top = order[0];
     if (Number.isFinite(found[top])) update(parameters.subarray(top * n, (top + 1) * n), found[top]);
-    const value = judgeOne(mean);
+    const value = await judgeOne(mean);
     if (Number.isFinite(value)) update(mean, value);
     yield { iteration: iteration + 1, value: best.value };
   }

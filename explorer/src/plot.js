@@ -1,5 +1,5 @@
 // Predicted against executed return of the last tries, as SVG.
-const NS = 'http://www.w3.org/2000/svg', SIZE = 260, LEFT = 40, BELOW = 34, TOP = 8;
+const NS = 'http://www.w3.org/2000/svg', SIZE = 260, LEFT = 48, BELOW = 34, TOP = 8;
 
 function element(name, attributes, text = '') {
   const found = document.createElementNS(NS, name);
@@ -27,7 +27,7 @@ export function drawReturns(svg, tries) {
   }
   svg.append(
     element('path', { d: `M${x(low)} ${y(low)}L${x(high)} ${y(high)}`, class: 'equal' }),
-    element('text', { x: LEFT + wide, y: y(low) - 8, 'text-anchor': 'end', class: 'note' }, 'promised more than it got'),
+    element('text', { x: LEFT + wide - 4, y: y(low) - 8, 'text-anchor': 'end', class: 'note' }, 'predicted more than was executed'),
     element('text', { x: LEFT + wide / 2, y: SIZE - 4, 'text-anchor': 'middle' }, 'predicted return'),
     element('text', { x: 0, y: 0, 'text-anchor': 'middle', transform: `translate(11 ${TOP + tall / 2}) rotate(-90)` }, 'executed return'),
   );
@@ -39,6 +39,6 @@ export function drawReturns(svg, tries) {
   });
   const below = tries.filter(({ predicted, executed }) => predicted > executed).length;
   svg.setAttribute('aria-label', tries.length
-    ? `Predicted against executed return of the last ${tries.length} tries; ${below} promised more than they got.`
+    ? `Predicted against executed return of the last ${tries.length} tries; ${below} predicted more than was executed.`
     : 'Predicted against executed return; no tries yet.');
 }

@@ -63,7 +63,7 @@ export function flipped(scene, arm) {
 
 /** What of a scene lies outside the starts and targets that the training and test data are drawn from, in words. */
 export function outside({ task, arm, block, target }, { start, target: ring }) {
-  const cm = v => `${Math.round(100 * v)}`, found = [], far = Math.hypot(...target);
+  const cm = v => (100 * v).toFixed(1), found = [], far = Math.hypot(...target);
   if (far < ring[0] - 1e-9 || far > ring[1] + 1e-9) found.push(`the target is ${cm(far)} cm from the shoulder (${cm(ring[0])} to ${cm(ring[1])} in the data)`);
   if (block) {
     const from = Math.hypot(...block), what = task === 'push' ? 'object' : 'obstacle';

@@ -6,6 +6,7 @@ import { loadMujoco } from './physics.js';
 import { Library, attempt, imagine } from './session.js';
 
 const BUDGET = 150; // ms for a later plan: 0.2 s of arm time, less what the prediction and the drawing take
+const HELPERS = 3; // more workers at most, where there are so many processors
 let current = 0, kept = null;
 
 const pause = () => new Promise(resolve => { setTimeout(resolve); }); // lets messages in
@@ -13,10 +14,30 @@ const fail = error => postMessage({
   type: 'error', message: error instanceof PageError ? error.message : `Something went wrong (${error.message}); reload the page.`,
 });
 
+/** Another worker as a function (question, rows, parameters) -> promise of returns; it answers in order. */
+function helper(files) {
+  const waiting = [], worker = new Worker(new URL('./helper.js', import.meta.url), { type: 'module' });
+  worker.onmessage = ({ data: { values, message } }) => {
+    const { resolve, reject } = waiting.shift();
+    if (values) resolve(values);
+    else reject(new PageError(message));
+  };
+  worker.onerror = () => { // what it does not answer any more, this worker does itself
+    files.helpers = [];
+    for (const { reject } of waiting) reject(new PageError('A part of the planner stopped; reload the page.'));
+  };
+  return (...question) => new Promise((resolve, reject) => {
+    waiting.push({ resolve, reject });
+    worker.postMessage(question);
+  });
+}
+
 const library = (async () => {
   const manifest = await readManifest();
   const mujoco = import('../vendor/mujoco.js').then(({ default: factory }) => loadMujoco(factory));
-  return { manifest, library: await Library.load(manifest, await mujoco) };
+  const found = await Library.load(manifest, mujoco);
+  found.helpers = Array.from({ length: Math.min(HELPERS, navigator.hardwareConcurrency - 1) }, () => helper(found));
+  return { manifest, library: found };
 })();
 
 library.then(({ manifest }) => postMessage({ type: 'ready', manifest }), fail);
@@ -40,10 +61,10 @@ onmessage = async ({ data }) => {
     }
     if (data.type === 'load') {
       const { library: files } = await library;
-      await Promise.all([files.network(data.task, data.model), files.network(data.task, 'prior'), files.world(data.task)]);
+      await Promise.all([files.model(data.task, data.model), files.prior(data.task), files.world(data.task)]);
       postMessage({ type: 'loaded' });
     }
-    if (data.type === 'imagine' && kept?.id === data.id && kept.net.about.codes) {
+    if (data.type === 'imagine' && kept?.id === data.id && kept.decoder.about.codes) {
       postMessage({ type: 'imagined', id: data.id, from: kept.from, states: imagine(kept, data.knobs, data.values) });
     }
   } catch (error) {

@@ -1,9 +1,10 @@
 // node test/engine.mjs < questions.json > answers.json: what the page computes, for tests in Python to compare.
-// Each question is { what: 'physics' | 'rollout' | 'decode' | 'plan', task, ... }; see the functions below.
+// Each question is { what: 'physics' | 'rollout' | 'decode' | 'judge' | 'plan' | 'link', task, ... }; see the functions below.
 import { readFileSync } from 'node:fs';
 import { readManifest } from '../dist/src/files.js';
 import { loadMujoco } from '../dist/src/physics.js';
-import { Library, attempt } from '../dist/src/session.js';
+import { Library, attempt, evaluate } from '../dist/src/session.js';
+import { fromLink } from '../dist/src/scene.js';
 import factory from '../dist/vendor/mujoco.js';
 
 const reader = async path => {
@@ -22,40 +23,53 @@ async function physics({ task, starts, actions }) {
   });
 }
 
-/** { model, pasts (N of { states, actions }), actions (N, T * 2), codes (N, K * dz)? } -> states (N, T * dx) */
-async function rollout({ task, model, pasts, actions, codes }) {
-  const net = await library.network(task, model);
+const asPast = ({ states, actions }) => ({ states: Float32Array.from(states), actions: Float32Array.from(actions) });
+
+/** { model, decoder?, pasts (N of { states, actions }), actions (N, T * 2), codes (N, K * dz)? } -> states (N, T * dx) */
+async function rollout({ task, model, decoder = 0, pasts, actions, codes }) {
+  const net = (await library.model(task, model))[decoder];
   return pasts.map((past, i) => {
-    const T = actions[i].length / 2, given = { states: Float32Array.from(past.states), actions: Float32Array.from(past.actions) };
-    const states = net.rollout(4, given, repeated(actions[i], 4), T, codes ? repeated(codes[i], 4) : null);
+    const T = actions[i].length / 2, states = net.rollout(4, asPast(past), repeated(actions[i], 4), T, codes ? repeated(codes[i], 4) : null);
     return [...states.subarray(0, states.length / 4)];
   });
 }
 
 /** { past (10 * 2), codes (N, K * dz) } -> actions (N, K H * 2) */
 async function decode({ task, past, codes }) {
-  const prior = await library.network(task, 'prior');
+  const prior = await library.prior(task);
   return codes.map(code => {
     const actions = prior.decode(4, Float32Array.from(past), repeated(code, 4));
     return [...actions.subarray(0, actions.length / 4)];
   });
 }
 
-/** { model, space, replan, starts, targets, seed, first?, again? } -> [{ predicted, executed, distance, success, ms }] */
+/** { model, pasts, targets, codes (N, K * dz) } -> returns (N), the mean over the modes of all decoders */
+async function judge({ task, model, pasts, targets, codes }) {
+  const which = [...library.manifest.tasks[task].models[model].decoders.keys()], { horizon } = library.manifest.tasks[task];
+  return Promise.all(pasts.map(async (past, i) => {
+    const question = { task, model, space: 'latent', past: asPast(past), horizon, target: targets[i], which };
+    return (await evaluate(library, question, 4, repeated(codes[i], 4)))[0];
+  }));
+}
+
+/** { model, space, replan, starts, targets, seed, first?, again? } -> [{ predicted, executed, distance, success, ms, cpu }], ms: of each plan; cpu: seconds */
 async function plan({ task, model, space, replan = false, starts, targets, seed, first, again }) {
   const found = [];
   for (const [i, start] of starts.entries()) {
-    const scene = { task, model, space, replan, start, target: targets[i], seed: seed + i }, ms = [];
+    const scene = { task, model, space, replan, start, target: targets[i], seed: seed + i }, ms = [], began = process.cpuUsage();
     for await (const event of attempt(library, scene, { first, again })) {
       if (event.type === 'part') ms.push(event.ms);
-      if (event.type === 'done') found.push({ ...event, ms });
+      if (event.type === 'done') found.push({ ...event, ms, cpu: process.cpuUsage(began).user / 1e6 });
     }
   }
   return found;
 }
 
+/** { links } -> what the page says of each; nothing of one that it restores */
+const link = ({ links }) => links.map(one => fromLink(one, library.manifest).problem);
+
 const answers = [];
 for (const question of JSON.parse(readFileSync(0))) {
-  answers.push(await { physics, rollout, decode, plan }[question.what](question));
+  answers.push(await { physics, rollout, decode, judge, plan, link }[question.what](question));
 }
 process.stdout.write(JSON.stringify(answers));

@@ -1,16 +1,16 @@
 // node test/look.mjs URL FOLDER: pictures of the page at two widths, light and dark, after one plan.
-import { chromium } from 'playwright-core';
+import { launch, planned, ready } from './browser.mjs';
 
 const [url, folder] = process.argv.slice(2);
-const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: ['--no-sandbox', '--disable-gpu'] });
+const browser = await launch();
 for (const [width, height, colorScheme] of [[1440, 900, 'light'], [390, 844, 'light'], [1440, 900, 'dark'], [390, 844, 'dark']]) {
   const page = await browser.newPage({ viewport: { width, height }, colorScheme, reducedMotion: 'reduce' });
   page.on('console', message => console.log(message.type(), message.text()));
   page.on('pageerror', error => console.log('error', error.message));
   await page.goto(url);
-  await page.waitForSelector('body[data-ready=yes]', { timeout: 120000 });
+  await ready(page);
   await page.click('#plan');
-  await page.waitForSelector('#numbers:not([hidden])', { timeout: 120000 });
+  await planned(page);
   console.log(await page.textContent('#verdict'), await page.textContent('#numbers'));
   await page.screenshot({ path: `${folder}/${width}-${colorScheme}.png`, fullPage: true });
   await page.close();

@@ -13,8 +13,6 @@ import operator
 import os
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Unpack
@@ -38,6 +36,7 @@ from tsmlib.envs.geometry import (
     capsule_length,
     fingertip,
 )
+from tsmlib.envs.mujoco_bulk import without_log
 from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
@@ -142,17 +141,6 @@ def _add_walls(spec: mujoco.MjSpec) -> None:
         )  # fmt: skip
 
 
-@contextmanager
-def _without_log() -> Iterator[None]:
-    """MuJoCo's warnings go nowhere, so that it writes no MUJOCO_LOG.TXT: `_check` reports what went wrong."""
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
-
-
 class MujocoArm(ArmVectorEnv):
     """N arms in MuJoCo. ``threads`` simulate at once (default: the CPU cores there are, at most 8)."""
 
@@ -212,7 +200,7 @@ class MujocoArm(ArmVectorEnv):
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
             position = np.concatenate([obstacle, np.full((len(obstacle), 1), PLANE)], axis=1)
             control = np.concatenate([control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2)
-        with _without_log():
+        with without_log():
             physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
         warned = physics[:, -1, 0] == physics[:, -2, 0]
         return physics[:, self.frame_skip - 1 : -1 : self.frame_skip].copy(), warned
@@ -235,7 +223,7 @@ class MujocoArm(ArmVectorEnv):
         mujoco.mj_setState(self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         if self.task == "obstacle":
             data.mocap_pos[0] = (*self._obstacle[episode], PLANE)
-        with _without_log():
+        with without_log():
             for action in np.repeat(actions, self.frame_skip, axis=0):
                 data.ctrl[:] = action
                 mujoco.mj_step(self.model, data)

@@ -81,7 +81,7 @@ class Bulk:
         """States (n, T frame_skip + 1, ...) from ``starts`` (n, ...) on, under actions (n, T, du) as the robot gets."""
         first, warm = starts[:, : self._size], starts[:, self._size :]
         control = np.repeat(actions.astype(np.float64), self.frame_skip, axis=1)
-        with _without_log():
+        with without_log():
             states, _ = self._pool.rollout(self.model, self._data, first, control, initial_warmstart=warm)
         return np.concatenate([first[:, None], states], axis=1)
 
@@ -190,8 +190,8 @@ def _model_bytes(model: Any) -> bytes:
 
 
 @contextmanager
-def _without_log() -> Iterator[None]:
-    """MuJoCo's warnings write no MUJOCO_LOG.TXT; where it stopped, the episode is stepped, which says so."""
+def without_log() -> Iterator[None]:
+    """MuJoCo's warnings go nowhere, so that it writes no MUJOCO_LOG.TXT; who asks for this reports what went wrong."""
     import mujoco
 
     handler = mujoco.get_mju_user_warning()

@@ -13,6 +13,7 @@ from __future__ import annotations
 import secrets
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any, Protocol
 
 import gymnasium
@@ -21,7 +22,7 @@ from gymnasium.spaces import Box, Space
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-from tsmlib.envs.mujoco_bulk import CHUNK, Mismatch
+from tsmlib.envs.mujoco_bulk import CHUNK, Mismatch, without_log
 from tsmlib.envs.snapshots import Snapshot, Step, abilities, play, restore, save
 from tsmlib.envs.spec import EnvSpec
 
@@ -86,12 +87,19 @@ def make_simulation(env_id: str, n: int, *, returns: bool = False) -> Simulation
         EnvSpec.parse(env_id)  # a variant of an arm is registered by this
     if gymnasium.spec(env_id).vector_entry_point is not None:
         return simulation(gymnasium.make_vec(env_id, num_envs=n))
-    first = gymnasium.make(env_id, disable_env_checker=True)
+    first = make(env_id)
     require_supported(env_id, first.observation_space, first.action_space)
     if abilities(first).restores:
         return Stepping([first], n, returns=returns)
-    more = (gymnasium.make(env_id, disable_env_checker=True) for _ in range(n - 1))
+    more = (make(env_id) for _ in range(n - 1))
     return Stepping([first, *more], returns=returns)
+
+
+def make(env_id: str) -> gymnasium.Env:
+    """The environment of an id. What MuJoCo has to say of Gymnasium's own robots, whose files are old, is left out."""
+    quiet = str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco")
+    with without_log() if quiet else nullcontext():
+        return gymnasium.make(env_id, disable_env_checker=True)
 
 
 def require_supported(env_id: str, observations: Space, actions: Space) -> tuple[Box, Box]:
@@ -389,7 +397,7 @@ def continued(env_id: str, seeds: Sequence[int], actions: np.ndarray) -> Steppin
 
     UnsupportedEnvironment where its state cannot be set, so that it cannot be tried what would follow.
     """
-    one = gymnasium.make(env_id, disable_env_checker=True)
+    one = make(env_id)
     require_supported(env_id, one.observation_space, one.action_space)
     known = abilities(one)
     if not known.restores:

@@ -111,9 +111,15 @@ class Adapted:
         return step
 
 
+class EnsembleModel:
+    """A model with ``members``, of which each row of a rollout takes one: see ``sampling.draw_members``."""
+
+    members: int
+
+
 def members(model: Model) -> int:
-    """Members of an ensemble, of which a rollout takes one; 1 for any other model."""
-    return int(getattr(model, "members", 1))
+    """Members of an ensemble, each of which has a mode of its own; 1 for any other model."""
+    return model.members if isinstance(model, EnsembleModel) else 1
 
 
 def as_dynamics(model: Model) -> DynamicsModel:

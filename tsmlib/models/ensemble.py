@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.models.base import Step
+from tsmlib.models.base import EnsembleModel, Step
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Featured, Features
 from tsmlib.sampling import Noise, draw_members, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class Ensemble(Featured, Configured):
+class Ensemble(Featured, Configured, EnsembleModel):
     """PETS: networks that differ in their first weights and in the order of their data, each stating a Gaussian.
 
     gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the

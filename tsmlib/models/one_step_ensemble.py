@@ -6,18 +6,18 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from tsmlib.sampling import Noise, standard_normal
+from tsmlib.models.base import EnsembleModel
+from tsmlib.sampling import Noise, draw_members, standard_normal
 from tsmlib.trajectory import Segment
 
 
-class OneStepEnsemble(ABC):
+class OneStepEnsemble(EnsembleModel, ABC):
     """M one-step networks as a ``SegmentModel``, by trajectory sampling with a fixed member (TS-inf of PETS).
 
     A row draws its member at the beginning of a segment and keeps it, 100 steps long.
     """
 
     segment_len, past_len, stochastic = 100, 1, True
-    members: int
 
     @abstractmethod
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -33,8 +33,7 @@ class OneStepEnsemble(ABC):
         if generator is None:
             rows = torch.arange(n_rows, device=start.device).expand(self.members, -1)
         else:
-            member = (self.members * torch.special.ndtr(standard_normal((n_rows,), generator, start))).long()
-            member = member.clamp(max=self.members - 1)
+            member = draw_members(self.members, n_rows, generator, start)
             groups = [(member == m).nonzero()[:, 0] for m in range(self.members)]
             rows = pad_sequence(groups, batch_first=True, padding_value=-1)  # (M, R), -1 where a group is shorter
         real, rows = rows >= 0, rows.clamp(min=0)

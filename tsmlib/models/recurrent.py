@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.models.base import Step
+from tsmlib.models.base import EnsembleModel, Step
 from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.energy import distance, energy_score
 from tsmlib.models.features import Featured, Features
@@ -51,7 +51,7 @@ class Decoder(nn.Module):
         return Recurrent.of(features, **layers)
 
 
-class RecurrentTSM(Featured, Configured):
+class RecurrentTSM(Featured, Configured, EnsembleModel):
     """Recurrent segment model of one environment.
 
     state_dim, action_dim: dx, du. angles: state dimensions in radians. members: decoders. hidden: size of h and c.
@@ -104,7 +104,7 @@ class RecurrentTSM(Featured, Configured):
         shares = self._shares(x, generator)
         codes = x.new_zeros(len(x), self.latent_dim)
 
-        def code(share: Tensor) -> Tensor:
+        def code(share: Tensor | slice) -> Tensor:
             return codes if generator is None else codes[share]
 
         steps = [
@@ -128,8 +128,8 @@ class RecurrentTSM(Featured, Configured):
         shares = self._shares(x, generator)
         z = self._codes(x, actions.shape[1], generator)
         states = [
-            chunked(partial(self._decode, k), *(part[share] for part in (*past, actions, z)))
-            for k, share in enumerate(shares)
+            chunked(partial(self._decode, decoder), *(part[share] for part in (*past, actions, z)))
+            for decoder, share in zip(self._decoders(), shares, strict=True)
         ]
         return self._joined(states, shares, generator)
 
@@ -139,30 +139,28 @@ class RecurrentTSM(Featured, Configured):
         z: (B, dz), of the first H steps, or (B, n, dz), of the first n times H; z = 0 after them. Codes of several
         decoders do not mean the same, so it is the first that decodes.
         """
-        return chunked(partial(self._decode, 0), *past, actions, z if z.ndim == 3 else z[:, None])
+        return chunked(partial(self._decode, self._decoders()[0]), *past, actions, z if z.ndim == 3 else z[:, None])
 
-    def _decode(self, k: int, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
-        decoder = self._decoders()[k]
+    def _decode(self, decoder: Recurrent, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         return self._run(decoder, states[:, -1], decoder.read(Segment(states, before)), actions, z)
 
     def _decoders(self) -> list[Recurrent]:
         return [cast(Decoder, decoder).over(self.features) for decoder in self.decoders]
 
-    def _shares(self, x: Tensor, generator: Noise | None) -> list[Tensor]:
+    def _shares(self, x: Tensor, generator: Noise | None) -> list[Tensor | slice]:
         """The rows (B_k,) of each decoder: all of them for the mode, which is the decoders' mean."""
-        rows = torch.arange(len(x), device=x.device)
         if generator is None or self.members == 1:
-            return [rows] * self.members
+            return [slice(None)] * self.members
         member = draw_members(self.members, len(x), generator, x)
         return [(member == k).nonzero()[:, 0] for k in range(self.members)]
 
-    def _joined(self, states: list[Tensor], shares: list[Tensor], generator: Noise | None) -> Tensor:
+    def _joined(self, states: list[Tensor], shares: list[Tensor | slice], generator: Noise | None) -> Tensor:
         """The decoders' states as rows (B, ..., dx)."""
         if self.members == 1:
             return states[0]
         if generator is None:
             return torch.stack(states).mean(0)
-        return torch.cat(states)[torch.cat(shares).argsort()]
+        return torch.cat(states)[torch.cat(cast(list[Tensor], shares)).argsort()]
 
     def point_loss(self, window: Window, generator: Noise) -> Tensor:
         """|m - x|, m the mode (z = 0) of a decoder, of each H steps as a whole, and the mean of these."""

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import functools
 import http.server
+import urllib.request
 import webbrowser
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tsmlib.study.runs import ROOT, RunError
+
+if TYPE_CHECKING:
+    from IPython.display import IFrame, Markdown
 
 PAGE = ROOT / "explorer" / "dist"
 PORT = 8765
@@ -58,3 +63,19 @@ def serve(*, port: int = PORT, browser: bool = False) -> None:
         if browser:
             webbrowser.open(address)
         running.serve_forever()
+
+
+def frame(*, port: int = PORT) -> IFrame | Markdown:
+    """The page in a frame, for the last line of a notebook's cell; where nothing serves it, how to serve it."""
+    from IPython.display import IFrame, Markdown
+
+    address = f"http://127.0.0.1:{port}/"
+    try:
+        with urllib.request.urlopen(address, timeout=2):
+            return IFrame(address, width="100%", height=900)
+    except OSError:
+        return Markdown(
+            "The explorer is not served on this machine. In a checkout of the repository, build it once with "
+            "`make explorer` (which takes node and npm), leave `python -m tsmlib explore` running in a terminal, and "
+            f"run this cell again; or open {address} in a browser then."
+        )

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
 import pandas as pd
 import torch
+from gymnasium.spaces import Box
 from IPython.display import Markdown, display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from tsmlib import figures, rewards
+from tsmlib.envs import drawing
 from tsmlib.envs.render import draw_scene
+from tsmlib.envs.stepping import within_bounds
 from tsmlib.evaluation import latent
 from tsmlib.evaluation.futures import Coded
 from tsmlib.figures.method import Method
@@ -70,8 +73,11 @@ def show_table(
 def film(task: Task, trial: Trial, target: int) -> np.ndarray:
     """Frames (T, height, width, 3) of one target: the predicted rollout beside the executed one.
 
-    Of a trial behind noisy sensors that was not planned: the observed states beside the true ones.
+    Of a trial behind noisy sensors that was not planned: the observed states beside the true ones. Of a robot that
+    cannot be drawn from its observations (``envs.drawing``): the execution alone, by its own ``render``.
     """
+    if task.seeds and not drawing.drawable(task.env):
+        return figures.side_by_side({"executed": _rendered(task, trial, target)})
     titles = "predicted", "executed"
     if trial.plan is None and trial.observed is not None:
         titles = "observed", "true"
@@ -131,18 +137,42 @@ def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: in
 
 def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
     """A film of each rollout (T, dx)."""
+    if task.seeds:  # not an arm
+        return [drawing.frames(task.env, states) for states in rollouts]
     return [_frames(task.env, states, task.target[target].numpy()) for states in rollouts]
 
 
 def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Each of the states (T, dx) drawn."""
+    """Each of the states (T, dx) of an arm drawn."""
     env: Any = gymnasium.make_vec(env_id, num_envs=1).unwrapped
     frames = np.stack([env.image(state, target) for state in states])
     env.close()
     return frames
 
 
+def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:
+    """The episode of one target stepped again, a picture after each step. RuntimeError where there are no pictures."""
+    try:
+        env = gymnasium.make(task.env, render_mode="rgb_array", disable_env_checker=True)
+        env.reset(seed=task.seeds[target])
+        frames: list[Any] = []
+        for action in within_bounds(trial.actions[target].numpy(), cast(Box, env.action_space)):
+            _, _, terminated, truncated, _ = env.step(action)
+            frames.append(env.render())
+            if terminated or truncated:
+                break
+        env.close()
+        return np.stack(frames)
+    except Exception as error:  # of whatever library it renders with
+        raise RuntimeError(
+            f"{task.env} gives no pictures here: {error!s:.200}. It needs what its render_mode='rgb_array' needs; of "
+            "MuJoCo's, without a screen, OpenGL by the environment variable MUJOCO_GL=egl or osmesa"
+        ) from error
+
+
 def _rollouts(trial: Trial, target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Predicted and executed states (T, dx), to the end of the episode."""
     if trial.plan is None:
         raise ValueError("these actions were not planned, so there is no predicted rollout")
-    return trial.plan.states[0, target].numpy(), trial.states[target, 1:].numpy()
+    steps = trial.lengths[target] if trial.lengths else trial.states.shape[1] - 1
+    return trial.plan.states[0, target, :steps].numpy(), trial.states[target, 1 : steps + 1].numpy()

@@ -20,6 +20,7 @@ from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results import prediction as prediction_results
+from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
 from tsmlib.study.runs import ROOT, Run
@@ -37,6 +38,7 @@ POOLED = (
     "04_latent",
     "06_robustness",
     "07_action_prior",
+    "09_your_own",
 )  # tables that ship with all seeds
 
 
@@ -66,6 +68,13 @@ def publish(run: Run) -> None:
     publish_claims()
 
 
+def publish_table(run: Run, notebook: str) -> None:
+    """Copy the table of one notebook of POOLED, with all its seeds, into data/; rewrite what is said of the results."""
+    require(run, notebook)
+    tables_storage.save(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    publish_claims()
+
+
 def _ships(path: Path) -> bool:
     """Not checkpoints, nor models that only a table needs: of the paper's choices, of the map of imperfect arms, and
     ensembles, which are large, of the pymunk arm."""
@@ -77,8 +86,11 @@ def _ships(path: Path) -> bool:
 
 def pooled(run: Run) -> dict[str, pd.DataFrame]:
     """Notebook -> the rows of this run and of every seed beside it. RunError where one did not come to its end."""
-    own = {notebook: tables_storage.load(run.metrics / f"{notebook}.csv") for notebook in POOLED}
-    return {notebook: study.pooled_rows(replace(run, notebook=notebook), rows) for notebook, rows in own.items()}
+    return {notebook: _pooled(run, notebook) for notebook in POOLED}
+
+
+def _pooled(run: Run, notebook: str) -> pd.DataFrame:
+    return study.pooled_rows(replace(run, notebook=notebook), tables_storage.load(run.metrics / f"{notebook}.csv"))
 
 
 def publish_claims() -> None:
@@ -139,7 +151,25 @@ def readme_results() -> str:
 *Published rows of `{env}`; means over training seeds (of predicting / of planning), half the 95 % t interval; -: no
 rows yet. Predicting: {episodes:,} test episodes, 90 steps open loop; error as a share of the data's deviation (nRMSE),
 likelihood in nats per step. Planning: {targets} targets, CEM over codes; the share is 1 for plans through the true
-simulator, 0 for doing nothing; the gap is the mean size of predicted minus executed return.*"""
+simulator, 0 for doing nothing; the gap is the mean size of predicted minus executed return.*
+{readme_costs(env)}"""
+
+
+def readme_costs(env: str) -> str:
+    """One sentence: what plans of each method cost, the cheapest first; and the longer training of OURS."""
+    rows = _shipped("05_control_rows")
+    costs = planning_results.paired_table(rows, env, OURS)
+    said = ", ".join(f"{line['method'].look.name} {line['cost (m)']}" for line in costs.to_dict("records"))
+    seeds = ", ".join(str(seed) for seed in sorted(planning_results.chosen(rows, env=env)["seed"].unique()))
+    closed = planning_results.chosen(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
+    again, hits = (table.values(table.select(closed, metric=metric)) for metric in ("return_true", "success"))
+    loops = ", ".join(f"`{model}` {-found.mean():.2f} ({hits[model].mean():.0%})" for model, found in again.items())
+    return (
+        f"Costs (m, seed {seeds}): {said}; planned again every ten steps (ending within 5 cm): {loops}. For pushing "
+        f"`{OURS}` has three decoders, each trained as long as a baseline; on validation targets one decoder is level "
+        "with the LSTM, and three baselines judging together [plan as well](benchmarks/settings/README.md). "
+        "[Target by target](docs/results.md#pushing-target-by-target)."
+    )
 
 
 def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
@@ -198,8 +228,9 @@ def results_page() -> str:
 {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
 observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
 seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
-of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`). `pets` is the same
-kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`).
+of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`), but `{OURS}` of
+pushing, which has three decoders, each trained that long. `pets` is the same kind of model as `ensemble`, by mbrl-lib
+(`benchmarks/peers`).
 
 {scores}
 
@@ -211,6 +242,13 @@ over steps.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
+## Pushing, target by target
+
+The cross-entropy method over codes; the cost of `{OURS}` and its size of the gap minus those of each other method on
+the same targets, with half the 95 % t interval over targets, of one training seed:
+
+{table.markdown(planning_results.paired_table(_shipped("05_control_rows"), PUSH, OURS))}
+
 ## Planning again every ten steps, pushing
 
 {planning_results.loops_table(control)}
@@ -220,4 +258,35 @@ over steps.
 Learned inside the models, and model-free ones in the environment; means of the last record
 over k copies or seeds, with half the 95 % t interval.
 
-{policies_results.policies_table(policies_results.learning_curves(learned))}"""
+{policies_results.policies_table(policies_results.learning_curves(learned))}
+
+{robots_page(_shipped("09_your_own"))}"""
+
+
+def robots_page(rows: pd.DataFrame) -> str:
+    """Scores and plans of the robots of 09_your_own; empty without rows."""
+    if not len(rows):
+        return ""
+    seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    return f"""## Robots that no one here made
+
+Written from the rows that `python -m tsmlib run your_own --scale paper` made, training seed {seeds};
+`python -m tsmlib publish --table your_own` copies them. Data are smooth random actions, collected by the package:
+no data set of Minari's was downloaded, and `load_minari` reads one in their place. All models of a robot were trained
+for the same CPU time; energy score and nRMSE are open loop after ten observed steps, in standardised units, lower is
+better.
+
+{robots_results.scores_table(rows)}
+
+{robots_results.sentences(rows)}
+
+Plans, closed loop, by the environment's own reward; the oracle is the same planner through the true simulator, from
+the first n of the same starts, which may be harder or easier than all. Success is to end upright, within 18 degrees;
+the hopper's episodes end where it falls, after the steps that are said:
+
+{robots_results.plans_table(rows)}
+
+Model-free learners as [RL Baselines3 Zoo]({robots_results.SOURCE}) published them, one run each, on version 3 of the
+MuJoCo robots and over whole episodes; they were not run here:
+
+{robots_results.model_free_table()}"""

@@ -279,6 +279,31 @@ def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def paired_table(found: pd.DataFrame, env: str, subject: str) -> pd.DataFrame:
+    """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
+    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets.
+    found: rows with a ``target``."""
+    every = {method: rows for method, rows in returns(found, env).items() if method.search_space != "direct"}
+    ours = next((rows for method, rows in every.items() if method.model == subject), None)
+    lines = []
+    for method, rows in sorted(every.items(), key=lambda each: _cost(each[1]).mean()):
+        line = {"method": method, "cost (m)": f"{_cost(rows).mean():.2f}"}
+        if ours is not None and rows is not ours:
+            line[f"cost of {subject} minus this"] = table.spell(_cost(ours) - _cost(rows), "{:+.2f} ± {:.2f}")
+            if rows["predicted"] is not None:
+                line["the same of the size of the gap"] = table.spell(_gap(ours) - _gap(rows), "{:+.2f} ± {:.2f}")
+        lines.append(line | {"n": len(_cost(rows))})
+    return pd.DataFrame(lines)
+
+
+def _cost(rows: Mapping[str, np.ndarray | None]) -> np.ndarray:
+    return -cast(np.ndarray, rows["true"])
+
+
+def _gap(rows: Mapping[str, np.ndarray | None]) -> np.ndarray:
+    return np.abs(cast(np.ndarray, rows["predicted"]) - cast(np.ndarray, rows["true"]))
+
+
 @table.sourced
 def convergence_table(found: pd.DataFrame) -> pd.DataFrame:
     """Iterations of planners to 95 % of what they gain in the end, in Markdown, from rows with a ``target``."""

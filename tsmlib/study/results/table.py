@@ -189,7 +189,7 @@ def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
     if figure and beside(found).empty:  # at scale paper it is what will be published
         known |= set(found["env"])
     if missing := [env for env in found["env"].unique() if env and env not in known]:
-        names = ", ".join(EnvSpec.parse(env).name for env in missing)
+        names = ", ".join(EnvSpec.parse(env).name if env.startswith("tsm/") else env for env in missing)
         said.append(f"of {names} nothing is published")
     return "; ".join(said)
 

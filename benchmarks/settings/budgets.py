@@ -1,0 +1,70 @@
+"""One training for another share of its budget, or at another rate of Muon: what would more time, or less, buy?
+
+    python benchmarks/settings/budgets.py lstm --times 3 --muon 0.01
+    python benchmarks/settings/budgets.py rtsm --times 0.3333 --seed 2
+
+trains on the data of scale paper, seed 0, and their symmetric copies; a recurrent TSM has one decoder. Model and
+checkpoints go to the run's folder ``settings`` (``TSM_RUN_DIR``); stopped, it goes on from there. ``curve.py`` makes
+the lines of the table from such a folder, ``decoders.py`` plans with the models.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import asdict, replace
+
+import torch
+
+from tsmlib.envs import fingerprint
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.symmetry import copies, symmetric
+from tsmlib.storage import artifacts
+from tsmlib.study import runs, zoo
+from tsmlib.study.data import dataset
+from tsmlib.training.fit import TrainingOptions, fit
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", help="word of a dynamics model")
+    parser.add_argument("--env", default="tsm/ReacherPush-v1")
+    parser.add_argument("--times", type=float, default=1.0, help="the budget (default 1)")
+    parser.add_argument("--muon", type=float, help="rate of Muon (default: that of the study)")
+    parser.add_argument("--seed", type=int, default=0, help="of the weights and the order of the data (default 0)")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    run, spec, env = runs.resolve("02_train", scale="paper", seed=0), zoo.find(given.model), EnvSpec.parse(given.env)
+    data, held_out = dataset(run, given.env, "train"), dataset(run, given.env, "validation")
+    if (symmetries := copies(given.env)) > 1:
+        data = symmetric(data)
+    one = {"members": 1} if given.model == "rtsm" else {}
+    net = spec.load().for_data(data, seed=given.seed, **{**spec.arguments(env), **one})
+    stages = spec.schedule(env, given.times)
+    if given.muon is not None:
+        stages = [replace(stage, muon=given.muon) for stage in stages]
+    name = f"{given.model}_{given.times:g}_{stages[0].muon:g}_{given.seed}"
+    path, curves = run.folder(f"settings/{env.name}") / f"{name}.safetensors", {}
+    for key, stage in zip(zoo.keys(stages), stages, strict=True):
+        options = TrainingOptions(
+            past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr, bf16=stage.bf16,
+            muon=stage.muon, weight_decay=stage.weight_decay, patience=stage.patience, span=stage.span,
+            batch_size=stage.batch, validate_every=250,
+        )  # fmt: skip
+        curve = fit(
+            net, getattr(net, stage.loss), data, held_out, options, seed=given.seed,
+            checkpoint=path.with_name(f"{name}-{key}.checkpoint"), progress=f"{name}: {key}",
+        )  # fmt: skip
+        curves[key] = asdict(curve)
+        print(f"{name} {key}: {stage.steps} updates, validation loss {min(curve.validation):.3g}", flush=True)
+    artifacts.save_model(path, net, {
+        "fingerprint": fingerprint(given.env), "model": given.model, "seed": given.seed, "curves": curves,
+        "schedule": [stage.stated() for stage in stages], "symmetries": symmetries, "scale": "paper",
+        "torch": torch.__version__, "finished": time.strftime("%Y-%m-%d"),
+        "seconds": sum(curve["seconds"][-1] for curve in curves.values()),
+    })  # fmt: skip
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

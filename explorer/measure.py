@@ -1,0 +1,204 @@
+"""Measurement of the explorer against what it is to reach; the table of docs/explorer.md.
+
+    python explorer/measure.py [--targets 100] [parity] [plans] [closed] [page] [table]
+
+parity: largest differences of the page from Python, over the 100 frozen starts of pushing, and CPU time of a try.
+plans: returns of open-loop plans for the frozen targets, in the page and in Python with the same settings.
+closed: success of closed loops over random scenes.
+page: times, sizes and accessibility in Chromium, by test/measure.mjs.
+
+Each is kept in measured.json, from which ``table`` writes. The page must be built; all but ``page`` ask it in node.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from tsmlib import statistics
+from tsmlib.collection import smooth_torques
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import rollout
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.planning.execution import Trial, execute, mpc
+from tsmlib.planning.planners import cem, reevaluate
+from tsmlib.planning.predictors import fresh_predictor, model_predictor
+from tsmlib.planning.search_spaces import LatentActions
+from tsmlib.planning.tasks import Task
+from tsmlib.storage import files
+from tsmlib.study import explorer
+from tsmlib.study.models import load_pretrained
+from tsmlib.study.tasks import draw_task, load_task
+
+HERE = Path(__file__).parent
+MEASURED = HERE / "measured.json"
+PAGE = HERE.parent / "docs" / "explorer.md"
+ENV = "tsm/ReacherPush-v1"
+OPEN = {"candidates": 64, "iterations": 6}  # src/session.js
+AGAIN = {"candidates": 64, "iterations": 4}
+FEWEST = {"candidates": 12, "iterations": 4}  # to which a slow machine falls back
+SEEDS = 4  # of Python's planner
+DRAGS = 22  # seed of the random scenes
+
+
+def ask(*questions: dict[str, Any]) -> list[Any]:
+    """The answers of test/engine.mjs."""
+    command = ["node", str(HERE / "test" / "engine.mjs")]
+    done = subprocess.run(command, input=json.dumps(questions), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def of_pushing() -> tuple[RecurrentTSM, ActionPrior]:
+    model, prior = (load_pretrained(word, env=ENV) for word in ("rtsm", "prior"))
+    assert isinstance(model, RecurrentTSM)
+    assert isinstance(prior, ActionPrior)
+    return model, prior
+
+
+def parity() -> dict[str, Any]:
+    """Largest absolute differences: states of the decoders after 50 steps of torques, and of MuJoCo after 100."""
+    task, (model, _) = load_task(ENV), of_pushing()
+    actions = smooth_torques(len(task), 100, generator=torch.Generator().manual_seed(5))
+    env: Any = gymnasium.make_vec(ENV, num_envs=len(task)).unwrapped
+    env.reset(options={"states": task.start})
+    true = env.rollout(actions.numpy())
+    asked = {"what": "physics", "task": "push", "starts": task.start.astype(float).tolist()}
+    (found,) = ask(asked | {"actions": actions.flatten(1).tolist()})
+    physics = np.abs(np.array(found).reshape(true.shape) - true)[..., [0, 1, 4, 5, 6, 7]].max()
+    past, actions, worst = task.past(10), actions[:, :50], 0.0
+    pasts = [{"states": x.flatten().tolist(), "actions": u.flatten().tolist()} for x, u in zip(*past, strict=True)]
+    asked = {"what": "rollout", "task": "push", "model": "rtsm", "pasts": pasts}
+    answers = ask(*(asked | {"decoder": k, "actions": actions.flatten(1).tolist()} for k in range(model.members)))
+    for k, found in enumerate(answers):
+        expected = rollout(model.alone(k), past, actions).numpy()
+        difference = np.abs(np.array(found).reshape(expected.shape) - expected)
+        worst = max(worst, float(difference[..., [0, 1, 4, 5, 6, 7]].max()))
+    cpu = in_page(task.take(10), seed=1, first=OPEN)["cpu"]
+    return {"n": len(task), "physics": float(physics), "model": worst, "cpu": cpu}
+
+
+def plans(targets: int) -> dict[str, Any]:
+    task, (model, prior) = load_task(ENV).take(targets), of_pushing()
+    space, predict = LatentActions(prior, task.horizon), model_predictor(model, task.past(10))
+    python = []
+    for seed in range(SEEDS):
+        plan = cem(predict, task.reward, space, len(task), elites=6, seed=seed, **OPEN)
+        plan = reevaluate(plan, fresh_predictor(model, task.past(10), seed=seed + 1), task.reward)
+        python.append(said(execute(task, plan)) | {"predicted": float(plan.predicted_return.mean())})
+    return {"n": len(task), "python": python, "page": [in_page(task, seed=1000 * k, first=OPEN) for k in (1, 2)]}
+
+
+def closed(targets: int) -> dict[str, Any]:
+    task, (model, prior) = draw_task(ENV, seed=DRAGS, n=targets), of_pushing()
+    space, start = LatentActions(prior, task.horizon), model_predictor(model, task.past(10))
+    first = cem(start, task.reward, space, len(task), elites=6, **OPEN)
+    found = {"n": len(task), "page": in_page(task, seed=1, first=OPEN, again=FEWEST, replan=True)}
+    return found | {"python": said(mpc(task, model, space, partial(cem, elites=6, **AGAIN), plan=first))}
+
+
+def in_page(task: Task, **asked: Any) -> dict[str, float]:
+    """Means over the targets of a task, planned and executed in the page's own code with a full search."""
+    asked |= {"what": "plan", "task": "push", "model": "rtsm", "space": "latent"}
+    (found,) = ask(asked | {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()})
+    return {word: float(np.mean([one[word] for one in found])) for word in ("predicted", "executed", "success", "cpu")}
+
+
+def said(trial: Trial) -> dict[str, float]:
+    assert trial.success is not None
+    return {"executed": float(trial.executed_return.mean()), "success": float(trial.success.float().mean())}
+
+
+def page() -> dict[str, Any]:
+    with explorer.server(port=0) as running:
+        thread = threading.Thread(target=running.serve_forever)
+        thread.start()
+        command = ["node", str(HERE / "test" / "measure.mjs"), f"http://127.0.0.1:{running.server_port}/"]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+        running.shutdown()
+        thread.join()
+    done.check_returncode()
+    return json.loads(done.stdout) | {"load": round(os.getloadavg()[0], 1), "processors": os.cpu_count()}
+
+
+def table(measured: dict[str, Any]) -> None:
+    """Write the table of docs/explorer.md, with a dash for what has not been measured."""
+    found = "| what | to reach | measured |\n|---|---|---|\n"
+    found += "".join(f"| {' | '.join(row)} |\n" for row in rows(measured))
+    text = PAGE.read_text()
+    pattern = r"(?s)(<!-- table -->\n).*?(<!-- end of table -->)"
+    files.write_bytes(PAGE, re.sub(pattern, lambda match: f"{match[1]}\n{found}\n{match[2]}", text).encode())
+
+
+def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
+    seen, near, open_loop, loops = (measured.get(part) for part in ("page", "parity", "plans", "closed"))
+    found = []
+    if seen:
+        seconds = {word: f"{seen[word] / 1000:.2f} s" for word in ("ready_ms", "plan_ms", "plan_least_ms", "replan_ms")}
+        found += [
+            ("ready after load", "2 s", f"{seconds['ready_ms']} (median of {seen['loads']})"),
+            ("open-loop plan, 64 candidates x 6", "1.0 s",
+             f"{seconds['plan_ms']} (median of {seen['plans']}, the fastest {seconds['plan_least_ms']})"),
+            ("longest task of the main thread", "50 ms", f"{seen['longest_task_ms']:.0f} ms of CPU"),
+            ("later plan, for 0.2 s of arm time", "0.2 s, else a smaller search",
+             f"{seconds['replan_ms']} (median of {seen['replans']}, {seen['replan_within_200_ms']:.0%} within 0.2 s), "
+             f"candidates x iterations chosen: {seen['replan_searches']}"),
+            ("page, compressed (gzip), until it is ready", "4 MB", f"{1e-6 * seen['gzip_bytes']:.2f} MB"),
+            ("violations that axe-core finds", "0", f"{seen['violations']} ({seen['looked_at']} states of the page)"),
+        ]  # fmt: skip
+        found.append(("load while times were taken", "", f"{seen['load']} on {seen['processors']} cores"))
+    if near:
+        found += [
+            ("CPU time of an open-loop try, of two workers", "", f"{near['cpu']:.2f} s of one core (mean of 10)"),
+            ("model in page against torch, 50 steps", "1e-4", f"{near['model']:.0e} m, rad (n = {near['n']})"),
+            ("MuJoCo in page against Python, 100 steps", "1e-9", f"{near['physics']:.0e} m, rad (n = {near['n']})"),
+        ]  # fmt: skip
+    if open_loop:
+        executed = [one["executed"] for one in open_loop["python"]]
+        middle, half = statistics.interval(executed)
+        mean = np.mean([one["executed"] for one in open_loop["page"]])
+        found.append((
+            f"executed return, {open_loop['n']} frozen targets", "within the interval of planner seeds",
+            f"{mean:.2f} (two seeds); in Python {middle:.2f} ± {half:.2f} (95 % interval), "
+            f"{min(executed):.2f} to {max(executed):.2f} over {len(executed)} seeds",
+        ))  # fmt: skip
+    if loops:
+        ours, python = loops["page"]["success"], loops["python"]["success"]
+        found.append((
+            f"success within 5 cm, closed loop, {loops['n']} random scenes", "0.9 of Python's share",
+            f"{ours:.2f} with the smallest search (12 x 4), in Python {python:.2f} with 64 x 4: {ours / python:.2f}",
+        ))  # fmt: skip
+    return found
+
+
+@torch.no_grad()
+def main(asked: list[str], targets: int) -> None:
+    measured: dict[str, Any] = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "parity": parity, "plans": partial(plans, targets), "closed": partial(closed, targets), "page": page,
+    }  # fmt: skip
+    for part in [word for word in parts if word in asked or not asked]:
+        found = parts[part]()
+        measured = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
+        measured[part] = found
+        files.write_bytes(MEASURED, (json.dumps(measured, indent=1) + "\n").encode())
+    table(measured)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Measure the explorer and write the table of docs/explorer.md.")
+    parser.add_argument("parts", nargs="*", choices=["parity", "plans", "closed", "page", "table"])
+    parser.add_argument("--targets", type=int, default=100)
+    arguments = parser.parse_args()
+    main(arguments.parts, arguments.targets)

@@ -1,0 +1,202 @@
+"""A model and a prior that collect the data they learn from: rounds, their files, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import tsmlib as tsm
+from tsmlib import exploration
+from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.storage.artifacts import digest
+from tsmlib.storage.files import StoreError
+from tsmlib.trajectory import TrajectoryError
+
+ARM, EPISODES, HORIZON = "tsm/Reacher-v0", 3, 20
+
+
+@cache
+def data(env: str = ARM) -> tsm.Trajectories:
+    return tsm.collect_random(env, 8, horizon=HORIZON)
+
+
+def tasks(k: int, n: int = EPISODES) -> tsm.Task:
+    start = data().states[:n, k]
+    return replace(tsm.Task.standard(ARM, start, torch.full((n, 2), 0.1)), horizon=HORIZON)
+
+
+def learners(seed: int = 0) -> tuple[tsm.RecurrentTSM, tsm.ActionPrior]:
+    train = data()
+    return (
+        tsm.RecurrentTSM.for_data(train, seed=seed, hidden=8),
+        tsm.ActionPrior.for_data(train, seed=seed, channels=4, dilations=(1, 2)),
+    )
+
+
+def options(**changes: Any) -> tsm.ExplorationOptions:
+    once = tsm.TrainingOptions(past_len=10, future_len=10, steps=4, batch_size=8, validate_every=2, lr=1e-3)
+    usual = dict(model=once, prior=once, rounds=2, candidates=4, elites=2, iterations=1)
+    return tsm.ExplorationOptions(**(usual | changes))
+
+
+def explored(model: Any, prior: Any, **given: Any) -> tsm.Exploration:
+    usual = dict(options=options(), tasks=tasks, seed=3)
+    train, held_out = data().take(slice(2, None)), data().take(slice(2))
+    return tsm.explore(model, prior, train, held_out, **(usual | given))
+
+
+def bits(*parts: torch.nn.Module | None) -> list[str]:
+    return [digest(part.state_dict()) for part in parts if part is not None]
+
+
+def test_every_round_adds_its_episodes_and_trains_model_and_prior() -> None:
+    model, prior = learners()
+    before, seen = bits(model, prior), []
+    found = explored(model, prior, measure=lambda model, prior: {"asked": 1.0}, callback=seen.append)
+    assert len(found.train) == 6 + 2 * (EPISODES - 1)
+    assert len(found.held_out) == 2 + 2
+    assert [record["env_steps"] for record in found.records] == [EPISODES * HORIZON, 2 * EPISODES * HORIZON]
+    for record in found.records:
+        assert record.keys() >= {
+            "executed_return", "success", "final_distance", "predicted_return", "gap", "validation", "prior_validation",
+            "asked",
+        }  # fmt: skip
+        assert record["lost"] == 0
+        assert all(np.isfinite(list(record.values())))
+    assert [progress.values for progress in seen] == found.records
+    assert all(then != now for then, now in zip(before, bits(model, prior), strict=True))
+
+
+@pytest.mark.parametrize("killed_at", ["episodes", "prior", "model", "record", "next"])
+def test_a_killed_loop_goes_on_with_the_same_bits(
+    killed_at: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = learners()
+    expected = explored(*whole)
+
+    class Killed(Exception):
+        pass
+
+    class Once:
+        """A function that is interrupted when it is called the ``n``-th time."""
+
+        def __init__(self, call: Any, n: int) -> None:
+            self.call, self.left = call, n
+
+        def __call__(self, *given: Any, **named: Any) -> Any:
+            self.left -= 1
+            if not self.left:
+                raise Killed
+            return self.call(*given, **named)
+
+    where, n = {
+        "episodes": ("mpc", 2), "prior": ("fit", 3), "model": ("fit", 4), "record": ("_trained", 2), "next": ("mpc", 1),
+    }[killed_at]  # fmt: skip
+    with monkeypatch.context() as patched:
+        patched.setattr(exploration, where, Once(getattr(exploration, where), n))
+        with pytest.raises(Killed):
+            explored(*learners(), folder=tmp_path)
+    again = learners()
+    found = explored(*again, folder=tmp_path)
+    assert bits(*again) == bits(*whole)
+    assert found.records == expected.records
+    np.testing.assert_array_equal(found.train.states, expected.train.states)
+    finished = learners()
+    assert explored(*finished, folder=tmp_path).records == expected.records  # without any work
+    assert bits(*finished) == bits(*whole)
+
+
+def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
+    explored(*learners(), options=options(rounds=1), folder=tmp_path)
+    with pytest.raises(StoreError, match=r"is of another exploration: .*seed.*Delete .* to start anew"):
+        explored(*learners(), options=options(rounds=1), folder=tmp_path, seed=4)
+    with pytest.raises(StoreError, match="began with"):
+        explored(*learners(seed=1), options=options(rounds=1), folder=tmp_path)
+
+
+def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores() -> None:
+    train = data("Pendulum-v1")
+    model = tsm.OneStep.for_data(train, hidden=8)
+
+    def upright(states: Tensor, actions: Tensor) -> Tensor:
+        return states[..., 0] - 0.001 * actions[..., 0].square()
+
+    def swings(k: int) -> tsm.Task:
+        return tsm.Task.from_env("Pendulum-v1", n=3, horizon=HORIZON, reward=upright, seed=10 * k)
+
+    found = tsm.explore(model, None, train, train, swings, options(prior=None, rounds=1))
+    assert found.train.states.shape == (10, HORIZON + 1, 3)
+    assert "success" not in found.records[0]
+
+
+def test_disagreement_is_worth_the_bonus_and_one_rollout_has_none() -> None:
+    states, actions = torch.zeros(2, 1, 1, 3, 2), torch.zeros(1, 1, 3, 2)
+    states[0, ..., 1, 0] = 4.0  # step 1: 4 and 0, a standard deviation of 2
+
+    def nothing(states: Tensor, actions: Tensor) -> Tensor:
+        return states[..., 0] * 0
+
+    rewarded = exploration._with_bonus(nothing, weight=3.0, scale=torch.tensor([0.5, 0.0]))
+    assert rewarded(states, actions)[:, 0, 0].tolist() == [[0, 6, 0]] * 2  # 3 (2 / 0.5 + 0) / 2
+    assert not rewarded(states[0, 0], actions[0]).any()
+
+
+@pytest.mark.parametrize("changes", [{"noise": 1.0}, {"bonus": 1e4, "candidates": 16}])
+def test_noise_and_bonus_lead_elsewhere(changes: Mapping[str, float]) -> None:
+    def executed(**changes: Any) -> float:
+        return explored(*learners(), options=options(rounds=1, **changes)).records[0]["executed_return"]
+
+    assert executed(**changes) != executed()
+
+
+def test_an_unstable_episode_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, asked = exploration.mpc, []
+
+    def unstable(task: tsm.Task, *given: Any, **named: Any) -> tsm.Trial:
+        asked.append(task.start)
+        if len(asked) == 1:
+            raise SimulationUnstable(ARM, 1, 7, "velocity")
+        return whole(task, *given, **named)
+
+    monkeypatch.setattr(exploration, "mpc", unstable)
+    found = explored(*learners(), options=options(rounds=1))
+    assert found.records[0]["lost"] == 1
+    np.testing.assert_array_equal(asked[1], asked[0][[0, 2]])
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    (dict(options=options(bonus=1.0)), "OneStep is deterministic: its samples do not disagree. Take bonus=0"),
+    (dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)), "are of tsm/ReacherObstacle-v0, the data"),
+    (dict(tasks=lambda k: tasks(k, n=1)), "round 1 has 1 task; expected at least 2"),
+])  # fmt: skip
+def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        explored(tsm.OneStep.for_data(data(), hidden=8), learners()[1], **given)
+
+
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"rounds": 0}, "at least 1 round"), ({"samples": 1}, "2 samples"), ({"noise": -1}, "zero or above"),
+    ({"held_out": 1.0}, "a share between 0 and 1"),
+])  # fmt: skip
+def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        options(**changes)
+
+
+def test_episodes_are_joined_whatever_their_lengths_and_never_those_of_two_robots() -> None:
+    long, short = data().take(slice(2)), data().cut(5).take(slice(3))
+    both = short.joined(long)
+    assert both.steps.tolist() == [5] * 3 + [HORIZON] * 2
+    np.testing.assert_array_equal(both.states[3:], long.states)
+    np.testing.assert_array_equal(both.states[0, 5:], np.repeat(short.states[0, -1:], HORIZON - 4, 0))
+    assert long.joined(long).lengths == ()
+    with pytest.raises(TrajectoryError, match="cannot be joined; expected one robot"):
+        long.joined(data("Pendulum-v1"))

@@ -1,0 +1,317 @@
+"""Exploration: a model and an action prior that collect the data they learn from (section 6, future work).
+
+    repeat: draw tasks; plan again and again through the model and its prior (``mpc``); execute;
+            append the episodes to the data; go on training the model and the prior
+
+What the first data hold is where a model is right; plans lead elsewhere, so that data of plans are worth more than as
+many random ones.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import DynamicsModel, as_dynamics
+from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
+from tsmlib.planning.execution import Trial, mpc
+from tsmlib.planning.planners import cem
+from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task
+from tsmlib.rewards import Reward, rewarded
+from tsmlib.storage import artifacts
+from tsmlib.storage.files import Json, StoreError, writer_lock
+from tsmlib.training.callbacks import Callback, Progress
+from tsmlib.training.fit import Loss, TrainingOptions, fit
+from tsmlib.trajectory import Trajectories
+
+
+class Trainable(DynamicsModel, Protocol):
+    """A dynamics model of this package: an ``nn.Module`` with a loss and the arguments that it was made with."""
+
+    @property
+    def loss(self) -> Loss: ...
+    def config(self) -> dict[str, Json]: ...
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+
+Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
+Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
+
+
+@dataclass(frozen=True)
+class ExplorationOptions:
+    """Schedule of ``explore``.
+
+    model, prior: one round's training of each, from the weights it has; prior=None leaves it as it is. every,
+    candidates, elites, iterations: of the planning (``mpc``, ``cem``). held_out: share of each round's episodes that
+    join the held-out data, at least one.
+    noise: standard deviation of what is added to the parameters of every plan, in those of the search space.
+    bonus: reward for each step per unit of disagreement, the standard deviation over ``samples`` predicted states, as a
+    share of the data's, mean over dimensions; 0: none.
+    """
+
+    model: TrainingOptions
+    prior: TrainingOptions | None = None
+    rounds: int = 5
+    every: int = 10
+    candidates: int = 96
+    elites: int = 9
+    iterations: int = 4
+    held_out: float = 0.1
+    noise: float = 0.0
+    bonus: float = 0.0
+    samples: int = 4
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.samples < 2:
+            raise ValueError(f"rounds {self.rounds}, samples {self.samples}: expected at least 1 round and 2 samples")
+        if min(self.noise, self.bonus) < 0 or not 0 < self.held_out < 1:
+            raise ValueError(
+                f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
+                "a share between 0 and 1"
+            )
+
+
+@dataclass
+class Exploration:
+    """What ``explore`` leaves: all data, and a record of each round.
+
+    records: ``round``; ``env_steps`` executed up to and with it; ``executed_return`` and, by the task's measures,
+    ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
+    of the ``gap``; ``lost``, episodes in which the simulation became unstable; after training the losses on held-out
+    data, ``validation`` and ``prior_validation``, and what ``measure`` gave.
+    """
+
+    train: Trajectories
+    held_out: Trajectories
+    records: list[dict[str, float]] = field(default_factory=list)
+
+
+def explore(
+    model: Trainable,
+    prior: ActionPrior | None,
+    train: Trajectories,
+    held_out: Trajectories,
+    tasks: Tasks,
+    options: ExplorationOptions,
+    *,
+    seed: int = 0,
+    folder: Path | None = None,  # of its own
+    progress: str = "",
+    measure: Measure | None = None,  # of model and prior, after every round
+    callback: Callback | None = None,  # at every round
+) -> Exploration:
+    """Rounds of planning, executing and learning, by a ``model`` and a ``prior`` that were trained on ``train``.
+
+    Both go on being trained, in place, on all data so far. prior=None: the actions themselves are searched. tasks(k):
+    those of round k = 1, 2, ..., one episode each. Given a ``folder``, a loop that was killed goes on from there with
+    the same bits; StoreError for the folder of another loop. ValueError for tasks of another robot than the data's, and
+    for a bonus where the model has no samples.
+    """
+    if options.bonus and not as_dynamics(model).stochastic:
+        raise ValueError(
+            f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
+            "Take bonus=0, or an ensemble or a segment model"
+        )
+    weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
+    identity: dict[str, Json] = {
+        "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
+        "data": [_digest(data) for data in (train, held_out)],
+    }  # fmt: skip
+    found, began = Exploration(train, held_out), time.process_time()
+    with ExitStack() as stack:
+        if folder is not None:
+            stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
+        for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
+            place = None if folder is None else _Round(folder / f"round-{k:03d}", identity)
+            episodes, record = _collected(k, model, prior, train, tasks, options, seed, place)
+            n = max(1, round(options.held_out * len(episodes)))
+            found.held_out = found.held_out.joined(episodes.take(slice(n)))
+            found.train = found.train.joined(episodes.take(slice(n, None)))
+            before = found.records[-1]["env_steps"] if found.records else 0
+            record = {"round": k, "env_steps": before + int(episodes.steps.sum())} | record
+            found.records.append(_trained(k, model, prior, found, record, options, seed, place, measure))
+            if callback is not None:
+                callback(Progress(k, time.process_time() - began, found.records[-1]))
+    return found
+
+
+def _collected(
+    k: int, model: Trainable, prior: ActionPrior | None, like: Trajectories, tasks: Tasks,
+    options: ExplorationOptions, seed: int, place: _Round | None,
+) -> tuple[Trajectories, dict[str, float]]:  # fmt: skip
+    """The episodes of round k and what is said of them, from the folder if they are there."""
+    if place is not None and (stored := place.episodes()) is not None:
+        return stored
+    task = tasks(k)
+    if task.env != like.env:
+        raise ValueError(f"the tasks of round {k} are of {task.env}, the data of {like.env}; expected one robot")
+    if len(task) < 2:
+        raise ValueError(f"round {k} has {len(task)} task; expected at least 2, since one episode is held out")
+    bonus = partial(_with_bonus, weight=options.bonus, scale=torch.from_numpy(like.states.std((0, 1))))
+    aim = replace(task, reward_for=lambda target: bonus(task.reward_for(target))) if options.bonus else task
+    space = DirectActions(task.horizon, task.action_dim) if prior is None else LatentActions(prior, task.horizon)
+    draw = seed * 1_000_003 + 1000 * k
+    planner: Planner = partial(
+        cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations, seed=draw
+    )
+    if options.noise:
+        planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(draw))
+    judge: Judge = partial(model_predictor, samples=options.samples) if options.bonus else model_predictor
+    lost = 0
+    while True:
+        try:
+            trial = mpc(aim, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
+            break
+        except SimulationUnstable as fault:
+            if len(aim) <= 2:
+                raise
+            aim, lost = _without(aim, fault.episode), lost + 1
+    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost}
+    lengths = trial.lengths or (trial.actions.shape[1],) * len(trial.actions)
+    episodes = replace(
+        like, states=(trial.states if trial.observed is None else trial.observed).numpy(),
+        actions=trial.actions.numpy(), lengths=lengths, terminated=tuple(n < task.horizon for n in lengths),
+    )  # fmt: skip
+    if place is not None:
+        place.keep_episodes(episodes, record)
+    return episodes, record
+
+
+def _trained(
+    k: int, model: Trainable, prior: ActionPrior | None, found: Exploration, record: dict[str, float],
+    options: ExplorationOptions, seed: int, place: _Round | None, measure: Measure | None,
+) -> dict[str, float]:  # fmt: skip
+    """The record of round k with what training gave; ``model`` and ``prior`` trained, or loaded if they are there."""
+    if place is not None and (stored := place.models(model, prior)) is not None:
+        return stored
+    parts: list[tuple[str, nn.Module, Loss, TrainingOptions]] = []
+    if prior is not None and options.prior is not None:
+        parts.append(("prior_validation", prior, prior.loss, options.prior))
+    parts.append(("validation", cast(nn.Module, model), model.loss, options.model))
+    for name, part, loss, training in parts:
+        checkpoint = None if place is None else place.folder / f"{name}.checkpoint"
+        curve = fit(part, loss, found.train, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
+        record[name] = min(curve.validation)
+    if measure is not None:
+        record |= measure(model, prior)
+    if place is not None:
+        place.keep_models(model, prior, record)
+    return record
+
+
+def _said(trial: Trial, *, bonus: bool) -> dict[str, float]:
+    """Means over the episodes of a trial."""
+    record = {"executed_return": float(trial.executed_return.mean())}
+    if trial.success is not None:
+        record["success"] = float(trial.success.float().mean())
+    if not trial.final_distance.isnan().any():
+        record["final_distance"] = float(trial.final_distance.mean())
+    if not bonus and trial.plan is not None:
+        record["predicted_return"] = float(trial.plan.predicted_return.mean())
+        record["gap"] = float(trial.gap.abs().mean())
+    return record
+
+
+def _with_bonus(reward: Reward, *, weight: float, scale: Tensor) -> Reward:
+    """``reward`` plus ``weight`` times the disagreement of sampled states (S, C, B, T, dx); one rollout has none.
+
+    scale (dx,): the data's standard deviation, in which disagreement is measured where the data move.
+    """
+
+    def total(states: Tensor, actions: Tensor) -> Tensor:
+        plain = rewarded(reward, states, actions)
+        if states.ndim < 5:
+            return plain
+        spread = states.std(0, unbiased=False, keepdim=True) / scale.where(scale > 0, torch.inf)
+        return plain + weight * spread.mean(-1)
+
+    return total
+
+
+@dataclass
+class _Perturbed:
+    """A planner whose plans are disturbed before they are executed."""
+
+    planner: Planner
+    deviation: float
+    generator: torch.Generator
+
+    def __call__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /) -> Plan:
+        plan = self.planner(predict, reward, space, start)
+        noise = space.noise(1, len(plan.parameters), self.generator)[0]
+        parameters = plan.parameters + self.deviation * space.scale * noise
+        with torch.no_grad():
+            return replace(plan, parameters=parameters, actions=space.decode(parameters[None])[0])
+
+
+def _without(task: Task, i: int) -> Task:
+    """The task without instance ``i``."""
+    kept = np.delete(np.arange(len(task)), i)
+    seeds = tuple(task.seeds[j] for j in kept) if task.seeds else ()
+    return replace(task, start=task.start[kept], target=task.target[torch.from_numpy(kept)], seeds=seeds)
+
+
+def _digest(data: Trajectories) -> str:
+    return artifacts.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})[:16]
+
+
+@dataclass(frozen=True)
+class _Round:
+    """The files of one round: its episodes, then the prior, at last the model with the whole record."""
+
+    folder: Path
+    identity: Mapping[str, Json]
+
+    def episodes(self) -> tuple[Trajectories, dict[str, float]] | None:
+        path = self.folder / "episodes.safetensors"
+        return (artifacts.load_trajectories(path), self._record(path)) if path.exists() else None
+
+    def keep_episodes(self, episodes: Trajectories, record: Mapping[str, float]) -> None:
+        artifacts.save_trajectories(self.folder / "episodes.safetensors", episodes, self._header(record))
+
+    def models(self, model: Trainable, prior: ActionPrior | None) -> dict[str, float] | None:
+        """The record of the whole round, its weights now in ``model`` and ``prior``; None if not all is there."""
+        path = self.folder / "model.safetensors"
+        if not path.exists():
+            return None
+        record = self._record(path)
+        for name, part in {"model": cast(nn.Module, model), "prior": prior}.items():
+            if part is not None:
+                stored = artifacts.load_model(self.folder / f"{name}.safetensors", cast(Any, type(part)))
+                part.load_state_dict(stored.state_dict())
+        return record
+
+    def keep_models(self, model: Trainable, prior: ActionPrior | None, record: Mapping[str, float]) -> None:
+        if prior is not None:
+            artifacts.save_model(self.folder / "prior.safetensors", prior, self._header(record))
+        artifacts.save_model(self.folder / "model.safetensors", cast(Any, model), self._header(record))
+        for checkpoint in self.folder.glob("*.checkpoint"):
+            shutil.rmtree(checkpoint)
+
+    def _header(self, record: Mapping[str, float]) -> dict[str, Json]:
+        return {"identity": dict(self.identity), "record": dict(record)}
+
+    def _record(self, path: Path) -> dict[str, float]:
+        header = artifacts.read_header(path)
+        if differs := artifacts.differences(cast(dict[str, Json], header.get("identity", {})), dict(self.identity)):
+            raise StoreError(
+                f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "
+                "or go back to those settings"
+            )
+        return dict(cast(dict[str, float], header["record"]))

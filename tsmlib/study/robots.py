@@ -1,0 +1,125 @@
+"""Models of any robot's data, trained for the same time and scored alike, and plans beside the true simulator's.
+
+What 09_your_own measures. An update takes another time on another robot, so the number of updates that fit into a
+budget is measured first, on a copy of the model: it is no function of the seed alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, cast
+
+from tsmlib.evaluation.prediction import score
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.planning.base import Planner, SearchSpace
+from tsmlib.planning.execution import Trial, execute, mpc
+from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.study import zoo
+from tsmlib.study.models import TrainedModel
+from tsmlib.study.results import robots as results
+from tsmlib.study.results.table import Row
+from tsmlib.study.runs import Run
+from tsmlib.study.zoo import Stage
+from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.trajectory import Trajectories
+
+
+class Trained(NamedTuple):
+    """How a model is trained on another robot: arguments of its class, and stages in shares of the time."""
+
+    arguments: dict[str, bool | int]
+    stages: tuple[Stage, ...]
+
+
+def _stage(loss: str, share: float = 1.0, **options: Any) -> Stage:
+    """Muon at the best rate of the baselines at pushing. The rate of updates is measured."""
+    return Stage(loss, rate=0.0, share=share, muon=0.02, **options)
+
+
+MODELS = {  # the first half of the segment model's training is of its mode over short windows, which costs least
+    "rtsm": Trained(
+        {"hidden": 96},
+        (
+            _stage("point_loss", 0.4, future_len=10, batch=128, span=(0.0, 0.4)),
+            _stage("loss", 0.6, batch=128, span=(0.4, 1.0)),
+        ),
+    ),
+    "onestep": Trained({}, (_stage("loss", lr=2e-3),)),
+    "lstm": Trained({"hidden": 96}, (_stage("loss", batch=128, lr=2e-3),)),
+    "ensemble+mse": Trained({"gaussian": False}, (_stage("loss", lr=2e-3),)),
+}
+SAMPLES, SEEN = 32, 10  # of a prediction; steps observed before it
+FEWEST = 4  # updates of a stage
+WARMUP = 20  # updates
+
+
+def train_for(
+    seconds: float, word: str, data: Trajectories, held_out: Trajectories, *, seed: int = 0
+) -> tuple[TrainedModel, float]:
+    """One of MODELS after ``seconds`` of training on one core, and the CPU seconds that it really took.
+
+    seconds: 0 is the fewest updates that show that all of it runs.
+    """
+    arguments, stages = MODELS[word]
+    made_for = cast(type[RecurrentTSM], zoo.find(word).load())  # what is used here of one, all have
+    net, taken = made_for.for_data(data, seed=seed, **arguments), 0.0
+    for stage, key in zip(stages, zoo.keys(stages), strict=True):
+        options = partial(
+            TrainingOptions, net.past_len, stage.future_len, lr=stage.lr, muon=stage.muon, batch_size=stage.batch,
+            span=stage.span, warmup=WARMUP,
+        )  # fmt: skip
+        steps = FEWEST
+        if seconds:
+            each = _update_seconds(net, stage.loss, data, held_out, options)
+            steps = max(steps, round(seconds * stage.share / each))
+        curve = fit(
+            net, getattr(net, stage.loss), data, held_out, options(steps=steps, validate_every=max(1, steps // 4)),
+            seed=seed, progress=f"{data.env} {word}: {key}",
+        )  # fmt: skip
+        taken += curve.seconds[-1]
+    return net, taken
+
+
+def _update_seconds(
+    net: RecurrentTSM, loss: str, data: Trajectories, held_out: Trajectories, options: Callable[..., TrainingOptions]
+) -> float:
+    """CPU seconds of one update of a copy of ``net``."""
+    few, tried = held_out.take(slice(8)), copy.deepcopy(net)
+    for updates in (2, 10):  # the first are slower
+        began = time.process_time()
+        fit(tried, getattr(tried, loss), data, few, options(steps=updates, validate_every=updates))
+        each = (time.process_time() - began) / updates
+    return each
+
+
+def scoreboard(run: Run, train: Trajectories, held_out: Trajectories, test: Trajectories, seconds: float) -> list[Row]:
+    """Rows of every model's scores on ``test``, each after ``seconds`` of training; see ``results.robots``."""
+    rows: list[Row] = []
+    for word in MODELS:
+        net, taken = train_for(seconds, word, train, held_out, seed=run.seed)
+        scores = score(
+            net, net.features, test, held_out, samples=SAMPLES, horizon=max(results.AHEAD), starts=(SEEN,),
+            seed=run.seed, progress=f"{train.env} {word}: scores",
+        )  # fmt: skip
+        rows += results.score_rows(run, train.env, word, scores, taken)
+    return rows
+
+
+def beside_the_oracle(
+    run: Run, task: Task, model: str, trial: Trial, space: SearchSpace, planner: Planner, *, every: int, n: int = 4
+) -> list[Row]:
+    """Rows of a trial planned through ``model``; on its task also of doing nothing, random actions, and the simulator.
+
+    space, planner, every: those of the trial. The oracle plans by them too, from the first ``n`` starts.
+    """
+    few = task.take(min(n, len(task)))
+    trials = {
+        model: (task, trial),
+        "oracle": (few, mpc(few, None, space, planner, every=every, progress=f"{task.env}: oracle")),
+        "zero": (task, execute(task, zero_torques(task))),
+        "random": (task, execute(task, random_torques(task, seed=run.seed))),
+    }
+    return [row for word, (own, each) in trials.items() for row in results.plan_rows(run, own, word, each)]
