@@ -207,7 +207,7 @@ def imperfect_task(env: str = REACHER, n: int = 4, **how: Any) -> Task:
 
 
 @pytest.mark.parametrize("env", [REACHER, "tsm/PymunkPush-v1"])
-def test_behind_noisy_sensors_a_trial_earns_what_the_true_states_earn(env: str) -> None:
+def test_behind_noisy_sensors_the_return_of_a_trial_is_that_of_the_true_states(env: str) -> None:
     noisy, clear, actions = imperfect_task(env, noise=NOISE), some_task(env), torques(4, 20)
     trial, plain = execute(noisy, actions), execute(clear, actions)
     assert torch.equal(trial.states, plain.states)
@@ -264,7 +264,7 @@ def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> 
     assert not torch.allclose(trial.states, at_once.states, atol=1e-3)
 
 
-def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_earns_what_is_true() -> None:
+def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scored_by_true_states() -> None:
     task, model = imperfect_task(noise=NOISE), Wrong()
     trial = mpc(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
     assert trial.observed is not None

@@ -89,7 +89,7 @@ def test_new_episodes_have_other_starts_and_targets_within_the_disc() -> None:
     np.testing.assert_array_equal(again.reset(), first)
 
 
-def test_doing_nothing_earns_what_zero_torque_earns() -> None:
+def test_doing_nothing_has_the_return_of_zero_torque() -> None:
     task = study.task("tsm/Reacher-v0").take(10)
     found = model_free.measured(task, lambda seen: np.zeros((len(seen), 2)))
     trial = execute(task, torch.zeros(10, task.horizon, 2))

@@ -16,7 +16,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import parameters, runs, zoo
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import fit
 
 TRIES = {"twice the batch, half the updates": (2.0, 0.5), "half the batch": (0.5, 1.0)}
 
@@ -38,10 +38,9 @@ def main() -> None:
         for stage in study.schedule(run, arguments.env, model)[: arguments.stages]:
             curve = fit(
                 net, getattr(net, stage.loss), data, held_out,
-                TrainingOptions(
-                    past_len=net.past_len, future_len=stage.future_len, steps=max(1, round(updates * stage.steps)),
-                    lr=stage.lr, batch_size=round(batches * stage.batch), validate_every=250, bf16=stage.bf16,
-                    muon=stage.muon, weight_decay=stage.weight_decay, span=stage.span,
+                stage.options(
+                    net.past_len, steps=max(1, round(updates * stage.steps)), batch_size=round(batches * stage.batch),
+                    patience=0,
                 ),
                 seed=run.seed, progress=f"{model}, {condition}: {stage.loss}",
             )  # fmt: skip

@@ -22,7 +22,7 @@ from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.storage import artifacts
 from tsmlib.study import runs, zoo
 from tsmlib.study.data import dataset
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import fit
 
 
 def main() -> None:
@@ -46,13 +46,8 @@ def main() -> None:
     name = f"{given.model}_{given.times:g}_{stages[0].muon:g}_{given.seed}"
     path, curves = run.folder(f"settings/{env.name}") / f"{name}.safetensors", {}
     for key, stage in zip(zoo.keys(stages), stages, strict=True):
-        options = TrainingOptions(
-            past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr, bf16=stage.bf16,
-            muon=stage.muon, weight_decay=stage.weight_decay, patience=stage.patience, span=stage.span,
-            batch_size=stage.batch, validate_every=250,
-        )  # fmt: skip
         curve = fit(
-            net, getattr(net, stage.loss), data, held_out, options, seed=given.seed,
+            net, getattr(net, stage.loss), data, held_out, stage.options(net.past_len), seed=given.seed,
             checkpoint=path.with_name(f"{name}-{key}.checkpoint"), progress=f"{name}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)

@@ -15,7 +15,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.storage import tables
 from tsmlib.study import parameters, runs, zoo
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import fit
 
 FACTORS = (0.5, 1.0, 2.0)
 
@@ -44,9 +44,8 @@ def main() -> None:
                 steps = max(1, round(stage.steps * arguments.share))
                 curve = fit(
                     net, getattr(net, stage.loss), data, held_out,
-                    TrainingOptions(
-                        past_len=net.past_len, future_len=stage.future_len, steps=steps,
-                        lr=factor * stage.lr, batch_size=stage.batch, validate_every=50, bf16=True,
+                    stage.options(
+                        net.past_len, steps=steps, lr=factor * stage.lr, muon=0.0, validate_every=50, bf16=True
                     ),
                     seed=run.seed, progress=f"{model}, {factor:g} times the rate: {stage.loss}",
                 )  # fmt: skip

@@ -23,7 +23,7 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import symmetric
 from tsmlib.study import models, runs, zoo
 from tsmlib.study.data import dataset
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import fit
 
 HERE, ENV = Path(__file__).resolve().parent, "tsm/ReacherPush-v1"
 KEY = ("model", "stage", "way", "symmetries", "updates", "seed")
@@ -54,9 +54,9 @@ def measured(run: runs.Run, word: str, at: int, way: str, updates: int, *, symme
     began = time.process_time()
     curve = fit(
         net, getattr(net, stage.loss), data, held_out,
-        TrainingOptions(
-            past_len=net.past_len, future_len=stage.future_len, steps=updates, batch_size=stage.batch,
-            lr=chosen.lr or stage.lr, muon=chosen.muon, weight_decay=chosen.weight_decay,
+        stage.options(
+            net.past_len, steps=updates, lr=chosen.lr or stage.lr, muon=chosen.muon, weight_decay=chosen.weight_decay,
+            patience=0, span=(0.0, 1.0), bf16=False,
         ),
         seed=run.seed, progress=f"{word}, {way}",
     )  # fmt: skip

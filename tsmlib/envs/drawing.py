@@ -53,10 +53,15 @@ class _Picture:
         for place in range(math.floor(self.left), math.ceil(self.left + ACROSS) + 1):
             line = self.pixels(np.array([[place, 0], [place, -0.08]]))
             self.draw.line(line, MARK, 2 * SMOOTH)
-            self.draw.text(line[1], f"{place} m", MARK, ImageFont.load_default(13 * SMOOTH), anchor="mt")
+            self.draw.text(line[1], f"{place} m", MARK, _font(), anchor="mt")
 
     def array(self) -> np.ndarray:
         return np.asarray(self.image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS))
+
+
+@cache
+def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(13 * SMOOTH)
 
 
 def drawable(env_id: str) -> bool:
@@ -101,7 +106,7 @@ def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
         picture.ground()
         for place, i in sorted(zip(middle, bodies, strict=True), key=lambda pair: -data.geom_xpos[pair[1], 1]):
             half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[[0, 2], 2]
-            second = "left" in (name := model.geom(i).name) or name.startswith("b")
+            second = "left" in (name := model.geom(i).name) or name.startswith("b")  # left leg, or hind leg
             picture.rod(np.stack([place - half, place + half]), float(model.geom_size[i, 0]), OTHER if second else BODY)
         found.append(picture.array())
     return np.stack(found)

@@ -95,11 +95,11 @@ def make_simulation(env_id: str, n: int, *, returns: bool = False) -> Simulation
     return Stepping([first, *more], returns=returns)
 
 
-def make(env_id: str) -> gymnasium.Env:
+def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
     """The environment of an id. What MuJoCo has to say of Gymnasium's own robots, whose files are old, is left out."""
     quiet = str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco")
     with without_log() if quiet else nullcontext():
-        return gymnasium.make(env_id, disable_env_checker=True)
+        return gymnasium.make(env_id, render_mode=render_mode, disable_env_checker=True)
 
 
 def require_supported(env_id: str, observations: Space, actions: Space) -> tuple[Box, Box]:

@@ -231,7 +231,7 @@ def _encoder(ax: Axes, x: float, out: float) -> None:
 
 @styled
 def figure3() -> Figure:
-    """Planning over latent codes (paper, figure 3): codes make actions, actions make states, states earn rewards, and
+    """Planning over latent codes (paper, figure 3): codes make actions, actions make states, states give rewards, and
     the gradient of the return flows back to the codes (dashed)."""
     figure, ax = _canvas(5.15, 3.85)
     centres, names = (1.2, 2.55, 4.4), ("1", "2", "K")

@@ -49,6 +49,11 @@ class Trial:
     own_return: Tensor | None = None
 
     @property
+    def steps(self) -> tuple[int, ...]:
+        """Steps of each episode, whether any ended early or not."""
+        return self.lengths or (self.actions.shape[1],) * len(self.actions)
+
+    @property
     def gap(self) -> Tensor:
         """Exploitation gap (B,): predicted minus true return."""
         if self.plan is None:
@@ -73,7 +78,7 @@ def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
 def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:
     """An episode from each of the task's starts, and the simulation that it ran in."""
     run = make_simulation(task.env, len(task), returns=True)
-    begin: dict[str, Any] = {"seed": task.seeds} if task.seeds else {"seed": SENSORS, "states": task.start}
+    begin: dict[str, Any] = {"seed": task.seeds} if task.begins_by_seed else {"seed": SENSORS, "states": task.start}
     seen = collect(run, controller, horizon=horizon, past_len=past_len, **begin)
     run.close()
     return seen, run

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -98,6 +98,11 @@ class Task:
         return self.reward_for(self.target)
 
     @property
+    def begins_by_seed(self) -> bool:
+        """Whether episodes begin by the seed of a reset: of every robot but the arms, which begin in any state."""
+        return bool(self.seeds)
+
+    @property
     def is_standard(self) -> bool:
         """Whether the reward is the paper's."""
         return self.reward_for in (rewards.reach, rewards.push)
@@ -135,11 +140,15 @@ class Task:
         """The past before the first step: x_0 repeated, zero actions."""
         return initial_past(torch.from_numpy(self.start).float(), past_len, self.action_dim)
 
-    def take(self, n: int) -> Task:
-        """The first ``n`` instances; ValueError if there are not as many."""
-        if not 1 <= n <= len(self):
-            raise ValueError(f"{n} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
-        return replace(self, start=self.start[:n], target=self.target[:n], seeds=self.seeds[:n])
+    def take(self, chosen: int | Sequence[int]) -> Task:
+        """The first instances, or those of some indices; ValueError where there is none, or not as many."""
+        if isinstance(chosen, int) and not 1 <= chosen <= len(self):
+            raise ValueError(f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
+        each = list(range(chosen)) if isinstance(chosen, int) else list(chosen)
+        if not each or not all(0 <= i < len(self) for i in each):
+            raise ValueError(f"targets {each} of {self.env} asked for; choose some from 0 to {len(self) - 1}")
+        seeds = tuple(self.seeds[i] for i in each) if self.seeds else ()
+        return replace(self, start=self.start[each], target=self.target[each], seeds=seeds)
 
     def times(self, n: int) -> Task:
         """All instances n times over, for as many copies of a policy."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-import gymnasium
 import numpy as np
 import pandas as pd
 import torch
+from gymnasium import make_vec
 from gymnasium.spaces import Box
 from IPython.display import Markdown, display
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ from torch import Tensor
 from tsmlib import figures, rewards
 from tsmlib.envs import drawing
 from tsmlib.envs.render import draw_scene
-from tsmlib.envs.stepping import within_bounds
+from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.evaluation import latent
 from tsmlib.evaluation.futures import Coded
 from tsmlib.figures.method import Method
@@ -76,7 +77,7 @@ def film(task: Task, trial: Trial, target: int) -> np.ndarray:
     Of a trial behind noisy sensors that was not planned: the observed states beside the true ones. Of a robot that
     cannot be drawn from its observations (``envs.drawing``): the execution alone, by its own ``render``.
     """
-    if task.seeds and not drawing.drawable(task.env):
+    if task.begins_by_seed and not drawing.drawable(task.env):
         return figures.side_by_side({"executed": _rendered(task, trial, target)})
     titles = "predicted", "executed"
     if trial.plan is None and trial.observed is not None:
@@ -137,14 +138,14 @@ def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: in
 
 def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
     """A film of each rollout (T, dx)."""
-    if task.seeds:  # not an arm
+    if task.begins_by_seed:  # not an arm
         return [drawing.frames(task.env, states) for states in rollouts]
     return [_frames(task.env, states, task.target[target].numpy()) for states in rollouts]
 
 
 def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Each of the states (T, dx) of an arm drawn."""
-    env: Any = gymnasium.make_vec(env_id, num_envs=1).unwrapped
+    env: Any = make_vec(env_id, num_envs=1).unwrapped
     frames = np.stack([env.image(state, target) for state in states])
     env.close()
     return frames
@@ -153,16 +154,15 @@ def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:
     """The episode of one target stepped again, a picture after each step. RuntimeError where there are no pictures."""
     try:
-        env = gymnasium.make(task.env, render_mode="rgb_array", disable_env_checker=True)
-        env.reset(seed=task.seeds[target])
-        frames: list[Any] = []
-        for action in within_bounds(trial.actions[target].numpy(), cast(Box, env.action_space)):
-            _, _, terminated, truncated, _ = env.step(action)
-            frames.append(env.render())
-            if terminated or truncated:
-                break
-        env.close()
-        return np.stack(frames)
+        with closing(make(task.env, render_mode="rgb_array")) as env:
+            env.reset(seed=task.seeds[target])
+            frames: list[Any] = []
+            for action in within_bounds(trial.actions[target].numpy(), cast(Box, env.action_space)):
+                _, _, terminated, truncated, _ = env.step(action)
+                frames.append(env.render())
+                if terminated or truncated:
+                    break
+            return np.stack(frames)
     except Exception as error:  # of whatever library it renders with
         raise RuntimeError(
             f"{task.env} gives no pictures here: {error!s:.200}. It needs what its render_mode='rgb_array' needs; of "
@@ -174,5 +174,5 @@ def _rollouts(trial: Trial, target: int) -> tuple[np.ndarray, np.ndarray]:
     """Predicted and executed states (T, dx), to the end of the episode."""
     if trial.plan is None:
         raise ValueError("these actions were not planned, so there is no predicted rollout")
-    steps = trial.lengths[target] if trial.lengths else trial.states.shape[1] - 1
+    steps = trial.steps[target]
     return trial.plan.states[0, target, :steps].numpy(), trial.states[target, 1 : steps + 1].numpy()

@@ -26,7 +26,7 @@ from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.parallel import precompute
 from tsmlib.study.runs import ROOT, Run
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
 
 if TYPE_CHECKING:
@@ -151,19 +151,14 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
         data = symmetric(data)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves, checkpoints = schedule(run, env, model), {}, []
+    fewer = {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
     for (k, part), (key, stage) in product(enumerate(_parts(net)), zip(zoo.keys(stages), stages, strict=True)):
         key += f"@{k}" * bool(k)
         checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
             cast(torch.nn.Module, part), getattr(part, stage.loss), data, held_out,
-            TrainingOptions(
-                past_len=net.past_len, future_len=stage.future_len, steps=stage.steps, lr=stage.lr, bf16=stage.bf16,
-                muon=stage.muon, weight_decay=stage.weight_decay, patience=stage.patience, span=stage.span,
-                batch_size=run.pick(smoke=32, laptop=stage.batch, paper=stage.batch),
-                validate_every=run.pick(smoke=10, laptop=250, paper=250),
-            ),
-            seed=run.seed + 1000 * k, device=run.device, checkpoint=checkpoints[-1],
-            progress=f"{name} {model}: {key}",
+            stage.options(net.past_len, **fewer), seed=run.seed + 1000 * k,
+            device=run.device, checkpoint=checkpoints[-1], progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
     header = {

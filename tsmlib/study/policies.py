@@ -54,8 +54,8 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
     """A policy learned inside a trained model.
 
     method: a model and a search space, latent (a SegmentPolicy, acting through the action prior) or direct (a
-    OneStepPolicy). Episodes start as those of the training data, so the environment is not asked. What the policy
-    truly earns on ``task`` is measured at ten points along the way, beside the return that the model predicts there
+    OneStepPolicy). Episodes start as those of the training data, so the environment is not asked. Its executed
+    return on ``task`` is measured at ten points along the way, beside the return that the model predicts there
     (``assess``); neither has a part in learning.
 
     From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its budget; else learned now,

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 from tsmlib.evaluation.prediction import score
@@ -22,12 +21,12 @@ from tsmlib.study.models import TrainedModel
 from tsmlib.study.results import robots as results
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
-from tsmlib.study.zoo import Stage
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.study.zoo import Stage, Updates
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
 
 
-class Trained(NamedTuple):
+class Recipe(NamedTuple):
     """How a model is trained on another robot: arguments of its class, and stages in shares of the time."""
 
     arguments: dict[str, bool | int]
@@ -40,16 +39,16 @@ def _stage(loss: str, share: float = 1.0, **options: Any) -> Stage:
 
 
 MODELS = {  # the first half of the segment model's training is of its mode over short windows, which costs least
-    "rtsm": Trained(
+    "rtsm": Recipe(
         {"hidden": 96},
         (
             _stage("point_loss", 0.4, future_len=10, batch=128, span=(0.0, 0.4)),
             _stage("loss", 0.6, batch=128, span=(0.4, 1.0)),
         ),
     ),
-    "onestep": Trained({}, (_stage("loss", lr=2e-3),)),
-    "lstm": Trained({"hidden": 96}, (_stage("loss", batch=128, lr=2e-3),)),
-    "ensemble+mse": Trained({"gaussian": False}, (_stage("loss", lr=2e-3),)),
+    "onestep": Recipe({}, (_stage("loss", lr=2e-3),)),
+    "lstm": Recipe({"hidden": 96}, (_stage("loss", batch=128, lr=2e-3),)),
+    "ensemble+mse": Recipe({"gaussian": False}, (_stage("loss", lr=2e-3),)),
 }
 SAMPLES, SEEN = 32, 10  # of a prediction; steps observed before it
 FEWEST = 4  # updates of a stage
@@ -67,30 +66,24 @@ def train_for(
     made_for = cast(type[RecurrentTSM], zoo.find(word).load())  # what is used here of one, all have
     net, taken = made_for.for_data(data, seed=seed, **arguments), 0.0
     for stage, key in zip(stages, zoo.keys(stages), strict=True):
-        options = partial(
-            TrainingOptions, net.past_len, stage.future_len, lr=stage.lr, muon=stage.muon, batch_size=stage.batch,
-            span=stage.span, warmup=WARMUP,
-        )  # fmt: skip
-        steps = FEWEST
-        if seconds:
-            each = _update_seconds(net, stage.loss, data, held_out, options)
-            steps = max(steps, round(seconds * stage.share / each))
+        updates = stage.within(0.0, False)
+        rate = 1 / _update_seconds(net, updates, data, held_out) if seconds else 0.0
+        steps = replace(stage, rate=rate).within(seconds, False).steps if seconds else FEWEST
+        options = updates.options(net.past_len, steps=steps, validate_every=max(1, steps // 4), warmup=WARMUP)
         curve = fit(
-            net, getattr(net, stage.loss), data, held_out, options(steps=steps, validate_every=max(1, steps // 4)),
-            seed=seed, progress=f"{data.env} {word}: {key}",
+            net, getattr(net, stage.loss), data, held_out, options, seed=seed, progress=f"{data.env} {word}: {key}",
         )  # fmt: skip
         taken += curve.seconds[-1]
     return net, taken
 
 
-def _update_seconds(
-    net: RecurrentTSM, loss: str, data: Trajectories, held_out: Trajectories, options: Callable[..., TrainingOptions]
-) -> float:
+def _update_seconds(net: RecurrentTSM, stage: Updates, data: Trajectories, held_out: Trajectories) -> float:
     """CPU seconds of one update of a copy of ``net``."""
     few, tried = held_out.take(slice(8)), copy.deepcopy(net)
     for updates in (2, 10):  # the first are slower
         began = time.process_time()
-        fit(tried, getattr(tried, loss), data, few, options(steps=updates, validate_every=updates))
+        options = stage.options(net.past_len, steps=updates, validate_every=updates, warmup=WARMUP)
+        fit(tried, getattr(tried, stage.loss), data, few, options)
         each = (time.process_time() - began) / updates
     return each
 

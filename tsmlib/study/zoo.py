@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from tsmlib.envs.spec import EnvSpec
     from tsmlib.storage.files import Json
+    from tsmlib.training.fit import TrainingOptions
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 580.0,
@@ -75,6 +76,13 @@ class Updates:
     weight_decay: float = 0.0
     patience: int = 0
     span: tuple[float, float] = (0.0, 1.0)
+
+    def options(self, past_len: int, **changes: Any) -> TrainingOptions:
+        """What ``fit`` takes. past_len: of the model; changes: of other fields, or of these."""
+        from tsmlib.training.fit import TrainingOptions  # heavy
+
+        own = {name: value for name, value in asdict(self).items() if name not in ("loss", "batch")}
+        return TrainingOptions(**{"past_len": past_len, "batch_size": self.batch} | own | changes)
 
     def stated(self) -> dict[str, Any]:
         """The stage as it stands in the header of a model: without ``bf16``, which holds where it is native."""

@@ -156,9 +156,11 @@ def by_target(found: pd.DataFrame, metric: str) -> dict[Method, np.ndarray]:
     return table.arrays(table.means(own, "target", "method").sort_index())
 
 
-def returns(found: pd.DataFrame, env: str, *, planner: str = "cem") -> dict[Method, dict[str, np.ndarray | None]]:
+def returns(
+    found: pd.DataFrame, env: str, *, planner: str = "cem", execution: str = OPEN
+) -> dict[Method, dict[str, np.ndarray | None]]:
     """What ``figures.figure6`` draws of one task: method -> true and predicted returns, from rows with a ``target``."""
-    own = chosen(found, env=env, planners=[planner])
+    own = chosen(found, env=env, execution=execution, planners=[planner])
     predicted = by_target(own, "return_predicted")
     return {
         method: {"true": true, "predicted": predicted.get(method)}
@@ -279,11 +281,12 @@ def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def paired_table(found: pd.DataFrame, env: str, subject: str) -> pd.DataFrame:
+def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str = OPEN) -> pd.DataFrame:
     """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
-    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets.
-    found: rows with a ``target``."""
-    every = {method: rows for method, rows in returns(found, env).items() if method.search_space != "direct"}
+    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets. Closed loop, the gap is
+    that of the first plan. found: rows with a ``target``."""
+    planned = returns(found, env, execution=execution)
+    every = {method: rows for method, rows in planned.items() if method.search_space != "direct"}
     ours = next((rows for method, rows in every.items() if method.model == subject), None)
     lines = []
     for method, rows in sorted(every.items(), key=lambda each: _cost(each[1]).mean()):
@@ -291,7 +294,9 @@ def paired_table(found: pd.DataFrame, env: str, subject: str) -> pd.DataFrame:
         if ours is not None and rows is not ours:
             line[f"cost of {subject} minus this"] = table.spell(_cost(ours) - _cost(rows), "{:+.2f} ± {:.2f}")
             if rows["predicted"] is not None:
-                line["the same of the size of the gap"] = table.spell(_gap(ours) - _gap(rows), "{:+.2f} ± {:.2f}")
+                line[f"size of the gap of {subject} minus this"] = table.spell(
+                    _gap(ours) - _gap(rows), "{:+.2f} ± {:.2f}"
+                )
         lines.append(line | {"n": len(_cost(rows))})
     return pd.DataFrame(lines)
 

@@ -57,8 +57,8 @@ def plan_rows(run: Run, task: Task, model: str, trial: Trial) -> list[Row]:
     model: of the plans, or oracle, zero or random. The horizon is what the environment may take, ended early or not.
     """
     who = {"model": "none", "planner": model} if model in ("zero", "random") else {"model": model, "planner": "cem"}
-    steps = np.array(trial.lengths or (task.horizon,) * len(task))
-    own = np.zeros(len(task)) if trial.own_return is None else trial.own_return.numpy()
+    steps = np.array(trial.steps)
+    own = np.full(len(task), np.nan) if trial.own_return is None else trial.own_return.numpy()
     found = {
         "own_return": own.mean(), "own_reward_per_step": (own / steps).mean(), "steps": steps.mean(),
         "return_true": float(trial.executed_return.mean()),
@@ -92,12 +92,13 @@ def plans_table(rows: pd.DataFrame) -> pd.DataFrame:
     """A line for each robot and method: return by the environment's own reward, per step, steps, and success."""
     lines = []
     for (env, model, planner), own in table.groups(table.select(rows, execution=CLOSED), ["env", "model", "planner"]):
-        means = own.groupby("metric")["value"].mean()
+        seeds = {metric: part["value"] for metric, part in table.groups(own, "metric")}
         lines.append({
             "env": env, "planner": zoo.look(model if model != "none" else planner).name,
-            "own return": f"{means['own_return']:.1f}", "per step": f"{means['own_reward_per_step']:.2f}",
-            "steps": f"{means['steps']:.0f} of {own['horizon'].max()}",
-            "success": f"{100 * means['success']:.0f} %" if "success" in means else "",
+            "own return": table.spell(seeds["own_return"], "{:.1f} ± {:.1f}"),
+            "per step": table.spell(seeds["own_reward_per_step"], "{:.2f} ± {:.2f}"),
+            "steps": f"{table.spell(seeds['steps'], '{:.0f} ± {:.0f}')} of {own['horizon'].max()}",
+            "success": table.spell(100 * seeds["success"], "{:.0f} ± {:.0f}") + " %" if "success" in seeds else "",
             "n": int(own["n"].max()),
         })  # fmt: skip
     return pd.DataFrame(lines)
