@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from tsmlib import figures
-from tsmlib.statistics import interval
+from tsmlib.statistics import holm, interval, random_effects
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import publish
 from tsmlib.study.claims import evaluate, ledger, report
@@ -122,6 +122,17 @@ def test_planted_nulls_are_not_replicated(noise: str, n: int) -> None:
     assert share(alike, REPLICATED, 0.0, n=60) >= 0.95
 
 
+def test_many_checks_do_not_make_a_failure_likely_by_chance() -> None:
+    rng, failed = np.random.default_rng(0), {1: 0, 8: 0}
+    for n_checks in failed:
+        rivals = [Model(f"rival{i}") for i in range(n_checks)]
+        level = ahead(*rivals)
+        for _ in range(300):
+            rows = Planted(tsm=np.zeros(10), **{rival.word: rng.standard_normal(10) for rival in rivals})
+            failed[n_checks] += evaluate.judge(level, rows).word == FAILED
+    assert max(failed.values()) <= 0.05 * 300
+
+
 def test_better_than_each_means_each() -> None:
     each = ahead(LSTM, ONE_STEP)
     rows = study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[3, 3.2, 3.1])
@@ -192,9 +203,13 @@ def better_plans(q: Query) -> Check:
     return q.executed(TSM, REACHER) - q.executed(LSTM, REACHER) > 0
 
 
-def test_trials_are_averaged_inside_a_seed_and_counted_only_where_there_is_one() -> None:
+def test_seeds_and_targets_both_have_a_part_in_the_interval_and_with_one_seed_its_targets_alone() -> None:
     rule = returns(better_plans)
-    assert evaluate.judge(rule, frames(of_05_control_rows=trials(3))).key.n == "3 seeds"
+    key, several = evaluate.judge(rule, frames(of_05_control_rows=(rows := trials(3)))).key, pd.DataFrame(rows)
+    assert key.n == "20 trials of 3 seeds"
+    by_model = {m: own.pivot(index="seed", columns="target", values="value") for m, own in several.groupby("model")}
+    found = random_effects(by_model["tsm"] - by_model["lstm"])
+    np.testing.assert_allclose([key.value, key.low], [found.mean, found.mean - found.half()])
     rows = trials(1)
     values = {m: np.array([r["value"] for r in rows if r["model"] == m]) for m in ("tsm", "lstm")}
     mean, half = interval(values["tsm"] - values["lstm"])  # paired by target
@@ -410,6 +425,34 @@ def test_the_figure_has_a_row_for_every_claim_with_rows() -> None:
     nothing = report.margins([evaluate.judge(ahead(LSTM), Tables({}))])
     with pytest.raises(ValueError, match="no claim has rows"):
         figures.claim_margins(nothing)
+
+
+def test_two_random_effects_cover_the_mean_where_seeds_alone_do_not() -> None:
+    rng, covered = np.random.default_rng(0), {"both": 0, "seeds": 0}
+    for _ in range(400):
+        values = 0.3 * rng.standard_normal((5, 1)) + 2 * rng.standard_normal(20) + rng.standard_normal((5, 20))
+        both, (mean, half) = random_effects(values), interval(values.mean(1))
+        covered["both"] += abs(both.mean) <= both.half()
+        covered["seeds"] += abs(mean) <= half
+    assert covered["both"] >= 0.93 * 400
+    assert covered["seeds"] < 0.80 * 400
+
+
+def test_trials_that_are_a_seeds_own_leave_the_means_of_seeds_to_decide() -> None:
+    values = np.random.default_rng(0).standard_normal((5, 20))
+    mean, half = interval(values.mean(1))
+    own = random_effects(values, crossed=False)
+    assert (own.mean, own.half()) == pytest.approx((mean, half))
+
+
+def test_holm_rejects_step_by_step_and_skips_what_was_not_measured() -> None:
+    p_values, levels = (
+        [0.01, np.nan, 0.04, 0.03, 0.005],
+        [0.05] * 5,
+    )  # 0.005 < 0.05 / 4, 0.01 < 0.05 / 3, 0.03 > 0.05 / 2
+    assert holm(p_values, levels).tolist() == [True, False, False, False, True]
+    assert holm([0.02, 0.03], [0.025, 0.10]).tolist() == [True, True]  # each against its own level
+    assert not holm([], []).size
 
 
 def test_intervals_are_those_of_students_t() -> None:

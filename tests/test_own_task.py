@@ -95,6 +95,16 @@ def test_a_reward_of_the_wrong_shape_is_refused(wrong: Reward, found: str) -> No
         posed(wrong)
 
 
+def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None:
+    task = study.task("tsm/Reacher-v0").take(4)
+    some = task.take([3, 1])
+    assert torch.equal(some.target, task.target[[3, 1]])
+    assert (some.start == task.start[[3, 1]]).all()
+    for wrong in ([], [4], [-1]):
+        with pytest.raises(ValueError, match="choose some from 0 to 3"):
+            task.take(wrong)
+
+
 def test_a_reward_that_fails_says_what_it_was_given() -> None:
     with pytest.raises(ValueError, match=r"the reward fails on states \(2, 1, 3, 20, 6\) and actions \(1, 3, 20, 2\)"):
         posed(lambda states, actions: states[..., 4:6] - ARC[:7])

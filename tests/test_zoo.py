@@ -46,6 +46,16 @@ def test_older_headers_mean_the_defaults_of_what_came_later() -> None:
         assert zoo.stated(older) != [stage.stated() for stage in changed]
 
 
+def test_a_stage_says_all_that_training_takes_from_it() -> None:
+    stage = zoo.Stage("loss", 10, future_len=30, lr=1e-3, batch=64, muon=0.02, patience=3, span=(0.2, 0.7)).within(
+        60, False
+    )
+    options = stage.options(5, validate_every=7)
+    assert (options.past_len, options.future_len, options.steps, options.batch_size) == (5, 30, 600, 64)
+    assert (options.lr, options.muon, options.patience, options.span) == (1e-3, 0.02, 3, (0.2, 0.7))
+    assert options.validate_every == 7
+
+
 def test_every_model_has_a_look_of_its_own() -> None:
     looks = [spec.look for spec in zoo.ZOO.values()]
     assert len({look.name for look in looks}) == len({look.colour for look in looks}) == len(looks)

@@ -1,8 +1,10 @@
-"""Statistics: t interval, rank correlation, classifier two-sample test."""
+"""Statistics: t interval, two-way random effects, rank correlation, classifier two-sample test."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit
+from scipy.special import stdtr, stdtrit
 
 
 def interval(values: ArrayLike, level: float = 0.95) -> tuple[float, float]:
@@ -13,6 +15,59 @@ def interval(values: ArrayLike, level: float = 0.95) -> tuple[float, float]:
         return float(array.mean()), 0.0
     half = stdtrit(dof, (1 + level) / 2) * array.std(ddof=1) / np.sqrt(len(array))
     return float(array.mean()), float(half)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean, its standard error, and the degrees of freedom of that (0: there is no error)."""
+
+    mean: float
+    error: float
+    dof: int
+
+    def half(self, level: float = 0.95) -> float:
+        """Half the t interval of ``level``; 0 without an error."""
+        return float(stdtrit(self.dof, (1 + level) / 2) * self.error) if self.dof else 0.0
+
+    def p_below(self, bound: float) -> float:
+        """One-sided p value against a mean of at least ``bound``; NaN without an error."""
+        if not self.dof:
+            return float("nan")
+        away = self.mean - bound
+        return float(stdtr(self.dof, away / self.error)) if self.error else float(away >= 0)
+
+
+def random_effects(values: ArrayLike, *, crossed: bool = True) -> Estimate:
+    """Mean of ``values`` (seeds, trials) with the error that both seeds and trials have a part in.
+
+    crossed: the trials are the same in every seed, as frozen targets are. Two-way random effects without replication:
+    the variance of the mean is (MS_seeds + MS_trials - MS_rest) / n, of which each mean square alone is the least that
+    is taken; degrees of freedom are those of whatever there is less of, since a variance between few seeds is often
+    estimated too small. Not crossed: trials of a seed are its own, so that the means of seeds decide. With one seed the
+    trials decide, with one trial the seeds.
+    """
+    array = np.asarray(values, dtype=float)
+    seeds, trials = array.shape
+    if min(seeds, trials) == 1 or not crossed:
+        flat = array.ravel() if min(seeds, trials) == 1 else array.mean(1)
+        error = float(flat.std(ddof=1) / len(flat) ** 0.5) if len(flat) > 1 else 0.0
+        return Estimate(float(flat.mean()), error, len(flat) - 1)
+    mean, rows, columns = array.mean(), array.mean(1, keepdims=True), array.mean(0, keepdims=True)
+    of_seeds, of_trials = trials * rows.var(ddof=1), seeds * columns.var(ddof=1)
+    rest = ((array - rows - columns + mean) ** 2).sum() / ((seeds - 1) * (trials - 1))
+    square = max(of_seeds + of_trials - rest, of_seeds, of_trials)
+    return Estimate(float(mean), float((square / array.size) ** 0.5), min(seeds, trials) - 1)
+
+
+def holm(p_values: ArrayLike, levels: ArrayLike) -> np.ndarray:
+    """Which of several hypotheses Holm's procedure rejects (n,), each p value held against its own level; NaN: none."""
+    p, level = np.asarray(p_values, dtype=float), np.asarray(levels, dtype=float)
+    rejected, asked = np.zeros(len(p), dtype=bool), int(np.isfinite(p).sum())
+    for k, i in enumerate(np.argsort(np.where(np.isfinite(p), p / level, np.inf), kind="stable")[:asked]):
+        if p[i] > level[i] / (asked - k):
+            break
+        rejected[i] = True
+    return rejected
 
 
 def spearman(a: ArrayLike, b: ArrayLike) -> float:

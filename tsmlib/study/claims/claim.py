@@ -2,7 +2,8 @@
 
     REPLICATED          every check holds, and keeps its sign under every other reading of the paper that has rows
     READING-DEPENDENT   the checks hold under some reading, not under all
-    NOT REPLICATED      the interval of some check lies beyond its margin, on the wrong side
+    NOT REPLICATED      the interval of some check lies beyond its margin, on the wrong side, by Holm's procedure over
+                        the claim's checks
     INCONCLUSIVE        the interval of some check holds its margin, or there is none
     NOT TESTABLE        rows are missing, or were refused
     DEFINITIONAL        nothing that could be measured would contradict it; not counted
@@ -24,7 +25,7 @@ from tsmlib.study.claims.query import Check, Checks, Query
 from tsmlib.study.claims.shown import Shown
 from tsmlib.study.zoo import PAPERS
 
-VERSION = 2  # raise it when verdicts are reached in another way: those that are stored are void then
+VERSION = 3  # raise it when verdicts are reached in another way: those that are stored are void then
 REPLICATED, DEPENDENT, INCONCLUSIVE, FAILED, UNTESTABLE, DEFINITIONAL = VERDICTS = (
     "REPLICATED", "READING-DEPENDENT", "INCONCLUSIVE", "NOT REPLICATED", "NOT TESTABLE", "DEFINITIONAL",
 )  # fmt: skip

@@ -2,8 +2,13 @@
 
     claim -> checks -> effects and their intervals over training seeds -> verdict
 
-With one training seed the interval is over its trials (jackknife) if every term of the check has them, and then says
-nothing about training; without them there is no interval, and nothing follows.
+Where every term of a check has trials (targets, copies of a policy), the interval is of their pseudo-values
+(jackknife): over seeds and targets as two random effects, since the targets are the same in every seed; over the means
+of seeds, where trials are a seed's own copies. With one training seed it is over its trials, and then says nothing
+about training; without trials there is no interval, and nothing follows.
+
+A claim holds if every check does, at its own level. It fails if some check does: by Holm's procedure over the claim's
+checks, so that many checks do not make a failure likely by chance.
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-from tsmlib.statistics import interval
+from tsmlib.statistics import Estimate, holm, random_effects
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Claim
 from tsmlib.study.claims.query import Check, Term
@@ -41,7 +46,10 @@ class ClaimError(ValueError):
 
 @dataclass(frozen=True)
 class Effect:
-    """What rows say of a check: estimate, interval where there is one, n in words, and a state."""
+    """What rows say of a check: estimate, interval where there is one, n in words, and a state.
+
+    p: one-sided p value against lying on the claimed side of the margin, where there is an interval.
+    """
 
     check: Check
     state: str  # holds, fails, open or missing
@@ -50,6 +58,7 @@ class Effect:
     high: float | None = None
     n: str = ""
     why: str = ""
+    p: float = np.nan
 
     @property
     def beyond(self) -> np.ndarray:
@@ -171,7 +180,10 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
 
 def judge(claim: Claim, rows: Tables) -> Verdict:
     """What rows say of a claim."""
-    effects = {reading: [_effect(claim, check, rows) for check in checks] for reading, checks in claim.checks.items()}
+    effects = {
+        reading: _of_one_family([_effect(claim, check, rows) for check in checks])
+        for reading, checks in claim.checks.items()
+    }
     states = {reading: min((e.state for e in found), key=STATES.index) for reading, found in effects.items()}
     first, key = states.pop(""), min(effects[""], key=lambda effect: effect.ease)
     holds = [reading for reading, found in states.items() if found == "holds"]
@@ -196,6 +208,15 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
 
 
+def _of_one_family(effects: Sequence[Effect]) -> list[Effect]:
+    """The effects of one reading; of those that fail by themselves only what Holm's procedure leaves."""
+    rejected = holm([effect.p for effect in effects], [(1 - effect.check.level) / 2 for effect in effects])
+    return [
+        replace(effect, state="open") if effect.state == "fails" and np.isfinite(effect.p) and not left else effect
+        for effect, left in zip(effects, rejected, strict=True)
+    ]
+
+
 def _effect(claim: Claim, check: Check, rows: Tables) -> Effect:
     try:
         return measure(check, rows)
@@ -210,10 +231,22 @@ def measure(check: Check, rows: Tables) -> Effect:
     if not asked:  # arithmetic
         exact = float(check.number.of({}))
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
+    values, n = of_seeds(check, asked)
+    return compared(check, random_effects(values, crossed=not any(term.curve for term in asked)), n)
+
+
+def of_seeds(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[np.ndarray, str]:
+    """A check's values (seeds, trials), one column where there are no trials, and n in words. asked: rows of its terms.
+
+    ClaimError where they do not belong together.
+    """
     seeds, own = _paired(check, asked)
+    whole = not any(np.isnan(found).any() for found in own.values())
 
     def number(i: int, without: int | None = None) -> float:
-        rows = {term: values[i][~np.isnan(values[i])] if term.trials else values[i, 0] for term, values in own.items()}
+        rows = {term: values[i] if term.trials else values[i, 0] for term, values in own.items()}
+        if not whole:
+            rows = {term: values[~np.isnan(values)] if term.trials else values for term, values in rows.items()}
         if without is not None:
             rows = {term: np.delete(values, without) for term, values in rows.items()}
         with np.errstate(all="ignore"):
@@ -222,18 +255,27 @@ def measure(check: Check, rows: Tables) -> Effect:
             raise ClaimError(f"{check.text}: {value} in seed {seeds[i]}", check.number.terms[0].table)
         return value
 
-    values, n = np.array([number(i) for i in range(len(seeds))]), f"{len(seeds)} seed{'s' * (len(seeds) > 1)}"
+    values, n = np.array([[number(i)] for i in range(len(seeds))]), f"{len(seeds)} seed{'s' * (len(seeds) > 1)}"
     trials = min(found.shape[1] for found in own.values())  # 1 where a term has none
-    if len(seeds) == 1 and trials > 1:  # pseudo-values: of a mean, the trials' own
-        values = trials * values[0] - (trials - 1) * np.array([number(0, without=i) for i in range(trials)])
-        n = f"{trials} trials of 1 seed"
-    mean, half = interval(values, check.level)
-    if len(values) == 1:
-        return Effect(check, "open", mean, n=n)
-    low, high = mean - half, mean + half
+    if trials > 1 and whole:
+        # pseudo-values (seeds, trials): of a mean, the trials' own
+        left_out = np.array([[number(i, without=j) for j in range(trials)] for i in range(len(seeds))])
+        values = trials * values - (trials - 1) * left_out
+        n = f"{trials} trials of {n}"
+    return values, n
+
+
+def compared(check: Check, found: Estimate, n: str) -> Effect:
+    """The effect of a check, from its estimate."""
+    if not found.dof:
+        return Effect(check, "open", found.mean, n=n)
+    half = found.half(check.level)
+    low, high = found.mean - half, found.mean + half
     inside = check.op != "==" and low <= check.margin <= high
     state = "holds" if check.accepts(low, high) else "open" if inside else "fails"
-    return Effect(check, state, mean, low, high, n)
+    below = found.p_below(check.margin)
+    p = np.nan if check.op == "==" else 1 - below if check.op[0] == "<" else below
+    return Effect(check, state, found.mean, low, high, n, p=p)
 
 
 def _paired(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[list[int], dict[Term, np.ndarray]]:

@@ -1,0 +1,127 @@
+"""How often verdicts are wrong: the checker on simulated worlds whose truth is known, and its power on published rows.
+
+    python benchmarks/verdicts/run.py
+
+worlds.csv: claims of 1, 3 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
+every seed. A check's value is effect + seed + target + rest, each normal, of the deviations in PLANS and SCORES.
+effect: in units of the margin; at 1 the claim is false, and true by any larger number. Wrong verdicts are REPLICATED at
+an effect of 1, and NOT REPLICATED at an effect of 1 as well, where the truth is just not on the wrong side.
+
+checks.csv: every check of the ledger whose published rows have two seeds or more, and a margin: the deviation of its
+values over seeds, and the share of simulated studies of ten seeds, with that deviation and an effect as far beyond the
+margin as that is from zero, in which it holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from tsmlib.statistics import random_effects
+from tsmlib.storage import files
+from tsmlib.study.claims import evaluate, ledger
+from tsmlib.study.claims.claim import FAILED, REPLICATED, Claim
+from tsmlib.study.claims.query import REACHER, TSM, Check, Checks, Model, Query, Term
+from tsmlib.study.claims.shown import FIGURE5
+from tsmlib.study.zoo import PAPERS
+
+HERE = Path(__file__).resolve().parent
+MARGIN, SEEDS = 1.0, 10
+
+
+class Deviations(NamedTuple):
+    """Standard deviations of a check's value, in units of the margin; targets: how many, 1 for scores."""
+
+    seed: float
+    target: float
+    rest: float
+    targets: int
+
+
+SCORES = Deviations(0.5, 0.0, 0.0, 1)
+PLANS = Deviations(0.5, 2.5, 2.5, 100)
+
+
+class World(evaluate.Tables):
+    """Rows of a world: a value (seeds, targets) of each rival, and 0 for the paper's model."""
+
+    def __init__(self, effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator) -> None:
+        shape = (len(effects), seeds, how.targets)
+        values = effects[:, None, None] + how.seed * rng.standard_normal((*shape[:2], 1))
+        values = (
+            values + how.target * rng.standard_normal((shape[0], 1, shape[2])) + how.rest * rng.standard_normal(shape)
+        )
+        self.values = {f"rival{i}": -each for i, each in enumerate(values)} | {PAPERS: np.zeros(shape[1:])}
+
+    def ask(self, term: Term) -> pd.DataFrame:
+        return pd.DataFrame(self.values[term.model])
+
+
+def ahead(n_checks: int, *, trials: bool) -> Claim:
+    """The paper's model is ahead of each of so many rivals by more than the margin."""
+
+    def rule(q: Query) -> Checks:
+        ask = q.executed if trials else q.ll
+        for i in range(n_checks):
+            found = ask(TSM, REACHER) - ask(Model(f"rival{i}"), REACHER) > MARGIN
+            assert isinstance(found, Check)
+            yield found
+
+    return Claim("X1", "simulated", FIGURE5, "it")(rule)
+
+
+def worlds(studies: int, rng: np.random.Generator) -> pd.DataFrame:
+    """A line for each kind of rows, number of seeds, of checks, and effect."""
+    lines = []
+    for (kind, how), seeds, n_checks, effect in product(
+        {"scores": SCORES, "plans": PLANS}.items(), (1, 3, 10), (1, 8), (1.0, 2.0)
+    ):
+        asked, effects = ahead(n_checks, trials=how.targets > 1), np.full(n_checks, effect)
+        words = [evaluate.judge(asked, World(effects, seeds, how, rng)).word for _ in range(studies)]
+        shares = {word.lower(): words.count(word) / studies for word in (REPLICATED, FAILED)}
+        lines.append({"rows": kind, "seeds": seeds, "checks": n_checks, "effect": effect, **shares, "studies": studies})
+    return pd.DataFrame(lines)
+
+
+def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
+    """A line for each check of the ledger with rows of several seeds and a margin."""
+    claims, lines = ledger.claims(PAPERS), []
+    rows = evaluate.tables(claims)
+    for name, check in ((claim.id, check) for claim in claims for check in claim.checks[""]):
+        if not check.margin or check.op == "==" or not check.number.terms:
+            continue
+        try:
+            values, _ = evaluate.of_seeds(check, {term: rows.ask(term) for term in check.number.terms})
+        except evaluate.ClaimError:
+            continue
+        if len(values) < 2:
+            continue
+        effect = check.margin + abs(check.margin) * (-1 if check.op[0] == "<" else 1)
+        deviation = float(values.mean(1).std(ddof=1))
+        drawn = effect + deviation * rng.standard_normal((studies, SEEDS, 1))
+        holds = [evaluate.compared(check, random_effects(study), "").state == "holds" for study in drawn]
+        lines.append({
+            "claim": name, "check": check.text, "seeds": len(values), "deviation": f"{deviation:.3g}",
+            "margin": check.margin, "power": f"{np.mean(holds):.3f}", "studies": studies,
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--studies", type=int, default=400, help="of each line (default 400)")
+    parser.add_argument("--out", type=Path, default=HERE, help="folder (default: that of this script)")
+    given = parser.parse_args()
+    rng = np.random.default_rng(0)
+    for name, lines in {"checks": checks(given.studies, rng), "worlds": worlds(given.studies, rng)}.items():
+        files.write_bytes(given.out / f"{name}.csv", lines.to_csv(index=False).encode())
+        print(lines.to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()
