@@ -3,9 +3,10 @@
     python benchmarks/settings/rows.py predict --scale paper --envs tsm/ReacherPush-v1 --models tsm rtsm lstm
     python benchmarks/settings/rows.py control --scale paper --envs tsm/ReacherPush-v1 --models rtsm lstm --closed rtsm
 
-predict: open loop and on segments (03_predict). control: plans by the cross-entropy method in both search spaces, open
-loop, and in codes planned again every ten steps for --closed; with the oracle over codes, no torque and random torques
-beside them (05_control). Models, scores and plans are those of the run, so what is missing is made first.
+predict: open loop and on segments (03_predict). control: plans by each planner in both search spaces, open loop, and by
+the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes, no torque and
+random torques beside them (05_control). Models, scores and plans are those of the run, so what is missing is made
+first.
 
 Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
 """
@@ -20,7 +21,7 @@ import pandas as pd
 
 from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS
-from tsmlib.figures.method import SEARCH_SPACES
+from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
 from tsmlib.study import runs, zoo
 from tsmlib.study.predictions import RESULTS
@@ -48,11 +49,12 @@ def publish(name: str, rows: Iterable[Row]) -> None:
 
 
 def controlled(
-    run: runs.Run, envs: list[str], models: list[str], closed: list[str], spaces: list[str]
+    run: runs.Run, envs: list[str], models: list[str], closed: list[str], spaces: list[str], planners: list[str]
 ) -> tuple[list[Row], list[Row]]:
     """Rows of 05_control.csv and 05_control_rows.csv."""
     tasks = [study.load_task(env) for env in envs]
-    trials = study.trials(run, tasks, [*zoo.methods(models, "cem", spaces), *FLOORS])
+    ways = [way for planner in planners for way in zoo.methods(models, planner, spaces)]
+    trials = study.trials(run, tasks, [*ways, *FLOORS])
     rows, targets = planning.rows(tasks, trials, run)
     if closed:
         loops = study.trials(run, tasks, zoo.methods(closed, "cem", ["latent"]), every=10)
@@ -68,6 +70,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", required=True, choices=zoo.words(), metavar="MODEL")
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
+    parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -76,7 +79,7 @@ def main() -> None:
     if given.part == "predict":
         publish(notebook, study.score_rows(run, [(env, word) for env in given.envs for word in given.models]))
     else:
-        rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces)
+        rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)
         publish(f"{notebook}_rows", targets)
     manifest.write_manifest(Path(RESULTS).parent)
