@@ -49,6 +49,7 @@ class Effect:
     """What rows say of a check: estimate, interval where there is one, n in words, and a state.
 
     p: one-sided p value against lying on the claimed side of the margin, where there is an interval.
+    seeds: of training.
     """
 
     check: Check
@@ -59,6 +60,7 @@ class Effect:
     n: str = ""
     why: str = ""
     p: float = np.nan
+    seeds: int = 0
 
     @property
     def beyond(self) -> np.ndarray:
@@ -232,7 +234,8 @@ def measure(check: Check, rows: Tables) -> Effect:
         exact = float(check.number.of({}))
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
     values, n = of_seeds(check, asked)
-    return compared(check, random_effects(values, crossed=not any(term.curve for term in asked)), n)
+    found = compared(check, random_effects(values, crossed=not any(term.curve for term in asked)), n)
+    return replace(found, seeds=len(values))
 
 
 def of_seeds(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[np.ndarray, str]:

@@ -5,17 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from tsmlib.study.claims.claim import DEFINITIONAL, REPLICATED, VERDICTS, Claim
+from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, REPLICATED, VERDICTS, Claim
 from tsmlib.study.claims.evaluate import Verdict
 from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
 
+DECIDED = (REPLICATED, DEPENDENT, FAILED)
+
 
 def counts(verdicts: Sequence[Verdict]) -> str:
-    """How often each verdict was given; what holds by definition is not counted."""
+    """How often each verdict was given, and by one training seed alone; what holds by definition is left out."""
     words = [verdict.word for verdict in verdicts]
     given = ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS if word != DEFINITIONAL)
-    return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}"
+    single = sum(verdict.word in DECIDED and verdict.key.seeds == 1 for verdict in verdicts)
+    by_one = f" ({single} of the decided by one training seed)" if single else ""
+    return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}{by_one}"
 
 
 def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "") -> str:
