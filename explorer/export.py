@@ -2,9 +2,8 @@
 
     python explorer/export.py explorer/dist
 
-From the shipped safetensors, whose checksums are verified when they are loaded. Weights are laid out as the kernel
-reads them: matrices (inputs, outputs) row by row, outputs padded with zeros to a multiple of 8, the last layer scaled
-to the units of a step.
+From the shipped safetensors, whose checksums are verified when they are loaded. Weights are matrices (inputs,
+outputs) row by row, outputs padded with zeros to a multiple of 8, the last layer scaled to the units of a step.
 """
 
 from __future__ import annotations

@@ -11,12 +11,15 @@ const MODELS = { rtsm: 'recurrent TSM', tsm: 'TSM', lstm: 'LSTM', onestep: 'one-
 const STEP = 0.005, LONG_STEP = 0.02; // metres per key
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const LAST = 20; // tries in the plot
+const SAME = 6; // tries in the table
+const WAIT = 200; // ms from a choice or a key to the plan, in case that more follow
+const FOOLED = 1; // cm, by which the mean distance to the target may differ from the prediction
 const still = matchMedia('(prefers-reduced-motion: reduce)'), dark = matchMedia('(prefers-color-scheme: dark)');
 const signed = (v, digits = 2) => v.toFixed(digits).replace('-', '−');
 
 const state = {
   manifest: null, scene: defaultScene(), result: null, time: 0, playing: false, planning: false, failed: false,
-  view: matchMedia('(max-width: 700px)').matches ? 'over' : 'beside', tries: [], bent: null, tour: -1, id: 0,
+  view: matchMedia('(max-width: 700px)').matches ? 'over' : 'beside', tries: [], bent: null, tour: -1, id: 0, waiting: 0, touched: false,
 };
 const worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
 const views = { predicted: new View($('predicted')), executed: new View($('executed')) };
@@ -142,11 +145,13 @@ function placeHandles() {
     const { what } = handle.dataset, point = position(what);
     handle.hidden = !point;
     if (!point) continue;
+    delete handle.dataset.name;
     const [a, b] = toShare(point), cm = point.map(v => signed(100 * v, 1));
     handle.style.left = `${100 * a}%`;
     handle.style.top = `${100 * b}%`;
     const name = what === 'block' && state.scene.task === 'obstacle' ? 'Obstacle' : NAMES[what];
     handle.setAttribute('aria-label', `${name} at ${cm[0]}, ${cm[1]} cm; arrow keys move it${what === 'arm' ? ', F bends the elbow the other way' : ''}`);
+    if (!state.touched && handle.tabIndex === 0) handle.dataset.name = name.toLowerCase();
     handle.title = what === 'arm' ? 'Fingertip at the start: drag it, or double-click to bend the elbow the other way' : `${name}: drag it`;
   }
 }
@@ -156,6 +161,7 @@ function grab(event) {
   event.preventDefault();
   handle.focus({ preventScroll: true });
   handle.setPointerCapture(event.pointerId);
+  state.touched = true;
   let changed = false;
   const follow = ({ clientX, clientY }) => {
     const box = frame.getBoundingClientRect();
@@ -176,11 +182,13 @@ function push(event) {
   if (!direction) return;
   event.preventDefault();
   const far = event.shiftKey ? LONG_STEP : STEP;
-  change(moved(state.scene, what, position(what).map((v, i) => v + far * direction[i]), arm));
+  state.touched = true;
+  if (change(moved(state.scene, what, position(what).map((v, i) => v + far * direction[i]), arm))) planSoon();
 }
 
 function flip() {
-  if (change(flipped(state.scene, state.manifest.arm))) plan();
+  state.touched = true;
+  if (change(flipped(state.scene, state.manifest.arm))) planSoon();
 }
 
 /** Take a scene where it is another one; what was planned for the one before is gone. */
@@ -194,7 +202,8 @@ function change(scene) {
 
 function forget() {
   worker.postMessage({ type: 'stop' });
-  Object.assign(state, { result: null, bent: null, time: 0, playing: false, planning: false });
+  clearTimeout(state.waiting);
+  Object.assign(state, { waiting: 0, result: null, bent: null, time: 0, playing: false, planning: false });
   for (const knob of [0, 1]) $(`knob-${knob}`).value = 0;
 }
 
@@ -207,9 +216,11 @@ function show() {
   $('space').value = scene.space;
   $('replan').checked = scene.replan;
   $('plan').disabled = planning || state.failed;
+  $('plan').textContent = done ? 'Try again' : 'Plan';
+  $('plan').title = done ? 'The same scene, with other random numbers for the planner' : '';
   $('views').dataset.view = state.view;
   for (const button of document.querySelectorAll('[data-set-view]')) button.setAttribute('aria-pressed', String(button.dataset.setView === state.view));
-  $('caption-predicted').textContent = state.view === 'over' ? `Outline: predicted by the ${MODELS[scene.model]}. Solid: executed by MuJoCo` : `Predicted by the ${MODELS[scene.model]}`;
+  $('caption-predicted').textContent = state.view === 'over' ? `Outline: ${MODELS[scene.model]}. Solid: MuJoCo` : `Predicted by the ${MODELS[scene.model]}`;
   $('time').max = horizon();
   $('time').disabled = $('play').disabled = !result?.parts.length;
   $('time').value = state.time;
@@ -221,17 +232,20 @@ function show() {
   $('outside').hidden = !marks.length;
   $('outside').textContent = marks.length ? `Outside the training data: ${marks.join('; ')}. The model may be wrong there.` : '';
   $('outcome').setAttribute('aria-busy', String(planning)); // a screen reader waits for the outcome
-  $('numbers').hidden = $('meaning').hidden = !done;
+  $('numbers').hidden = $('agreement').hidden = !done;
   $('legend').textContent = legend();
   if (done) {
     $('predicted-return').textContent = signed(done.predicted);
     $('executed-return').textContent = signed(done.executed);
-    $('gap').textContent = signed(Number(done.predicted.toFixed(2)) - Number(done.executed.toFixed(2))); // as the two above it say
+    $('gap').textContent = gapOf(done);
     $('distance').textContent = `${(100 * done.distance).toFixed(1)} cm`;
   }
   $('guide-result').textContent = done ? `Here: predicted return ${$('predicted-return').textContent}, executed ${$('executed-return').textContent}, gap ${$('gap').textContent}; ends ${$('distance').textContent} from the target.` : '';
   $('verdict').className = `verdict ${done ? (done.success ? 'good' : 'bad') : ''}`;
   $('verdict').textContent = verdict();
+  $('agreement').className = `agreement ${done && fooled(done) ? 'fooled' : ''}`;
+  $('agreement').textContent = done ? agreement() : '';
+  showTries();
   const knobs = model.knobs, usable = knobs.length > 0 && done && !scene.replan;
   $('knobs').disabled = !usable;
   [0, 1].forEach(k => {
@@ -264,13 +278,51 @@ function verdict() {
     const { candidates, iterations, ms } = result.parts.at(-1);
     return `Executing and planning again: ${candidates} × ${iterations} candidates in ${Math.round(ms)} ms.`;
   }
-  if (planning) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} predicted so far.` : 'Planning…';
-  if (!done && state.tries.length) return 'Other settings: press Plan, or drag the target.';
+  if (planning || state.waiting) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} predicted so far.` : 'Planning…';
   if (!done) return scene.task === 'push' ? 'Drag the target, the object or the fingertip; or press Plan.' : 'Drag the target or the fingertip; or press Plan.';
-  const how = scene.replan ? 'planned again every ten steps' : 'open loop: planned once, executed without looking';
-  const cm = `${Math.round(100 * about().tolerance)} cm`, what = scene.task === 'push' ? 'The object' : 'The fingertip';
-  return done.success ? `Arrived: ${what.toLowerCase()} ends within ${cm} (${how}).` : `Missed: ${what.toLowerCase()} does not end within ${cm} (${how}).`;
+  return `${done.success ? 'Arrived' : 'Missed'}: ${(100 * done.distance).toFixed(1)} cm off target (success: within ${Math.round(100 * about().tolerance)} cm).`;
 }
+
+/** What has to arrive. */
+const mover = task => (task === 'push' ? 'object' : 'fingertip');
+
+/** How much farther (cm) from the target it was executed than predicted, in the mean over time: both spent the same torques. */
+const farther = ({ predicted, executed, replan, steps }) => (replan ? 0 : 100 * (predicted - executed) / steps);
+const fooled = one => farther(one) > FOOLED;
+
+/** Prediction against execution, in words. */
+function agreement() {
+  const { scene, result: { done } } = state, cm = farther(done), much = `${Math.abs(cm).toFixed(1)} cm`;
+  if (scene.replan) return 'Planned again every ten steps, from what the arm really did. The predicted return is that of the first plan.';
+  const how = 'Open loop: one plan, executed without looking.', what = `on average the ${mover(scene.task)} was ${much} ${cm > 0 ? 'farther from' : 'nearer to'} the target than predicted`;
+  if (fooled(done)) return `${how} The model was fooled: ${what}.`;
+  return cm < -FOOLED ? `${how} The model was too pessimistic: ${what}.` : `${how} Model and execution agree: ${what}.`;
+}
+
+/** What of a scene stays the same when another model or another search is tried. */
+const startOf = ({ task, arm, block, target }) => toLink({ task, arm, block, target, model: '', space: '', replan: false, seed: 0 });
+
+/** The table of tries from the start on the screen, the latest first. */
+function showTries() {
+  const start = startOf(state.scene), same = state.tries.filter(one => one.start === start).slice(-SAME).reverse();
+  $('tries').replaceChildren(...same.map(one => {
+    const row = document.createElement('tr'), swatch = document.createElement('span');
+    const cell = (text, className = '') => Object.assign(row.insertCell(), { textContent: text, className });
+    Object.assign(swatch, { className: 'swatch' }).style.background = colourOf(one.model);
+    cell(MODELS[one.model]).prepend(swatch);
+    cell(`${one.space === 'latent' ? 'like the data’s' : 'any torques'}${one.replan ? ', again every ten steps' : ''}`);
+    cell(signed(one.predicted));
+    cell(signed(one.executed));
+    cell(`${gapOf(one)}${fooled(one) ? ' fooled' : ''}`, fooled(one) ? 'fooled' : '');
+    cell(`${(100 * one.distance).toFixed(1)} cm`);
+    return row;
+  }));
+  $('meaning').textContent = `${same.length ? '' : 'None yet. '}Return: minus the distance to the target in metres and the squared torques, summed over ${horizon()} steps; nearer to 0 is better. `
+    + `Fooled: open loop, the ${mover(state.scene.task)} was on average over ${FOOLED} cm farther from the target than predicted.`;
+}
+
+/** The gap of the returns as they are printed. */
+const gapOf = ({ predicted, executed }) => signed(Number(predicted.toFixed(2)) - Number(executed.toFixed(2)));
 
 // Time ------------------------------------------------------------------------------------------------------------------
 
@@ -321,6 +373,19 @@ function plan() {
   show();
 }
 
+/** Plan when a person has chosen; not for each of several choices or keys in a row. */
+function planSoon() {
+  clearTimeout(state.waiting);
+  state.waiting = setTimeout(plan, WAIT);
+  show();
+}
+
+/** Another try from the same start: other random numbers. */
+function tryAgain() {
+  if (state.result?.done) change({ ...state.scene, seed: state.scene.seed + 1 });
+  plan();
+}
+
 function fail(message) {
   Object.assign(state, { planning: false, failed: true });
   $('notice').hidden = false;
@@ -335,7 +400,9 @@ const answers = {
     start();
   },
   loaded() {
+    const first = !document.body.dataset.ready;
     document.body.dataset.ready = 'yes';
+    if (first && !state.result) plan();
   },
   error({ message }) {
     fail(message);
@@ -354,12 +421,12 @@ const answers = {
     else play();
   },
   done(done) {
-    const { result, scene } = state;
-    result.done = done;
+    const { result, scene } = state, { model, space, replan } = scene;
+    result.done = { ...done, replan, steps: horizon() };
     state.planning = false;
     if (still.matches) state.time = horizon();
-    state.tries = [...state.tries, { ...done, colour: colourOf(scene.model), space: scene.space }].slice(-LAST);
-    drawReturns($('returns'), state.tries);
+    state.tries = [...state.tries, { ...result.done, model, space, start: startOf(scene) }].slice(-LAST);
+    plot();
     show();
   },
   imagined({ from, states }) {
@@ -370,6 +437,10 @@ const answers = {
     redraw();
   },
 };
+
+function plot() {
+  drawReturns($('returns'), state.tries.map(one => ({ ...one, colour: colourOf(one.model) })));
+}
 
 let asked = false, wanted = false;
 
@@ -437,15 +508,18 @@ function copyLink() {
 
 function start() {
   makeHandles();
-  drawReturns($('returns'), []);
+  plot();
   restore(location.hash);
   const choose = key => event => {
     if (key === 'task') change({ ...defaultScene(event.target.value), model: state.scene.model, space: state.scene.space, replan: state.scene.replan });
     else change({ ...state.scene, [key]: key === 'replan' ? event.target.checked : event.target.value });
     worker.postMessage({ type: 'load', task: state.scene.task, model: state.scene.model });
+    planSoon();
+    const { bottom, height } = $('views').getBoundingClientRect(); // on a narrow screen the choices are below the picture
+    if (bottom < height / 2) $('views').scrollIntoView({ block: 'start', behavior: still.matches ? 'auto' : 'smooth' });
   };
   for (const key of ['task', 'model', 'space', 'replan']) $(key).addEventListener('change', choose(key));
-  $('plan').addEventListener('click', plan);
+  $('plan').addEventListener('click', tryAgain);
   $('play').addEventListener('click', () => { if (state.playing) { state.playing = false; show(); } else play(); });
   $('time').addEventListener('input', scrub);
   for (const knob of [0, 1]) $(`knob-${knob}`).addEventListener('input', () => { show(); turn(); });
@@ -457,8 +531,8 @@ function start() {
   $('guide-back').addEventListener('click', () => visit(state.tour - 1));
   $('guide-next').addEventListener('click', () => visit(state.tour + 1));
   $('guide-end').addEventListener('click', () => visit(-1));
-  addEventListener('hashchange', () => restore(location.hash));
-  dark.addEventListener('change', show);
+  addEventListener('hashchange', () => { restore(location.hash); plan(); });
+  dark.addEventListener('change', () => { plot(); show(); });
   new ResizeObserver(redraw).observe($('views'));
 }
 

@@ -1,5 +1,5 @@
 // A worker beside the planner's, which judges a share of the candidates.
-//   in: [question, rows, parameters] of session.evaluate       out: { values } | { message }
+//   in: the arguments of session.evaluate after the first       out: { found } | { message }
 import { readManifest } from './files.js';
 import { Library, evaluate } from './session.js';
 
@@ -8,7 +8,7 @@ library.catch(() => {}); // said when it is asked
 
 onmessage = async ({ data }) => {
   try {
-    postMessage({ values: await evaluate(await library, ...data) });
+    postMessage({ found: await evaluate(await library, ...data) });
   } catch ({ message }) {
     postMessage({ message });
   }

@@ -3,6 +3,15 @@ import { PageError, read } from './files.js';
 
 export const CAPACITY = 64; // rows, a multiple of 4
 
+/** Weights (nin, nout) in panels of 8 columns, (nout / 8, nin, 8), as kernel.ts reads them. */
+function panels(w, nin, nout) {
+  const found = new Float32Array(w.length);
+  for (let o = 0, to = 0; o < nout; o += 8) {
+    for (let i = 0; i < nin; i++, to += 8) found.set(w.subarray(i * nout + o, i * nout + o + 8), to);
+  }
+  return found;
+}
+
 export class Kernel {
   static async load(reader = read) {
     if (!globalThis.WebAssembly) {
@@ -42,7 +51,7 @@ export class Kernel {
   /** A layer of the export: w (nin, nout), b (nout) or zeros. */
   layer(arrays, name) {
     const [nin, nout] = arrays[`${name}.w`].shape, bias = arrays[`${name}.b`]?.data ?? new Float32Array(nout);
-    return { w: this.put(arrays[`${name}.w`].data), b: this.put(bias), nin, nout };
+    return { w: this.put(panels(arrays[`${name}.w`].data, nin, nout)), b: this.put(bias), nin, nout };
   }
 
   /** y = init + x W; init: an address with one row, or rows ``stride`` apart; by default the bias. */

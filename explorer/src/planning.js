@@ -82,7 +82,7 @@ export async function* cem(space, judge, { start = new Float32Array(space.size),
   };
   let best = { parameters: Float32Array.from(start), value: await judgeOne(start) };
   const update = (parameters, value) => {
-    if (value > best.value || !Number.isFinite(best.value)) best = { parameters: Float32Array.from(parameters), value };
+    if (Number.isFinite(value) && !(value <= best.value)) best = { parameters: Float32Array.from(parameters), value };
   };
   for (let iteration = 0; iteration < iterations; iteration++) {
     const parameters = new Float32Array(candidates * n);
@@ -90,8 +90,13 @@ export async function* cem(space, judge, { start = new Float32Array(space.size),
       space.noise(draw, noise);
       for (let i = 0; i < n; i++) parameters[row * n + i] = mean[i] + deviation[i] * noise[i];
     }
-    if (iteration) parameters.set(best.parameters, 0);
+    if (iteration) parameters.set(mean, 0); // in the place of the best so far, whose return is known
     const found = await judge(candidates, parameters);
+    if (iteration) {
+      update(mean, found[0]);
+      parameters.set(best.parameters, 0);
+      found[0] = best.value;
+    }
     const worst = Math.min(0, ...found.filter(Number.isFinite)); // a candidate on which the model diverges, or that was sorted out
     const order = [...found.keys()].sort((a, b) => (Number.isFinite(found[b]) ? found[b] : worst) - (Number.isFinite(found[a]) ? found[a] : worst));
     for (let i = 0; i < n; i++) {
@@ -102,10 +107,9 @@ export async function* cem(space, judge, { start = new Float32Array(space.size),
       deviation[i] = keep * deviation[i] + (1 - keep) * Math.sqrt(square / (elites - 1));
     }
     const top = order[0];
-    if (Number.isFinite(found[top])) update(parameters.subarray(top * n, (top + 1) * n), found[top]);
-    const value = await judgeOne(mean);
-    if (Number.isFinite(value)) update(mean, value);
+    update(parameters.subarray(top * n, (top + 1) * n), found[top]);
     yield { iteration: iteration + 1, value: best.value };
   }
+  update(mean, await judgeOne(mean));
   return best;
 }

@@ -12,6 +12,7 @@ import { normal, uniform } from './random.js';
 export const SAMPLES = 32; // futures of the fan, and behind a predicted return, as in tsmlib.planning.predictors
 export const EVERY = 10; // steps executed before the next plan
 const FEWEST = 12; // candidates, of which one group of 4 is judged by all decoders
+const ALONE = 8; // rows in which CEM judges its start and its last mean
 const KEPT = 4; // of so many candidates one is judged by all decoders
 const L = 10, DU = 2;
 
@@ -96,31 +97,37 @@ function searchSpace(space, prior, past, horizon) {
 const measured = (task, dx) => ({ dx, position: task === 'push' ? 6 : 4 });
 
 /**
- * Mean return (rows) of candidates over the modes of some decoders, which are named by their numbers.
- * question: { task, model, space, past, horizon, target, which }
+ * Returns (rows) of candidates over the mode of one decoder, and their actions: { values, actions }.
+ * question: { task, model, space, past, horizon, target }; candidates: { parameters } of the search space, or { actions }
  */
-export async function evaluate(library, { task, model, space, past, horizon, target, which }, rows, parameters) {
+export async function evaluate(library, { task, model, space, past, horizon, target }, decoder, rows, { parameters, actions }) {
   const [decoders, prior] = await Promise.all([library.model(task, model), library.prior(task)]);
-  const actions = searchSpace(space, prior, past, horizon).decode(rows, parameters), found = new Float64Array(rows);
-  for (const k of which) {
-    const states = decoders[k].rollout(rows, past, actions, horizon);
-    const values = returns(rows, states, actions, target, measured(task, library.manifest.tasks[task].stateDim));
-    for (let row = 0; row < rows; row++) found[row] += values[row] / which.length;
-  }
-  return found;
+  actions ??= searchSpace(space, prior, past, horizon).decode(rows, parameters);
+  const states = decoders[decoder].rollout(rows, past, actions, horizon);
+  return { actions, values: returns(rows, states, actions, target, measured(task, library.manifest.tasks[task].stateDim)) };
 }
 
-/** The same, with the candidates shared out among this worker and its helpers. */
-async function share(library, question, rows, parameters) {
-  const { helpers } = library, wide = parameters.length / rows, many = Math.ceil(rows / 4 / (helpers.length + 1)) * 4;
-  const begins = Array.from({ length: Math.ceil(rows / many) }, (_, k) => k * many).reverse(); // its own share is the last
-  const parts = begins.map((from, k) => {
-    const count = Math.min(many, rows - from), part = parameters.slice(from * wide, (from + count) * wide);
-    return from ? helpers[k](question, count, part) : evaluate(library, question, count, part);
+/** Rows of an array that holds ``rows`` of them. */
+const rowsOf = (values, rows, from, to) => values.subarray(from * values.length / rows, to * values.length / rows);
+
+/**
+ * Mean returns over some decoders, and the actions, with the work shared out among this worker and its helpers: each has
+ * one decoder and all candidates, or where there are fewer decoders than workers, some of the candidates.
+ */
+async function share(library, question, which, rows, candidates) {
+  const workers = [(...job) => evaluate(library, ...job), ...library.helpers], [[kind, given]] = Object.entries(candidates);
+  const many = Math.ceil(rows / 4 / Math.ceil(workers.length / which.length)) * 4, jobs = [];
+  for (const decoder of which) {
+    for (let from = 0; from < rows; from += many) jobs.push({ decoder, from, to: Math.min(rows, from + many) });
+  }
+  const done = await Promise.all(jobs.map(({ decoder, from, to }, k) => // this worker computes when all others have been asked
+    workers[k % workers.length](question, decoder, to - from, { [kind]: rowsOf(given, rows, from, to).slice() })));
+  const values = new Float64Array(rows), actions = new Float32Array(rows * question.horizon * DU);
+  jobs.forEach(({ from }, k) => {
+    done[k].values.forEach((value, row) => { values[from + row] += value / which.length; });
+    actions.set(done[k].actions, from * question.horizon * DU);
   });
-  const found = new Float64Array(rows);
-  (await Promise.all(parts)).forEach((values, k) => found.set(values, begins[k]));
-  return found;
+  return { values, actions };
 }
 
 /**
@@ -128,14 +135,14 @@ async function share(library, question, rows, parameters) {
  * return is the mean over all decoders; the others are never elites, and are given minus infinity.
  */
 export async function judge(library, question, rows, parameters) {
-  const decoders = library.manifest.tasks[question.task].models[question.model].decoders.length, wide = parameters.length / rows;
-  const first = await share(library, { ...question, which: [0] }, rows, parameters);
+  const decoders = library.manifest.tasks[question.task].models[question.model].decoders.length;
+  const { values: first, actions } = await share(library, question, [0], rows, { parameters });
   if (decoders === 1) return first;
   const order = [...first.keys()].sort((a, b) => (first[b] || -Infinity) - (first[a] || -Infinity));
-  const best = order.slice(0, Math.ceil(rows / KEPT / 4) * 4), kept = new Float32Array(best.length * wide);
-  best.forEach((row, i) => kept.set(parameters.subarray(row * wide, (row + 1) * wide), i * wide));
+  const best = order.slice(0, Math.ceil(rows / KEPT / 4) * 4), kept = new Float32Array(best.length * actions.length / rows);
+  best.forEach((row, i) => kept.set(rowsOf(actions, rows, row, row + 1), i * actions.length / rows));
   const others = Array.from({ length: decoders - 1 }, (_, k) => k + 1);
-  const rest = await share(library, { ...question, which: others }, best.length, kept);
+  const { values: rest } = await share(library, question, others, best.length, { actions: kept });
   const found = new Float64Array(rows).fill(-Infinity);
   best.forEach((row, i) => { found[row] = (first[row] + others.length * rest[i]) / decoders; });
   return found;
@@ -143,9 +150,9 @@ export async function judge(library, question, rows, parameters) {
 
 /** The search that fits into ``budget`` (ms) at the speed measured so far: fewer candidates, then fewer iterations. */
 export function affordable({ candidates, iterations }, msPerStep, steps, budget) {
-  const fits = budget / (msPerStep * steps); // candidates of all iterations
-  const many = Math.min(candidates, Math.max(FEWEST, Math.floor((fits / iterations - 4) / 4) * 4));
-  return { candidates: many, iterations: Math.min(iterations, Math.max(1, Math.floor(fits / (many + 4)))) };
+  const fits = budget / (msPerStep * steps) - ALONE; // candidates of all iterations
+  const many = Math.min(candidates, Math.max(FEWEST, Math.floor(fits / iterations / 4) * 4));
+  return { candidates: many, iterations: Math.min(iterations, Math.max(1, Math.floor(fits / many))) };
 }
 
 /**
@@ -173,7 +180,7 @@ export async function* attempt(library, scene, { first = { candidates: CAPACITY,
     let step = await planning.next();
     for (; !step.done; step = await planning.next()) yield { type: 'progress', from, ...step.value, of: iterations };
     const plan = search.decode(4, repeated(step.value.parameters, 4)).slice(0, horizon * DU);
-    rate = (performance.now() - began) / ((candidates + 4) * iterations * horizon);
+    rate = (performance.now() - began) / ((candidates * iterations + ALONE) * horizon);
     const { mode, samples } = predict(decoders, past, plan, horizon, seed + 1000 * from + 1, dx);
     if (!from) {
       const rows = samples ? SAMPLES : 1, of = returns(rows, samples ?? mode, samples ? repeated(plan, rows) : plan, target, place);

@@ -9,26 +9,30 @@ const BUDGET = 150; // ms for a later plan: 0.2 s of arm time, less what the pre
 const HELPERS = 3; // more workers at most, where there are so many processors
 let current = 0, kept = null;
 
-const pause = () => new Promise(resolve => { setTimeout(resolve); }); // lets messages in
+const { port1: next, port2: queue } = new MessageChannel();
+const pause = () => new Promise(resolve => { // lets messages in; a timer would wait four milliseconds
+  next.onmessage = resolve;
+  queue.postMessage(0);
+});
 const fail = error => postMessage({
   type: 'error', message: error instanceof PageError ? error.message : `Something went wrong (${error.message}); reload the page.`,
 });
 
-/** Another worker as a function (question, rows, parameters) -> promise of returns; it answers in order. */
+/** Another worker as a function: session.evaluate without its first argument. It answers in order. */
 function helper(files) {
   const waiting = [], worker = new Worker(new URL('./helper.js', import.meta.url), { type: 'module' });
-  worker.onmessage = ({ data: { values, message } }) => {
+  worker.onmessage = ({ data: { found, message } }) => {
     const { resolve, reject } = waiting.shift();
-    if (values) resolve(values);
+    if (found) resolve(found);
     else reject(new PageError(message));
   };
   worker.onerror = () => { // what it does not answer any more, this worker does itself
     files.helpers = [];
     for (const { reject } of waiting) reject(new PageError('A part of the planner stopped; reload the page.'));
   };
-  return (...question) => new Promise((resolve, reject) => {
+  return (...job) => new Promise((resolve, reject) => {
     waiting.push({ resolve, reject });
-    worker.postMessage(question);
+    worker.postMessage(job);
   });
 }
 

@@ -12,7 +12,7 @@ export const slow = { timeout: 120000 };
 export const ready = page => page.waitForSelector('body[data-ready=yes]', slow);
 export const planned = page => page.waitForFunction(() => !document.querySelector('#numbers').hidden, null, slow);
 
-/** Begin to trace; what is returned ends it and gives the CPU time (ms) of the page's longest task. */
+/** Begin to trace; what is returned ends it and gives CPU times (ms): of the page's longest task, and of each worker. */
 export async function tracing(page) {
   const session = await page.context().newCDPSession(page), events = [];
   session.on('Tracing.dataCollected', ({ value }) => events.push(...value));
@@ -21,8 +21,9 @@ export async function tracing(page) {
   return async () => {
     await session.send('Tracing.end');
     await done;
-    const main = new Set(events.filter(({ name, args }) => name === 'thread_name' && args.name === 'CrRendererMain').map(({ pid, tid }) => `${pid} ${tid}`));
-    return Math.max(0, ...events.filter(({ ph, pid, tid, name }) => ph === 'X' && name === 'RunTask' && main.has(`${pid} ${tid}`)).map(({ tdur = 0 }) => tdur / 1000));
+    const tasks = word => events.filter(({ name, args }) => name === 'thread_name' && args.name.startsWith(word)).map(thread =>
+      events.filter(({ ph, pid, tid, name }) => ph === 'X' && name === 'RunTask' && pid === thread.pid && tid === thread.tid).map(({ tdur = 0 }) => tdur / 1000));
+    return { longest: Math.max(0, ...tasks('CrRendererMain').flat()), workers: tasks('DedicatedWorker').map(times => times.reduce((a, b) => a + b, 0)) };
   };
 }
 

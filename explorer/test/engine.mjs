@@ -1,9 +1,9 @@
 // node test/engine.mjs < questions.json > answers.json: what the page computes, for tests in Python to compare.
-// Each question is { what: 'physics' | 'rollout' | 'decode' | 'judge' | 'plan' | 'link', task, ... }; see the functions below.
+// Each question is { what: 'physics' | 'rollout' | 'decode' | 'judge' | 'sorted' | 'plan' | 'link', task, ... }; see the functions below.
 import { readFileSync } from 'node:fs';
 import { readManifest } from '../dist/src/files.js';
 import { loadMujoco } from '../dist/src/physics.js';
-import { Library, attempt, evaluate } from '../dist/src/session.js';
+import { Library, attempt, evaluate, judge } from '../dist/src/session.js';
 import { fromLink } from '../dist/src/scene.js';
 import factory from '../dist/vendor/mujoco.js';
 
@@ -44,12 +44,21 @@ async function decode({ task, past, codes }) {
 }
 
 /** { model, pasts, targets, codes (N, K * dz) } -> returns (N), the mean over the modes of all decoders */
-async function judge({ task, model, pasts, targets, codes }) {
-  const which = [...library.manifest.tasks[task].models[model].decoders.keys()], { horizon } = library.manifest.tasks[task];
+async function judged({ task, model, pasts, targets, codes }) {
+  const { horizon } = library.manifest.tasks[task];
   return Promise.all(pasts.map(async (past, i) => {
-    const question = { task, model, space: 'latent', past: asPast(past), horizon, target: targets[i], which };
-    return (await evaluate(library, question, 4, repeated(codes[i], 4)))[0];
+    const question = { task, model, space: 'latent', past: asPast(past), horizon, target: targets[i] };
+    return (await judge(library, question, 4, repeated(codes[i], 4)))[0];
   }));
+}
+
+/** { model, past, target, codes (N, K * dz), workers } -> returns (N) by which CEM judges candidates, null: sorted out */
+async function sorted({ task, model, past, target, codes, workers }) {
+  const question = { task, model, space: 'latent', past: asPast(past), horizon: library.manifest.tasks[task].horizon, target };
+  library.helpers = Array(workers - 1).fill((...job) => evaluate(library, ...job));
+  const found = await judge(library, question, codes.length, Float32Array.from(codes.flat()));
+  library.helpers = [];
+  return [...found];
 }
 
 /** { model, space, replan, starts, targets, seed, first?, again? } -> [{ predicted, executed, distance, success, ms, cpu }], ms: of each plan; cpu: seconds */
@@ -68,8 +77,8 @@ async function plan({ task, model, space, replan = false, starts, targets, seed,
 /** { links } -> what the page says of each; nothing of one that it restores */
 const link = ({ links }) => links.map(one => fromLink(one, library.manifest).problem);
 
-const answers = [];
+const answers = [], ask = { physics, rollout, decode, judge: judged, sorted, plan, link };
 for (const question of JSON.parse(readFileSync(0))) {
-  answers.push(await { physics, rollout, decode, judge, plan, link }[question.what](question));
+  answers.push(await ask[question.what](question));
 }
 process.stdout.write(JSON.stringify(answers));

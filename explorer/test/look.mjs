@@ -9,7 +9,6 @@ for (const [width, height, colorScheme] of [[1440, 900, 'light'], [390, 844, 'li
   page.on('pageerror', error => console.log('error', error.message));
   await page.goto(url);
   await ready(page);
-  await page.click('#plan');
   await planned(page);
   console.log(await page.textContent('#verdict'), await page.textContent('#numbers'));
   await page.screenshot({ path: `${folder}/${width}-${colorScheme}.png`, fullPage: true });
