@@ -8,24 +8,48 @@ the start of its processes, and in this process with as many threads as the othe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from _rounds import Row, interleaved, parsed, parser, save
 from train import training
 
 from tsmlib import study
+from tsmlib.storage.files import Json
 from tsmlib.study import runs
+from tsmlib.study.jobs import Job
 from tsmlib.study.parallel import cores
 from tsmlib.study.runs import Run
 
 ENV = "tsm/ReacherPush-v1"
 
 
-def little(run: Run, seed: int, updates: int) -> None:
-    """``updates`` of the free-running stage."""
-    data, held_out = (study.random_data(ENV, n, seed=seed) for n in (100, 1))
-    stage = study.schedule(run, ENV, "tsm")[-1]
-    net = study.initialise(run, "tsm", data)
-    training(net, stage, (data, held_out), updates=updates)()
+@dataclass(frozen=True)
+class Little:
+    """``updates`` of the free-running stage, which nobody keeps."""
+
+    seed: int
+    updates: int
+    kind = "model"
+
+    @property
+    def name(self) -> str:
+        return f"{self.seed}"
+
+    def needs(self, run: Run) -> list[Job]:
+        return []
+
+    def settings(self, run: Run) -> Json:
+        return self.updates
+
+    def seconds(self, run: Run) -> float:
+        return self.updates / 10
+
+    def make(self, run: Run) -> None:
+        data, held_out = (study.random_data(ENV, n, seed=self.seed) for n in (100, 1))
+        stage = study.schedule(run, ENV, "tsm")[-1]
+        net = study.initialise(run, "tsm", data)
+        training(net, stage, (data, held_out), updates=self.updates)()
 
 
 def main() -> None:
@@ -34,16 +58,16 @@ def main() -> None:
     options.add_argument("--updates", type=int, default=40, help="of each (default 40)")
     arguments = parsed(options)
     run, at_once = runs.resolve("bench", scale="paper"), min(cores(), arguments.trainings)
-    calls = [(little, seed, arguments.updates) for seed in range(arguments.trainings)]
+    jobs = [Little(seed, arguments.updates) for seed in range(arguments.trainings)]
 
     def in_turn() -> None:
         torch.set_num_threads(at_once)
-        for make, *given in calls:
-            make(run, *given)
+        for job in jobs:
+            job.make(run)
         torch.set_num_threads(arguments.threads)
 
     def side_by_side() -> None:
-        study.precompute(run, calls)
+        study.precompute(run, jobs)
 
     seconds = interleaved({"ahead": side_by_side, "in turn": in_turn}, arguments.rounds, warm=False)
     n = arguments.trainings

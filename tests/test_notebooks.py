@@ -79,7 +79,7 @@ def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monke
         rows = tables.records(tables.load(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv"))
         assert rows
         assert {row["scale"] for row in rows} == {"smoke"}
-    status = manifest.read_own_json(tmp_path / "smoke" / "seed0" / "status.json")
+    status = manifest.statuses(tmp_path / "smoke" / "seed0")
     assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
     manifest.verify(tmp_path)
     assert not list(tmp_path.rglob("*.tmp-*"))

@@ -430,9 +430,9 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     net, about = study.load_or_train(run, "tsm/Reacher-v0", "onestep")
     task, method = study.task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", space, "policy")
-    assert study.stored_budget(run, task, method) is None
+    assert study.stored_budget(run, task.env, method) is None
     actor, header = study.learn(run, task, method, study.Budget(copies=2))
-    assert study.stored_budget(run, task, method) == study.Budget(copies=2, iterations=4)
+    assert study.stored_budget(run, task.env, method) == study.Budget(copies=2, iterations=4)
     near = study.within_data(run, task, actor)
     assert near.shape == (2,)
     assert ((near >= 0) & (near <= 1)).all()

@@ -37,7 +37,7 @@ def test_the_lock_holds_exact_versions_and_no_addresses() -> None:
 
 
 def test_the_lock_covers_every_dependency() -> None:
-    extras = {**PROJECT["optional-dependencies"], "mbrl": []}  # of a peer, installed by hand
+    extras = {**PROJECT["optional-dependencies"], "mbrl": [], "cluster": []}  # installed by hand, next to other pins
     wanted = [*PROJECT["dependencies"], *(line for lines in extras.values() for line in lines)]
     names = {re.split(r"[<>=!~\[ ]", line)[0].lower().replace("_", "-") for line in wanted}
     locked = pins() | pins("docs/requirements.lock")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+import multiprocessing
 import os
 import pty
 import re
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ import pytest
 
 from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS
+from tsmlib.storage import manifest
+from tsmlib.storage.files import StoreError
 from tsmlib.study import notebooks, papermill_plugin, parameters, runs
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import RunError, resolve
@@ -51,7 +55,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def status(place: Path, scale: str = "laptop", seed: int = 0) -> dict[str, Any]:
-    return json.loads((place / "runs {x} ü" / scale / f"seed{seed}" / "status.json").read_text())
+    folder = place / "runs {x} ü" / scale / f"seed{seed}"
+    return {path.name.partition(".")[0]: json.loads(path.read_text()) for path in folder.glob("*.status.json")}
 
 
 def untouched(place: Path) -> bool:
@@ -327,21 +332,91 @@ def test_a_stopped_run_is_interrupted_and_its_kernel_goes(place: Path, number: s
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_one_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
+def test_a_notebook_of_a_run_has_one_writer_until_that_writer_is_gone(place: Path) -> None:
     process = start(place)
+    again, second = (notebooks.prepare(runs.notebooks()[name]) for name in ("first", "second"))
     try:
-        second = notebooks.prepare(runs.notebooks()["second"])
         with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid} on .*, 01_first, since"):
-            notebooks.execute(second, progress=False)
-        assert set(status(place)) == {"01_first"}
+            notebooks.execute(again, progress=False)
+        notebooks.execute(second, progress=False)  # another notebook of the run does not wait
+        assert status(place)["02_second"]["state"] == "complete"
+        with pytest.raises(RunError, match="01_first in .* is running, expected complete. Wait for it"):
+            notebooks.require(second.run, "01_first")
     finally:
         process.kill()
         process.wait()
     assert status(place)["01_first"]["state"] == "running"
-    notebooks.execute(second, progress=False)
-    assert status(place)["02_second"]["state"] == "complete"
+    with pytest.raises(RunError, match="01_first in .* is interrupted: its process is gone"):
+        notebooks.require(second.run, "01_first")
+    write_notebook(place / "notebooks" / "01_first.ipynb", "1 + 1")
+    notebooks.execute(again, progress=False)
+    assert status(place)["01_first"]["state"] == "complete"
     with contextlib.suppress(ProcessLookupError):  # a kernel also ends by itself once its parent is gone
         os.kill(int((place / "inside").read_text()), signal.SIGKILL)
+
+
+def test_a_process_of_another_machine_is_not_looked_for_here(place: Path) -> None:
+    run, there = resolve("01_first"), {"state": "running", "pid": 2**22 + 1, "host": "another"}
+    manifest.write_json(run.dir / "01_first.status.json", manifest.sealed(there))
+    with pytest.raises(RunError, match="01_first in .* is running, expected complete"):
+        notebooks.require(run, "01_first")
+
+
+WRITES = """from tsmlib.study.runs import resolve
+run = resolve('{stem}', scale=scale, seed=seed, run_dir=run_dir)
+for name, text in {files!r}.items():
+    _ = (run.metrics / name).write_text(text)
+{more}"""
+
+
+def test_a_notebook_answers_for_the_files_that_it_wrote_last(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
+    for stem, files in {"01_first": {"a": "1", "b": "1"}, "02_second": {"b": "2", "c": "2"}}.items():
+        write_notebook(place / "notebooks" / f"{stem}.ipynb", WRITES.format(stem=stem, files=files, more=""))
+        execution = notebooks.prepare(runs.notebooks()[stem[3:]])
+        notebooks.execute(execution, progress=False)
+        assert set(notebooks.require(execution.run, stem)["files"]) == {f"metrics/{name}" for name in files}
+    run = execution.run
+    notebooks.require(run, "01_first")  # b is the second's now
+    assert len([path for path in manifest.verify(run.dir) if path.parent == run.metrics]) == 3
+    (run.metrics / "b").write_text("1")
+    notebooks.require(run, "01_first")
+    with pytest.raises(RunError, match="b is not what 02_second made"):
+        notebooks.require(run, "02_second")
+    with pytest.raises(StoreError, match="b is damaged, or was changed"):
+        manifest.verify(run.dir)
+    (run.metrics / "a").write_text("2")
+    with pytest.raises(RunError, match="a is not what 01_first made"):
+        notebooks.require(run, "01_first")
+
+
+def test_notebooks_that_run_at_the_same_time_answer_for_their_own_files(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
+    until = f"import os, time\nwhile not os.path.exists({str(place / 'go')!r}):\n    time.sleep(0.05)"
+    for stem, more in {"01_first": until, "02_second": f"open({str(place / 'go')!r}, 'w').close()"}.items():
+        source = WRITES.format(stem=stem, files={f"{stem}.csv": "x"}, more=more)
+        write_notebook(place / "notebooks" / f"{stem}.ipynb", source)
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        pool.map(partial(notebooks.execute, progress=False), map(notebooks.prepare, runs.notebooks().values()))
+    for stem, entry in status(place).items():
+        assert set(entry["files"]) == {f"metrics/{stem}.csv"}
+
+
+def test_the_status_of_an_older_run_is_read(place: Path) -> None:
+    run = resolve("03_third")
+    (run.metrics / "a").write_text("1")
+    old = {"files": manifest.listing(run.dir, [run.metrics / "a"]), "state": "complete", "pid": 1}
+    manifest.write_json(run.dir / "status.json", {"03_third": manifest.sealed(old)})
+    assert notebooks.require(run, "03_third")["pid"] == 1
+    notebooks.execute(notebooks.prepare(runs.notebooks()["first"]), progress=False)
+    assert manifest.verify(run.metrics / "a") == [run.metrics / "a"]
+    (run.metrics / "a").write_text("2")
+    with pytest.raises(RunError, match="a is not what 03_third made"):
+        notebooks.require(run, "03_third")
+    with pytest.raises(StoreError, match="a is damaged"):
+        manifest.verify(run.dir)
 
 
 # papermill by itself -------------------------------------------------------------------------------------------------

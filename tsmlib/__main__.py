@@ -1,6 +1,7 @@
 """Command line: run, notebooks, explore, verify, bench and publish; ``tsmlib`` and ``python -m tsmlib`` are the same.
 
 ``python -m tsmlib run NOTEBOOK`` executes a notebook, ``run NOTEBOOK --help`` lists its parameters.
+``python -m tsmlib run all --seeds 0-9`` executes all for ten seeds, here or (``--executor``) on a cluster.
 ``python -m tsmlib notebooks FOLDER`` copies the notebooks out, to be opened, changed and run by their paths.
 ``python -m tsmlib explore`` serves the explorer, a page in the browser, to this machine.
 ``python -m tsmlib verify [PATH]`` hashes again.
@@ -36,6 +37,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
     run.add_argument("--device", default="", help="where to train, learn, plan and roll out: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
+    flow = run.add_argument_group(
+        "several seeds, as a workflow (docs/howto/cluster.md); options of Snakemake follow --"
+    )
+    flow.add_argument("--seeds", default="", help="such as 0-9 or 0,2,5: a job for each model, score, plan, notebook")
+    flow.add_argument("--executor", default="", help="local, slurm or another plugin of Snakemake's; pool: without it")
+    flow.add_argument("--jobs", type=int, default=0, help="at a time (default: one for each core; elsewhere 100)")
+    flow.add_argument("--dry-run", action="store_true", help="list the jobs, and do nothing")
+    flow.add_argument("--any-code", action="store_true", help="go on with what another version of tsmlib has made")
+    step = commands.add_parser(
+        "step", help="one job of a workflow: what `run --seeds` executes in each of its processes"
+    )
+    step.add_argument("notebook")
+    step.add_argument("--job", default="", help="what the notebook needs, by its name; default: the notebook itself")
+    for option in ("--scale", "--seed", "--device"):
+        step.add_argument(option, default="0" if option == "--seed" else "")
+    step.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[])
     copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
     copy.add_argument("folder", type=Path)
     explore = commands.add_parser("explore", help="serve the explorer, a page in the browser, on 127.0.0.1")
@@ -49,8 +66,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     publish.add_argument("--seed", default="0")
     publish.add_argument("--claims", action="store_true", help="only judge the claims again, from the tables that ship")
     publish.add_argument("--table", default="", help="only the table of this notebook, for example your_own")
-    arguments = parser.parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    end = words.index("--") if "--" in words else len(words)
+    arguments = parser.parse_args(words[:end])
     try:
+        if words[end + 1 :] and arguments.command != "run":
+            raise parameters.ParameterError("only run takes options of Snakemake after --.")
         match arguments.command:
             case "run" if arguments.help:
                 return _help(run, arguments.notebook)
@@ -64,8 +85,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _bench(arguments.name)
             case "publish":
                 return _publish(arguments.seed, claims=arguments.claims, table=arguments.table)
+            case "step":
+                return _step(arguments)
             case _:
-                return _run(arguments)
+                return _run(arguments, words[end + 1 :])
     except parameters.ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -113,8 +136,8 @@ def _copy_notebooks(folder: Path) -> int:
     return 0
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    chosen = _chosen(arguments.notebook)
+def _given(arguments: argparse.Namespace) -> dict[str, str]:
+    """Parameter -> text, as typed."""
     given: dict[str, str] = {}
     for item in arguments.given:
         name, equals, text = item.partition("=")
@@ -123,11 +146,38 @@ def _run(arguments: argparse.Namespace) -> int:
                 f"-p {item!r:.80}: expected NAME=VALUE, each name once, and --scale and --seed for these two."
             )
         given[name] = text
+    return given
+
+
+def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
+    chosen, given = _chosen(arguments.notebook), _given(arguments)
     notebooks.require_tools()
     scale, seed, device = arguments.scale, parameters.convert("seed", arguments.seed), arguments.device
+    if arguments.seeds or arguments.executor or arguments.dry_run or arguments.jobs or arguments.any_code or more:
+        from tsmlib.study import workflow
+
+        if arguments.seeds and arguments.seed != "0":
+            raise parameters.ParameterError("--seed and --seeds are both given; name the seeds once.")
+        seeds = parameters.parse_seeds(arguments.seeds or arguments.seed)
+        prepared = workflow.prepare(chosen, seeds, scale=scale, device=device, given=given)
+        return workflow.run_all(
+            prepared, given, executor=arguments.executor, jobs=arguments.jobs, dry_run=arguments.dry_run,
+            any_code=arguments.any_code, more=more,
+        )  # fmt: skip
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
     for execution in executions:  # all of them are checked before the first one starts
         print(notebooks.execute(execution))
+    return 0
+
+
+def _step(arguments: argparse.Namespace) -> int:
+    from tsmlib.study import workflow
+
+    (notebook,), given = _chosen(arguments.notebook), _given(arguments)
+    scale, seed = arguments.scale, parameters.convert("seed", arguments.seed)
+    workflow.step(
+        notebooks.prepare(notebook, scale=scale, seed=seed, device=arguments.device, given=given), arguments.job
+    )
     return 0
 
 

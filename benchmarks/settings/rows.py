@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -24,6 +25,7 @@ from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
 from tsmlib.study import runs, zoo
+from tsmlib.study.jobs import Job, Scores, plan_jobs
 from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import planning
 from tsmlib.study.results.table import Row
@@ -53,8 +55,11 @@ def controlled(
 ) -> tuple[list[Row], list[Row]]:
     """Rows of 05_control.csv and 05_control_rows.csv."""
     tasks = [study.load_task(env) for env in envs]
-    ways = [way for planner in planners for way in zoo.methods(models, planner, spaces)]
-    trials = study.trials(run, tasks, [*ways, *FLOORS])
+    ways = [*(way for planner in planners for way in zoo.methods(models, planner, spaces)), *FLOORS]
+    wanted = [job for env in envs for job in plan_jobs(env, 100, ways)]
+    wanted += [job for env in envs for job in plan_jobs(env, 100, zoo.methods(closed, "cem", ["latent"]), every=10)]
+    study.precompute(run, wanted)
+    trials = study.trials(run, tasks, ways)
     rows, targets = planning.rows(tasks, trials, run)
     if closed:
         loops = study.trials(run, tasks, zoo.methods(closed, "cem", ["latent"]), every=10)
@@ -77,7 +82,10 @@ def main() -> None:
     notebook = "03_predict" if given.part == "predict" else "05_control"
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "predict":
-        publish(notebook, study.score_rows(run, [(env, word) for env in given.envs for word in given.models]))
+        pairs = list(product(given.envs, given.models))
+        wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
+        study.precompute(run, wanted)
+        publish(notebook, study.score_rows(run, pairs))
     else:
         rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)

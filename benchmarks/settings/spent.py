@@ -36,7 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a run, such as runs/paper/seed1")
     run: Path = parser.parse_args().run
-    for name, entry in manifest.read_own_json(run / "status.json").items():
+    for name, entry in manifest.statuses(run).items():
         print(f"{name:40} {entry['state']:12} {entry.get('seconds', float('nan')):8,.0f} s")
     spent: dict[str, list[float]] = defaultdict(list)
     for path in sorted([*run.glob("models/*/*.safetensors"), *run.glob("plans/*.safetensors")]):

@@ -19,7 +19,7 @@ os.environ.setdefault("TQDM_DISABLE", "1")
 
 import torch
 
-from reliability import files, pipelines, simulators, training
+from reliability import cluster, files, pipelines, simulators, training
 from reliability.world import Outcome
 from tsmlib.storage import files as files_storage
 from tsmlib.storage import manifest
@@ -62,6 +62,9 @@ CHECKS: dict[str, list[tuple[Callable[[int], Outcome], int, int]]] = {  # check,
         (pipelines.elsewhere, 2, 3),
         (pipelines.threads, LONG_ONLY, 20),
         (pipelines.another_thread_count, 0, 0),
+    ],
+    "cluster": [
+        (cluster.killed_on_a_cluster, 1, 60),
     ],
 }
 

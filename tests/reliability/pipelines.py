@@ -66,7 +66,7 @@ def killed_runs(trials: int) -> Outcome:
                     else:
                         process.send_signal(getattr(signal, how))
                 code = process.wait(600)
-            state = json.loads((place / "runs/smoke/seed0/status.json").read_text())["01_first"]["state"]
+            state = json.loads((place / "runs/smoke/seed0/01_first.status.json").read_text())["state"]
             found.count(code != 0 and state != "complete", f"{how}: exit {code}, {state}")
             run = runs.resolve("02_second", scale="smoke", run_dir=str(place / "runs"))
             said = refusal(lambda: notebooks.require(run, "01_first"), RunError)  # noqa: B023
@@ -84,7 +84,7 @@ def cells_out_of_order(trials: int) -> Outcome:
     """R12: each cell of a notebook alone, and its cells in random order: no table that is then taken for a result.
 
     A table that comes about in this way may say anything, and so counts for nothing: without a complete run in
-    status.json nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
+    a status nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
     """
     from reliability.training import answer, kernel
 

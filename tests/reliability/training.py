@@ -161,7 +161,7 @@ def order_of(text: str) -> dict[str, str]:
     order: dict[str, str] = {}
     waiting: dict[str, str] = {}
     for line in text.splitlines():
-        if match := re.search(r"(write|pwrite64)\(\d+<([^>]+\.tmp-\d+)>", line):
+        if match := re.search(r"(write|pwrite64)\(\d+<([^>]+\.tmp-[^>]+)>", line):
             waiting[match[2]] = waiting.get(match[2], "") + "w"
         elif match := re.search(r"fsync\(\d+<([^>]+)>", line):
             if ".tmp-" in match[1]:

@@ -247,7 +247,7 @@ def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
         "shipped table": (table, lambda: tables.records(tables.load(table))),
         "manifest": (table.parent / files.MANIFEST, lambda: tables.records(tables.load(table))),
         "table of a run": (result, lambda: tables.records(tables.load(result))),
-        "status": (run.dir / files.STATUS, lambda: require(run, "05_control")),
+        "status": (run.dir / f"05_control.{files.STATUS}", lambda: require(run, "05_control")),
     }
 
 

@@ -1,9 +1,11 @@
-"""Atomic writes, one read, JSON, and a lock per folder."""
+"""Atomic writes, one read, JSON, and locks that name who holds them."""
 
 import contextlib
+import glob
 import json
 import os
 import socket
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,11 +27,11 @@ class StoreError(ValueError):
 
 def write_bytes(path: PathLike, data: bytes) -> None:
     """Replace ``path`` by ``data`` in one step, creating its folder; on failure the old file stays and nothing else."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    path, here = Path(path), f".tmp-{socket.gethostname()}-"
+    temporary = path.with_name(f".{path.name}{here}{os.getpid()}")
     try:
         _make(path.parent)
-        for left in path.parent.glob(".*.tmp-*"):  # by a process that was killed
+        for left in path.parent.glob(f".*{glob.escape(here)}*"):  # by a process of this machine that was killed
             if not alive(left.name.rpartition("-")[2]):
                 left.unlink(missing_ok=True)
         with open(temporary, "wb") as file:
@@ -91,21 +93,27 @@ def _sync(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(folder: PathLike, purpose: str) -> Iterator[None]:
+def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = False) -> Iterator[None]:
     """Exclusive right to write in ``folder``, made if need be; it ends with this process, however that ends.
 
-    Raises StoreError naming the holder: process, machine, purpose and since when.
+    name: of the part of the folder that is written, where others may write the rest; '' is all of it. wait: until
+    another holder is done, naming it on stderr, in place of StoreError naming it: process, machine, purpose and since.
     """
-    lock, holder = FileLock(Path(folder) / ".lock"), Path(folder) / ".writer"
+    hidden = f".{name}" if name else ""
+    lock, holder = FileLock(Path(folder) / f"{hidden}.lock"), Path(folder) / f"{hidden}.writer"
     try:
         _make(Path(folder))
-        lock.acquire(timeout=0.2)  # in which a new holder writes its name
-    except Timeout:
-        name = holder.read_text() if holder.exists() else "unknown"
-        raise StoreError(
-            f"{folder} is being written by another process ({name}). Wait for it or end it, or take another seed, or "
-            "another folder with TSM_RUN_DIR."
-        ) from None
+        try:
+            lock.acquire(timeout=0.2)  # in which a new holder writes its name
+        except Timeout:
+            who = holder.read_text() if holder.exists() else "unknown"
+            if not wait:
+                raise StoreError(
+                    f"{Path(folder) / name} is being written by another process ({who}). Wait for it or end it, or "
+                    "take another seed, or another folder with TSM_RUN_DIR."
+                ) from None
+            sys.stderr.write(f"waiting for {who}, which writes {Path(folder) / name}\n")
+            lock.acquire(poll_interval=0.5)
     except OSError as error:
         raise _cannot_write(f"in {folder}", error) from error
     try:
@@ -119,10 +127,13 @@ def writer_lock(folder: PathLike, purpose: str) -> Iterator[None]:
         lock.release()
 
 
-def alive(pid: object) -> bool:
-    """Whether there may be a process of this number; True for what is none."""
+def alive(pid: object, host: object = None) -> bool:
+    """Whether there may be a process of this number; True for what is none, or is of another machine.
+
+    host: the machine's name; None is this one.
+    """
     try:
-        return psutil.pid_exists(int(str(pid)))
+        return host not in (None, socket.gethostname()) or psutil.pid_exists(int(str(pid)))
     except (ValueError, OverflowError):
         return True
 

@@ -100,7 +100,7 @@ def verify(path: PathLike) -> list[Path]:
         raise StoreError(
             f"{path} does not exist. Expected an artefact (*.safetensors) or a folder of them: check the name."
         )
-    if path.is_file() and path.suffix != ".safetensors" and path.name not in (MANIFEST, STATUS) and not _listed(path):
+    if path.is_file() and path.suffix != ".safetensors" and not _states(path) and not _listed(path):
         raise StoreError(
             f"{path} carries no checksum, and no {MANIFEST} or {STATUS} above it lists it: nothing to check. "
             "Name a folder, or an artefact (*.safetensors)."
@@ -110,9 +110,9 @@ def verify(path: PathLike) -> list[Path]:
 
     def check(file: Path, wanted: str | None) -> None:
         try:
-            if file.name in (MANIFEST, STATUS):
+            if _states(file):
                 for name, digest in _manifest(file).items():
-                    check(file.parent / name, digest)
+                    check(file.parent / name, _listed(file.parent / name) or digest)
             else:
                 _require_sha256(file, read_bytes(file), wanted)
             if file.suffix == ".safetensors" and file not in checked:
@@ -126,23 +126,53 @@ def verify(path: PathLike) -> list[Path]:
             problems[str(error)] = None
 
     for file in [path] if path.is_file() else sorted(path.rglob("*")):
-        if file.suffix == ".safetensors" or file.name in (MANIFEST, STATUS) or file == path:
+        if file.suffix == ".safetensors" or _states(file) or file == path:
             check(file, _listed(file))
     if problems:
         raise StoreError("\n".join(problems))
     return list(checked)
 
 
+def statuses(folder: Path) -> dict[str, Any]:
+    """What the status files of a run state: notebook -> entry, in the order in which they were made.
+
+    A notebook has its own, ``03_predict.status.json``; older runs have one for all, ``status.json``.
+    """
+    found: dict[str, Any] = {}
+    for path in _status_files(folder):
+        value = read_own_json(path)
+        found |= value if path.name == STATUS else {path.name.removesuffix(f".{STATUS}"): value}
+    return found
+
+
+def _status_files(folder: Path) -> list[Path]:
+    """Status files by when their notebooks ended, the older runs' first."""
+    old = [folder / STATUS] if (folder / STATUS).is_file() else []
+    return old + sorted(folder.glob(f"[!.]*.{STATUS}"), key=lambda path: str(read_own_json(path).get("finished", "")))
+
+
+def made_by(entries: Mapping[str, Any]) -> dict[str, str]:
+    """File -> the notebook of ``statuses`` that made it; of several the last."""
+    complete = (name for name, entry in entries.items() if intact(entry) and entry.get("state") == "complete")
+    return {file: name for name in complete for file in entries[name].get("files", {})}
+
+
+def _states(path: Path) -> bool:
+    """Whether a file is a manifest or a status."""
+    return path.name in (MANIFEST, STATUS) or path.name.endswith(f".{STATUS}")
+
+
 def _manifest(path: Path) -> dict[str, str]:
     """File name -> SHA-256, from a manifest that is itself intact, or from the complete notebooks of a status."""
     value: dict[str, Any] = read_own_json(path)
     try:
-        if path.name == STATUS:
-            entries = [entry for entry in value.values() if "files" in entry and entry["state"] == "complete"]
-        else:
+        if path.name == MANIFEST:
             entries = [value]
             if set(value) != {"files", "sha256"}:
                 raise TypeError("expected 'files' and 'sha256'")
+        else:
+            entries = list(value.values()) if path.name == STATUS else [value]
+            entries = [entry for entry in entries if "files" in entry and entry["state"] == "complete"]
         digests = {name: str(file["sha256"]) for entry in entries for name, file in entry["files"].items()}
         whole = all(map(intact, entries))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -155,9 +185,12 @@ def _manifest(path: Path) -> dict[str, str]:
 
 
 def _listed(path: Path) -> str | None:
-    """The SHA-256 that the nearest manifest or status states for ``path``."""
+    """The SHA-256 that the nearest manifest, or else the statuses beside each other, state for ``path``."""
     for folder in path.parents:
-        for name in (MANIFEST, STATUS):
-            if (folder / name).is_file():
-                return _manifest(folder / name).get(path.relative_to(folder).as_posix())
+        stating = [folder / MANIFEST] if (folder / MANIFEST).is_file() else _status_files(folder)
+        if stating:
+            digests: dict[str, str] = {}
+            for file in stating:
+                digests |= _manifest(file)
+            return digests.get(path.relative_to(folder).as_posix())
     return None

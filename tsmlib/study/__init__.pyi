@@ -12,14 +12,13 @@ from .models import TrainedModel as TrainedModel
 from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
-from .models import precompute_models as precompute_models
 from .models import schedule as schedule
 from .models import train_all as train_all
+from .needed import needs as needs
 from .parallel import precompute as precompute
 from .plans import along_the_way as along_the_way
 from .plans import as_judged as as_judged
 from .plans import plan as plan
-from .plans import precompute_plans as precompute_plans
 from .plans import trial as trial
 from .plans import trials as trials
 from .policies import EPISODES as EPISODES

@@ -13,13 +13,13 @@ from tsmlib.study.runs import Run
 def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
     """The published rows of a notebook's table and those of this run, told apart by the column ``source``.
 
-    At scale paper the other seeds beside this run are its own too (``pooled_rows``). table: what follows the
-    notebook's name in the table's, ``_rows`` for instance. What is written stays without the column: ``tables.save``
-    and ``publish`` know nothing of it.
+    At scale paper the other seeds beside this run are its own too, those that are complete (``pooled_rows``). table:
+    what follows the notebook's name in the table's, ``_rows`` for instance. What is written stays without the column:
+    ``tables.save`` and ``publish`` know nothing of it.
     """
     path = predictions.RESULTS / f"{run.notebook}{table}.csv"
     published = tables.load(path) if path.exists() else tables.frame([])
-    own = predictions.pooled_rows(run, rows, table)
+    own = predictions.pooled_rows(run, rows, table, whole=False)
     return _sourced(published, own)
 
 

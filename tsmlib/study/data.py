@@ -14,7 +14,6 @@ from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs.spec import EnvSpec, gone
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError
-from tsmlib.study.parallel import precompute
 from tsmlib.study.parameters import ParameterError, standard_arm
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
@@ -60,10 +59,8 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
 
 
 def datasets(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Trajectories]:
-    """(environment, split) -> its data. At scale paper several are collected at a time."""
-    pairs = list(wanted)
-    precompute(run, [(dataset, *pair) for pair in pairs], progress="data sets")
-    return {pair: dataset(run, *pair) for pair in tqdm(pairs, desc="data sets")}
+    """(environment, split) -> its data."""
+    return {pair: dataset(run, *pair) for pair in tqdm(list(wanted), desc="data sets")}
 
 
 def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajectories:

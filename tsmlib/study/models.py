@@ -24,7 +24,6 @@ from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
-from tsmlib.study.parallel import precompute
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
@@ -62,7 +61,7 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now. Raises
     StoreError for a file of another environment, word, class or schedule.
     """
-    env = _trained_on(env, model)
+    env = trained_on(env, model)
     folder, file = EnvSpec.parse(env).name, f"{zoo.find(model).word}.safetensors"
     own = run.folder(f"models/{folder}") / file
     for path in [own, run.shipped / folder / file] if run.scale == "laptop" and run.seed == 0 else [own]:
@@ -95,19 +94,17 @@ def load_pretrained(model: str, *, env: str) -> TrainedModel:
 
     ValueError naming what there is.
     """
-    folder = PRETRAINED / EnvSpec.parse(_trained_on(env, zoo.find(model).word)).name
+    folder = PRETRAINED / EnvSpec.parse(trained_on(env, zoo.find(model).word)).name
     if not (path := folder / f"{model}.safetensors").exists():
         there = [path.stem for path in sorted(folder.glob("*.safetensors")) if path.stem in zoo.ZOO]
         known = f"there are {', '.join(there)}" if there else "there are none"
         raise ValueError(f"no pretrained {model} of {env} in {folder}: {known}.")
-    return _load(path, _trained_on(env, model), model)
+    return _load(path, trained_on(env, model), model)
 
 
 def train_all(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Trained]:
-    """(env, model) -> the trained model. At scale paper several are trained at a time."""
-    pairs = list(dict.fromkeys(wanted))
-    precompute_models(run, pairs)
-    return {pair: load_or_train(run, *pair) for pair in pairs}
+    """(env, model) -> the trained model."""
+    return {pair: load_or_train(run, *pair) for pair in wanted}
 
 
 def described(trained: Mapping[tuple[str, str], Trained]) -> pd.DataFrame:
@@ -124,14 +121,7 @@ def described(trained: Mapping[tuple[str, str], Trained]) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def precompute_models(run: Run, wanted: Iterable[tuple[str, str]]) -> None:
-    """``precompute`` for models: each (env, model) that is wanted, once, the longest trainings first."""
-    pairs = list(dict.fromkeys((_trained_on(env, model), model) for env, model in wanted))
-    pairs.sort(key=lambda pair: -zoo.BUDGET[EnvSpec.parse(pair[0]).standard.name])
-    precompute(run, [(load_or_train, *pair) for pair in pairs], progress="models")
-
-
-def _trained_on(env: str, model: str) -> str:
+def trained_on(env: str, model: str) -> str:
     """The environment; of the prior, since equally many episodes hold the same torques, one with as many."""
     if zoo.find(model).group != "prior":
         return env
@@ -186,12 +176,16 @@ def _share(run: Run) -> float:
     return run.pick(smoke=0.0, laptop=0.5, paper=1.0)
 
 
-def _duration(run: Run, env: str, model: str) -> str:
-    """How long a training may take, in words."""
+def training_seconds(run: Run, env: str, model: str) -> float:
+    """The budget of a training, of all its parts."""
     spec = zoo.find(model)
     seconds = _share(run) * (zoo.BUDGET[EnvSpec.parse(env).standard.name] if spec.budget is None else spec.budget)
-    seconds *= cast(int, spec.arguments(EnvSpec.parse(env)).get("members", 1))
-    if not seconds:
+    return seconds * cast(int, spec.arguments(EnvSpec.parse(env)).get("members", 1))
+
+
+def _duration(run: Run, env: str, model: str) -> str:
+    """How long a training may take, in words."""
+    if not (seconds := training_seconds(run, env, model)):
         return "a few updates"
     return f"about {max(1, round(seconds / 60))} min of one core. Stopped, it goes on from there the next time"
 

@@ -5,13 +5,13 @@ import importlib.util
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from tqdm.auto import tqdm
 
@@ -54,37 +54,39 @@ def require_tools() -> None:
         )
 
 
-def execute(execution: Execution, *, progress: bool = True) -> Path:
+def execute(execution: Execution, *, progress: bool = True, wait: bool = False) -> Path:
     """Execute a notebook into its run's folder and return the executed copy.
 
-    Raises RunError if another process writes to the same run or the notebook does not reach its end.
+    Raises RunError if another process executes it there (or waits for that) or the notebook does not reach its end.
     """
     from tsmlib.storage import manifest  # heavy, and not needed to refuse a parameter
     from tsmlib.storage.provenance import provenance
 
     run, hold = execution.run, contextlib.ExitStack()
     try:
-        hold.enter_context(writer_lock(run.dir, run.notebook))
+        hold.enter_context(writer_lock(run.dir, run.notebook, name=run.notebook, wait=wait))
     except StoreError as error:
         raise RunError(str(error)) from None
-    with hold, _terminable(), _environment("TSM_DEVICE", run.device):
-        began, before = time.monotonic(), _stamps(run)
+    record = run.dir / f".{run.notebook}.written"
+    record.unlink(missing_ok=True)
+    with hold, terminable(), _environment(TSM_DEVICE=run.device, TSM_WRITTEN=str(record)):
+        began = time.monotonic()
         status: dict[str, Json] = {
-            "pid": os.getpid(), "started": _now(), "parameters": execution.values, "scale": run.scale,
-            "seed": run.seed, "device": run.device, "provenance": provenance(),
+            "pid": os.getpid(), "host": socket.gethostname(), "started": _now(), "parameters": execution.values,
+            "scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance(),
         }  # fmt: skip
         _note(run, {**status, "state": "running"})
         ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
         try:
             executed = _papermill(execution, progress)
-            made = [path for path, stamp in _stamps(run).items() if before.get(path) != stamp]
-            ended = {"state": "complete", "files": manifest.listing(run.dir, sorted(made))}
+            ended = {"state": "complete", "files": manifest.listing(run.dir, _made(run, record))}
         except RunError as error:
             ended = {"state": "failed", "error": str(error)}
             raise
         finally:
             seconds = round(time.monotonic() - began, 1)
             _note(run, {**status, **ended, "finished": _now(), "seconds": seconds})
+            record.unlink(missing_ok=True)
     return executed
 
 
@@ -97,9 +99,10 @@ def require(run: Run, notebook: str) -> Mapping[str, Json]:
 
     name = next((each.name for each in notebooks().values() if each.stem == notebook), "all")
     command = f"python -m tsmlib run {name} --scale {run.scale} --seed {run.seed}"
-    entry = _entries(run).get(notebook, {"state": "not run"})
+    entries = manifest.statuses(run.dir)
+    entry = entries.get(notebook, {"state": "not run"})
     state = entry.get("state") if isinstance(entry, dict) else "damaged"
-    if state == "running" and not alive(entry.get("pid")):
+    if state == "running" and not alive(entry.get("pid"), entry.get("host")):
         state = "interrupted: its process is gone"
     if state == "complete" and {"files", "sha256"} & set(entry) and not manifest.intact(entry):
         state = "damaged"  # older ones have neither
@@ -107,10 +110,12 @@ def require(run: Run, notebook: str) -> Mapping[str, Json]:
         what = "Wait for it, or run it again" if state == "running" else "Run it"
         raise RunError(f"{notebook} in {run.dir} is {state!s:.80}, expected complete. {what}: {command}")
     try:
+        last = manifest.made_by(entries)  # a file that another notebook made again is no longer this one's
         changed = [
             file
             for file, stated in entry.get("files", {}).items()
-            if not (run.dir / file).is_file() or manifest.sha256(run.dir / file) != stated["sha256"]
+            if last.get(file) == notebook
+            and (not (run.dir / file).is_file() or manifest.sha256(run.dir / file) != stated["sha256"])
         ]
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         changed = [f"{STATUS} ({error!r:.80})"]
@@ -119,10 +124,12 @@ def require(run: Run, notebook: str) -> Mapping[str, Json]:
     return entry
 
 
-def _stamps(run: Run) -> dict[Path, tuple[int, int]]:
-    """Tables and pictures of a run, and when each was written."""
-    found = [path for folder in ("metrics", "figures") for path in (run.dir / folder).glob("[!.]*") if path.is_file()]
-    return {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in found}
+def _made(run: Run, record: Path) -> list[Path]:
+    """Tables and pictures of a run that its notebook's kernel wrote (``runs.record_written``), those that are left."""
+    written = {Path(line) for line in record.read_text().splitlines()} if record.exists() else set()
+    folders = (run.dir / "metrics", run.dir / "figures")
+    made = (path for path in written if path.parent in folders and not path.name.startswith("."))
+    return sorted(path for path in made if path.is_file())
 
 
 def _papermill(execution: Execution, progress: bool) -> Path:
@@ -188,42 +195,29 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _entries(run: Run) -> dict[str, Any]:
-    """status.json: notebook -> what is known of it."""
-    from tsmlib.storage import manifest
-
-    path = run.dir / STATUS
-    return dict(manifest.read_own_json(path)) if path.exists() else {}
-
-
 def _note(run: Run, entry: Mapping[str, Json]) -> None:
-    """Write this notebook's entry of status.json. A file that it made again is no longer another's."""
+    """Write the status of this notebook."""
     from tsmlib.storage import manifest
 
-    entries, made = _entries(run), manifest.sealed(entry)
-    entries[run.notebook], own = made, dict[str, Any](made).get("files", {})
-    for name, other in entries.items():
-        if name != run.notebook and manifest.intact(other) and set(other.get("files", {})) & set(own):
-            rest = {file: stated for file, stated in other["files"].items() if file not in own}
-            entries[name] = manifest.sealed({**other, "files": rest})
-    manifest.write_json(run.dir / STATUS, entries)
+    manifest.write_json(run.dir / f"{run.notebook}.{STATUS}", manifest.sealed(entry))
 
 
 @contextlib.contextmanager
-def _environment(name: str, value: str) -> Iterator[None]:
-    """Processes that start meanwhile, a kernel for one, have ``value`` in their environment."""
-    before = os.environ.get(name)
-    os.environ[name] = value
+def _environment(**values: str) -> Iterator[None]:
+    """Processes that start meanwhile, a kernel for one, have ``values`` in their environment."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
-        os.environ.pop(name)
-        if before is not None:
-            os.environ[name] = before
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
+def terminable() -> Iterator[None]:
     """SIGTERM ends a run as Ctrl-C does, so that its status is written and its kernel shut down."""
 
     def interrupt(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""Parallel processes for models, plans and scores of a run; torch has one thread in each.
+"""Parallel processes for the jobs of a run; torch has one thread in each.
 
 Two threads on one small network may stand in each other's way; two networks on a thread each use both cores.
 """
@@ -7,41 +7,41 @@ import multiprocessing
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from itertools import islice
-from typing import Any
 
 import torch
 from tqdm.auto import tqdm
 
+from tsmlib.study.jobs import Job, complete
 from tsmlib.study.runs import Run, RunError
 
 
-def precompute(
-    run: Run, calls: Sequence[tuple[Callable[..., object], *tuple[object, ...]]], *, progress: str = "ahead"
-) -> None:
-    """Do ``make(run, *arguments)`` for each (make, *arguments) of ``calls``, as many at a time as there are cores.
+def precompute(run: Run, jobs: Iterable[Job], *, progress: str = "ahead") -> None:
+    """Make jobs, and what they need before them, as many at a time as there are cores.
 
-    make: a function that keeps what it makes in the run's folder, such as ``plan``. Calls must not need each other's
-    results. At scale paper alone; elsewhere the notebook makes each thing when it comes to it. The first error, or an
-    interrupt, ends it when the calls under way have ended; what they made is kept. Raises RunError where a worker died.
+    Of those that could begin, the longest first. At scale paper alone; elsewhere the notebook makes each thing when it
+    comes to it. The first error, or an interrupt, ends it when the jobs under way have ended; what they made is kept.
+    Raises RunError where a worker died.
     """
-    workers = min(cores(), len(calls), 61)  # Windows allows no more
+    wanted = complete(run, jobs)
+    workers = min(cores(), len(wanted), 61)  # Windows allows no more
     if run.scale != "paper" or workers < 2:
         return
-    waiting, under_way = iter(calls), set[Future[None]]()
+    waiting = dict(sorted(wanted.items(), key=lambda item: -item[1].seconds(run)))
+    under_way: dict[Future[None], str] = {}
     spawn = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin) as pool,
-        tqdm(total=len(calls), desc=progress) as bar,
+        tqdm(total=len(waiting), desc=progress) as bar,
     ):
-        while True:
-            under_way |= {pool.submit(_make, run, *call) for call in islice(waiting, workers - len(under_way))}
-            if not under_way:
-                break
-            done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+        while waiting or under_way:
+            missing = {*waiting, *under_way.values()}
+            ready = [job for job in waiting.values() if not missing & {other.name for other in job.needs(run)}]
+            for job in ready[: workers - len(under_way)]:
+                under_way[pool.submit(_make, run, waiting.pop(job.name))] = job.name
+            done, _ = wait(under_way, return_when=FIRST_COMPLETED)
             for call in done:
                 try:
                     call.result()
@@ -50,12 +50,13 @@ def precompute(
                         "a process that made things ahead died, perhaps for want of memory. Run it again: trainings "
                         "go on where they were"
                     ) from error
+                del under_way[call]
                 bar.update()
 
 
-def _make(run: Run, make: Callable[..., Any], *arguments: Any) -> None:
+def _make(run: Run, job: Job) -> None:
     """In the worker. What is made stays in the run's folder; only that it is done goes back."""
-    make(run, *arguments)
+    job.make(run)
 
 
 def _begin() -> None:

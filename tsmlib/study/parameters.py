@@ -25,6 +25,7 @@ SCALES = ("smoke", "laptop", "paper")
 ENVS = tuple(f"tsm/{arm}" for arm in ("Reacher-v0", "ReacherObstacle-v0", "ReacherPush-v1",
                                       "PymunkReacher-v0", "PymunkObstacle-v0", "PymunkPush-v1"))  # fmt: skip
 LONGEST = 1000  # characters
+MOST_SEEDS = 1000
 INJECTED = "# Parameters\n"  # how the cell begins that papermill puts below the one tagged parameters
 Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
@@ -126,6 +127,24 @@ def convert(name: str, text: str, *, default: object = None) -> Value:
     if kind is float and re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", text, re.ASCII):
         return float(text)
     return text
+
+
+def parse_seeds(text: str) -> list[int]:
+    """The seeds that a text such as ``0-9`` or ``0,2,5-7`` names, in order. ParameterError for any other text."""
+    found: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part, re.ASCII)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if not 0 <= last - first < MOST_SEEDS:
+            raise ParameterError(
+                f"--seeds is {_shown(text)}, expected such as 0-9 or 0,2,5, at most {MOST_SEEDS} seeds."
+            )
+        found += range(first, last + 1)
+    if len(set(found)) < len(found) or len(found) > MOST_SEEDS:
+        raise ParameterError(f"--seeds is {_shown(text)}: each seed once, and at most {MOST_SEEDS}.")
+    for seed in found:
+        check("seed", seed)
+    return found
 
 
 def _shown(value: object) -> str:

@@ -25,8 +25,7 @@ from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json
-from tsmlib.study.models import TrainedModel, load_or_train, load_prior, precompute_models
-from tsmlib.study.parallel import precompute
+from tsmlib.study.models import TrainedModel, load_or_train, load_prior
 from tsmlib.study.predictions import RESULTS
 from tsmlib.study.runs import Run
 
@@ -61,21 +60,11 @@ def trial(run: Run, task: Task, method: Method, *, iterations: int = 0, every: i
 def trials(
     run: Run, tasks: Sequence[Task], methods: Methods, *, iterations: int = 0, every: int = 0
 ) -> dict[str, dict[Method, Trial]]:
-    """Environment -> method -> trial. At scale paper several models are trained, and plans made, at a time."""
-    precompute_plans(run, tasks, methods, iterations=iterations, every=every)
+    """Environment -> method -> trial."""
     return {
         task.env: {m: trial(run, task, m, iterations=iterations, every=every) for m in _of(methods, task)}
         for task in tasks
     }
-
-
-def precompute_plans(run: Run, tasks: Sequence[Task], methods: Methods, *, iterations: int = 0, every: int = 0) -> None:
-    """``precompute`` for plans and the models that they need; the oracle's first, which take longest."""
-    asked = [(task, method) for task in tasks for method in _of(methods, task) if method.model not in TORQUES]
-    precompute_models(run, [(task.env, word) for task, method in asked for word in _models(method)])
-    asked.sort(key=lambda pair: pair[1].model != "oracle")
-    make = partial(plan, iterations=iterations, every=every)
-    precompute(run, [(make, *pair) for pair in asked], progress="plans")
 
 
 def plan(run: Run, task: Task, method: Method, *, iterations: int = 0, every: int = 0) -> Plan:
@@ -93,9 +82,7 @@ def plan(run: Run, task: Task, method: Method, *, iterations: int = 0, every: in
             f"{' or '.join(SEARCH_SPACES)}, and 0 (the scale's default) or more"
         )
     problem = _Problem.of(run, task, method, iterations, every)
-    kind = f"-every{every}" * bool(every) + f"-{iterations}" * bool(iterations)
-    words = (EnvSpec.parse(task.env).name, method.model, method.search_space, method.planner)
-    name = f"{'-'.join(words)}{kind}.safetensors"
+    name = f"{file_name(task.env, method, iterations=iterations, every=every)}.safetensors"
     own, made_from = run.folder("plans") / name, problem.made_from()
     if task.is_standard and (kept := _kept(own, task, made_from)):
         return kept
@@ -115,6 +102,12 @@ def plan(run: Run, task: Task, method: Method, *, iterations: int = 0, every: in
         header: dict[str, Json] = {"made_from": made_from, "seconds": found.seconds, "device": run.device}
         artifacts.save(own, arrays, kind="plan", header=header)
     return found
+
+
+def file_name(env: str, method: Method, *, iterations: int = 0, every: int = 0) -> str:
+    """What the file of a plan is called, without suffix."""
+    kind = f"-every{every}" * bool(every) + f"-{iterations}" * bool(iterations)
+    return "-".join((EnvSpec.parse(env).name, method.model, method.search_space, method.planner)) + kind
 
 
 def along_the_way(run: Run, task: Task, method: Method, *, iterations: int, at: Iterable[int]) -> dict[int, Trial]:
@@ -229,7 +222,7 @@ def _of(methods: Methods, task: Task) -> Sequence[Method]:
     return methods[task.name] if isinstance(methods, Mapping) else methods
 
 
-def _models(method: Method) -> list[str]:
+def models_of(method: Method) -> list[str]:
     """The trained models that planning with a method needs."""
     return [method.model] * (method.model != "oracle") + ["prior"] * (method.search_space == "latent")
 

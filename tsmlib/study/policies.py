@@ -21,8 +21,7 @@ from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, le
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
 from tsmlib.storage import artifacts
 from tsmlib.study.data import dataset, fingerprint, sizes
-from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior, precompute_models
-from tsmlib.study.parallel import precompute
+from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior
 from tsmlib.study.results.policies import learning_rows
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
@@ -72,8 +71,8 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
     if prior is not None:
         weights["prior"] = artifacts.digest(prior.state_dict())
     made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
-    budget = replace(budget, iterations=budget.iterations or run.pick(smoke=4, laptop=300, paper=2200))
-    own = _path(run, task, method)
+    budget = complete(run, budget)
+    own = _path(run, task.env, method)
     shipped = run.shipped / own.parent.name / own.name
     cls: type[Policy] = OneStepPolicy if prior is None else SegmentPolicy
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
@@ -91,12 +90,13 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
 
 
 def learn_all(run: Run, wanted: Iterable[tuple[Task, Method, Budget]]) -> dict[tuple[str, Method], Learned]:
-    """(environment, method) -> the policy. At scale paper several are learned at a time."""
-    asked = list(wanted)
-    words = [(task.env, word) for task, method, _ in asked for word in (method.model, "prior")]
-    precompute_models(run, words)
-    precompute(run, [(learn, *one) for one in asked], progress="policies")
-    return {(task.env, method): learn(run, task, method, budget) for task, method, budget in asked}
+    """(environment, method) -> the policy."""
+    return {(task.env, method): learn(run, task, method, budget) for task, method, budget in wanted}
+
+
+def complete(run: Run, budget: Budget) -> Budget:
+    """The budget with the scale's iterations where it has none of its own."""
+    return replace(budget, iterations=budget.iterations or run.pick(smoke=4, laptop=300, paper=2200))
 
 
 def _learn(
@@ -147,15 +147,19 @@ def learned_rows(run: Run, task: Task, method: Method, found: Learned) -> list[R
     )  # fmt: skip
 
 
-def stored_budget(run: Run, task: Task, method: Method) -> Budget | None:
+def stored_budget(run: Run, env: str, method: Method) -> Budget | None:
     """How the policy that the run's folder holds was learned, for ``learn`` to find it again; else None."""
-    path = _path(run, task, method)
+    path = _path(run, env, method)
     return Budget(**cast("dict[str, int]", artifacts.read_header(path)["budget"])) if path.exists() else None
 
 
-def _path(run: Run, task: Task, method: Method) -> Path:
-    folder = run.folder(f"models/{EnvSpec.parse(task.env).name}")
-    return folder / f"policy-{method.model}-{method.search_space}.safetensors"
+def _path(run: Run, env: str, method: Method) -> Path:
+    return run.dir / "models" / EnvSpec.parse(env).name / f"{file_name(method)}.safetensors"
+
+
+def file_name(method: Method) -> str:
+    """What the file of a policy is called, without suffix."""
+    return f"policy-{method.model}-{method.search_space}"
 
 
 def execute_policy(task: Task, policy: Policy) -> Trial:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -16,11 +15,10 @@ from tsmlib.models.base import DynamicsModel, predict_segment
 from tsmlib.sampling import Noise
 from tsmlib.storage import artifacts, tables
 from tsmlib.study.data import dataset
-from tsmlib.study.models import load_or_train, precompute_models
+from tsmlib.study.models import load_or_train
 from tsmlib.study.notebooks import require
-from tsmlib.study.parallel import precompute
 from tsmlib.study.results import prediction as prediction_results
-from tsmlib.study.runs import ROOT, Run
+from tsmlib.study.runs import ROOT, Run, RunError
 from tsmlib.trajectory import Segment
 
 RESULTS = ROOT / "data" / "results"
@@ -34,10 +32,8 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> predict
     """
     net, _ = load_or_train(run, env, model)
     test, held_out = (dataset(run, env, split) for split in ("test", "validation"))
-    test, held_out = (
-        data.take(slice(run.pick(smoke=8, laptop=200, paper=n))) for data, n in ((test, 1000), (held_out, 200))
-    )
-    samples = run.pick(smoke=8, laptop=16, paper=32)  # of a model without samples: noisy copies
+    n, samples = score_sizes(run).values()
+    test, held_out = test.take(slice(n)), held_out.take(slice(min(n, 200)))
     options: dict[str, Any] = {"horizon": 90}
     if segments:
         options = {"horizon": 10, "starts": list(prediction_results.SEGMENTS)}
@@ -61,6 +57,11 @@ def scores(run: Run, env: str, model: str, *, segments: bool = False) -> predict
     return _unpacked(artifacts.load(path, kind="scores")[0])  # new ones too: the same rows in the same order
 
 
+def score_sizes(run: Run) -> dict[str, int]:
+    """Test episodes, and samples of each prediction; of a model without samples these are noisy copies."""
+    return run.pick(smoke={"n": 8, "samples": 8}, laptop={"n": 200, "samples": 16}, paper={"n": 1000, "samples": 32})
+
+
 class Scored(NamedTuple):
     """Scores of a model on whole episodes, and on segments from the true past."""
 
@@ -69,12 +70,8 @@ class Scored(NamedTuple):
 
 
 def score_all(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Scored]:
-    """(environment, model) -> its scores. At scale paper several models are trained and scored at a time."""
-    pairs = list(dict.fromkeys(wanted))
-    precompute_models(run, pairs)
-    both = (scores, partial(scores, segments=True))
-    precompute(run, [(score, *pair) for pair in pairs for score in both], progress="scores")
-    return {pair: Scored(*(score(run, *pair) for score in both)) for pair in pairs}
+    """(environment, model) -> its scores."""
+    return {pair: Scored(scores(run, *pair), scores(run, *pair, segments=True)) for pair in wanted}
 
 
 def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, object]]:
@@ -86,17 +83,26 @@ def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, ob
     return found
 
 
-def pooled_rows(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
+def pooled_rows(
+    run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "", *, whole: bool = True
+) -> pd.DataFrame:
     """The given rows, and at scale paper those of the other seeds beside this run.
 
-    table: what follows the notebook's name in the table's, ``_rows`` for instance. RunError where another seed's
-    notebook did not come to its end.
+    table: what follows the notebook's name in the table's, ``_rows`` for instance. Where another seed's notebook did
+    not come to its end: RunError if ``whole``, else that seed is left out, and it is said.
     """
     name, parts = f"{run.notebook}{table}.csv", [tables.frame(rows)]
     for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.scale == "paper" else ():
         if run.dir not in path.parents:
             folder = path.parents[1]
-            require(replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder), run.notebook)
+            other = replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder)
+            try:
+                require(other, run.notebook)
+            except RunError as error:
+                if whole:
+                    raise
+                print(f"seed {other.seed} is left out: {error}")
+                continue
             parts.append(tables.load(path))
     return tables.frame(pd.concat(parts))
 

@@ -1,7 +1,8 @@
 """Runs: scale, seed, device and folders of what a notebook makes.
 
 Everything that a run makes is in one folder, ``runs/<scale>/seed<k>/``: ``data``, ``models``, ``metrics``, ``figures``,
-the executed notebooks, and ``status.json``, which alone says whether a notebook ran to its end (``notebooks.require``).
+the executed notebooks, and of each a status, ``05_control.status.json``, which alone says whether it ran to its end
+(``notebooks.require``).
 
 What ships lies in ``ROOT``, below ``data`` and ``notebooks``: in a checkout the repository, in an installed package
 ``tsmlib/_shipped``, which ``setup.py`` puts into a wheel. A checkout has its runs in the repository, an installed
@@ -10,7 +11,8 @@ package in the working directory.
 
 import os
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -38,6 +40,7 @@ class Run:
     seed: int
     dir: Path
     device: str = "cpu"  # where ``study`` trains, learns, plans and imagines
+    parameters: Mapping[str, Value] = field(default_factory=dict, compare=False)  # the notebook's others, as given
 
     @property
     def data(self) -> Path:
@@ -63,6 +66,13 @@ class Run:
     def shipped(self) -> Path:
         """The pretrained models that come with the package. Read only."""
         return ROOT / "data" / "pretrained"
+
+    def parameter(self, name: str) -> Value:
+        """The value of another parameter of the notebook: as it was given, else its default there."""
+        if name in self.parameters:
+            return self.parameters[name]
+        path = next(each.path for each in notebooks().values() if each.stem == self.notebook)
+        return parameters.declared(path)[name]  # type: ignore[return-value]  # literals
 
     def pick(self, *, smoke: T, laptop: T, paper: T) -> T:
         """The value for this run's scale."""
@@ -116,6 +126,7 @@ def resolve(
     """
     if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()):
         parameters.require_declared(shell.user_ns.get("In", []), notebook)
+        _record_written()
     parameters.check("seed", seed)
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
@@ -131,7 +142,29 @@ def resolve(
         if isinstance(error, ParameterError):
             raise
         raise ParameterError(f"run_dir is {str(base)[:80]!a}, expected the name of a folder: {error}.") from None
-    return Run(notebook, scale, seed, base / scale / f"seed{seed}", device)
+    return Run(notebook, scale, seed, base / scale / f"seed{seed}", device, others)
+
+
+def _record_written() -> None:
+    """From now on, list in the file TSM_WRITTEN each file that this process opens for writing, or renames to.
+
+    ``notebooks.execute`` asks a notebook's kernel for it: other notebooks of the run may write there at the same time.
+    """
+    if not (record := os.environ.pop("TSM_WRITTEN", "")):
+        return
+    seen, file = set[str](), os.open(record, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+
+    def note(event: str, arguments: tuple[object, ...]) -> None:
+        if event == "os.rename" or (event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITES):
+            path = arguments[1 if event == "os.rename" else 0]
+            if isinstance(path, str | os.PathLike) and (name := os.path.abspath(path)) not in seen:
+                seen.add(name)
+                os.write(file, f"{name}\n".encode(errors="surrogateescape"))
+
+    sys.addaudithook(note)
+
+
+_WRITES = os.O_WRONLY | os.O_RDWR
 
 
 def _setting(name: str, value: str, variable: str, default: str) -> str:

@@ -1,0 +1,199 @@
+"""Workflows of several seeds: steps in order, refused before they do harm, and the same files whoever runs them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from reliability import cluster
+
+from tsmlib.__main__ import main
+from tsmlib.storage import files, manifest
+from tsmlib.storage.provenance import provenance
+from tsmlib.study import parameters, runs, workflow, zoo
+from tsmlib.study.data import HELD_OUT_SEED
+from tsmlib.study.parameters import ParameterError
+from tsmlib.study.runs import RunError
+from tsmlib.study.tasks import TASK_SEED
+
+HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
+needs_snakemake = pytest.mark.skipif(not HAS_SNAKEMAKE, reason="no Snakemake: pip install 'tsmlib[cluster]'")
+NOTEBOOKS = list(runs.notebooks().values())
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path / "runs"))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    return tmp_path
+
+
+def table(scale: str = "smoke", seeds: tuple[int, ...] = (0, 2), **given: str) -> dict[str, workflow.Step]:
+    prepared = workflow.prepare(NOTEBOOKS, seeds, scale=scale, device="", given=given)
+    return workflow.steps(prepared, given)
+
+
+# Seeds ---------------------------------------------------------------------------------------------------------------
+
+
+def test_seeds_are_named_by_ranges_and_commas() -> None:
+    assert parameters.parse_seeds("0-3") == [0, 1, 2, 3]
+    assert parameters.parse_seeds("5,0, 2-3") == [5, 0, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "3-1", "0,0", "0-2,2", "-1", "1.0", "0-", "a", "0;1", "0-99999", "4294967296", "٣"]
+)
+def test_other_words_for_seeds_are_refused(text: str, place: Path) -> None:
+    with pytest.raises(ParameterError, match=r"(--seeds|seed) is .*(expected|once)"):
+        parameters.parse_seeds(text)
+    assert not text or main(["run", "all", f"--seeds={text}", "--dry-run"]) == 2
+    assert not list(place.iterdir())
+
+
+@pytest.mark.parametrize("seed", [*HELD_OUT_SEED.values(), *TASK_SEED.values()])
+def test_seeds_of_held_out_episodes_and_targets_are_refused(
+    seed: int, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "all", "--scale", "smoke", "--seeds", f"{seed - 1}-{seed}"]) == 2
+    assert "draws held-out episodes or targets" in capsys.readouterr().err
+    assert not list(place.iterdir())
+
+
+# Steps ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", ["smoke", "laptop", "paper"])
+def test_a_step_comes_after_those_that_it_needs(scale: str) -> None:
+    done, steps = set[str](), table(scale)
+    for name, step in steps.items():
+        assert set(step.needs) <= done, name
+        done.add(name)
+    assert len({step.done for step in steps.values()}) == len(steps)
+    assert sum(step.kind == "notebook" for step in steps.values()) == 2 * len(NOTEBOOKS)
+
+
+def test_claims_wait_for_the_notebooks_of_every_seed() -> None:
+    steps = table("paper")
+    others = {name for name, step in steps.items() if step.kind == "notebook" and "08_claims" not in name}
+    assert set(steps["seed0/08_claims"].needs) == set(steps["seed2/08_claims"].needs) == others
+
+
+def test_a_plan_that_a_second_notebook_makes_for_more_targets_is_not_made_before_the_first_has_used_it() -> None:
+    plan = "seed2/plans/Reacher-oracle-latent-cem"
+    steps = table("laptop")
+    assert plan in steps["seed2/05_control"].needs
+    assert "seed2/05_control" in steps["seed2/07_action_prior"].needs
+    assert "seed2/05_control" not in table("paper")["seed2/07_action_prior"].needs  # there it is the same plan
+
+
+def test_a_change_of_a_schedule_reaches_what_was_made_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = table("paper", (0,))
+    spec = zoo.ZOO["lstm"]
+    longer = tuple(replace(stage, rate=99.0) for stage in spec.stages)
+    monkeypatch.setitem(zoo.ZOO, "lstm", replace(spec, stages=longer))
+    changed = {name for name, step in table("paper", (0,)).items() if step.settings != before[name].settings}
+    assert changed == {f"seed0/models/Reacher{how}/lstm" for how in ("", "Obstacle", "-noise0.25", "-delay5")} | {
+        f"seed0/models/Reacher{how}/lstm" for how in ("-noise0.1", "-noise0.25-delay5")
+    }
+
+
+# Refusals ------------------------------------------------------------------------------------------------------------
+
+
+def dry(*options: str) -> int:
+    return main(["run", "train", "--scale", "smoke", "--seeds", "0,2", "--dry-run", *options])
+
+
+def test_a_dry_run_lists_the_steps_and_leaves_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert dry("--executor", "pool") == 0
+    told = capsys.readouterr().out.splitlines()
+    assert "model    seed2/models/ReacherPush/rtsm" in told
+    assert told[-1] == f"{len(told) - 1} of {len(told) - 1} steps are not there yet"
+    assert not list(place.iterdir())
+
+
+def test_an_executor_without_its_package_is_refused_naming_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: Path
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if "snakemake" in name else name)
+    assert dry("--executor", "slurm") == 1
+    assert "pip install 'tsmlib[cluster]'" in capsys.readouterr().err
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name.endswith("_kubernetes") else name)
+    assert dry("--executor", "kubernetes") == 1
+    assert "pip install snakemake-executor-plugin-kubernetes" in capsys.readouterr().err
+    assert dry("--executor", "../x") == 2
+    assert not list(place.iterdir())
+
+
+def test_a_workflow_that_another_process_holds_is_refused_naming_it(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with files.writer_lock(place / "runs" / "smoke" / "workflow", "workflow of seeds 0"):
+        assert main(["run", "train", "--scale", "smoke", "--seeds", "0", "--executor", "pool"]) == 1
+    told = capsys.readouterr().err
+    assert f"workflow is being written by another process (pid {os.getpid()} on " in told
+    assert "workflow of seeds 0, since" in told
+
+
+def test_two_versions_of_the_code_are_refused_naming_both_unless_it_is_asked_for(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, now = place / "runs" / "smoke" / "workflow", provenance()["code"]
+    manifest.write_json(folder / "code.json", {"codes": ["0.1.0+aaa"]})
+    assert dry("--executor", "pool") == 1
+    told = capsys.readouterr().err
+    assert f"workflow was made by tsmlib 0.1.0+aaa, this is {now}" in told
+    assert "--any-code" in told
+    assert dry("--executor", "pool", "--any-code") == 0
+    manifest.write_json(folder / "code.json", {"codes": ["0.1.0+aaa", now]})
+    assert dry("--executor", "pool") == 0
+    entry = {"state": "complete", "provenance": {"code": "0.1.0+bbb"}}
+    manifest.write_json(folder.parent / "seed2" / "02_train.status.json", manifest.sealed(entry))
+    assert dry("--executor", "pool") == 1
+    assert "02_train in" in capsys.readouterr().err
+
+
+def test_a_step_of_another_version_than_its_workflow_is_refused(place: Path) -> None:
+    manifest.write_json(place / "runs" / "smoke" / "workflow" / "code.json", {"codes": ["0.1.0+aaa"]})
+    (execution, *_) = workflow.prepare(NOTEBOOKS[1:2], [0], scale="smoke", device="", given={})
+    with pytest.raises(RunError, match=r"this step runs tsmlib .*, its workflow 0\.1\.0\+aaa"):
+        workflow.step(execution, "data/Reacher/test")
+
+
+def test_a_step_makes_a_job_by_its_name_and_no_other(place: Path) -> None:
+    assert main(["step", "collect", "--job", "data/Reacher/test", "--scale", "smoke", "--seed", "2"]) == 0
+    assert (place / "runs" / "smoke" / "seed2" / "data" / "Reacher" / "test.safetensors").exists()
+    assert main(["step", "collect", "--job", "models/Reacher/tsm", "--scale", "smoke"]) == 2
+
+
+# Whole workflows -----------------------------------------------------------------------------------------------------
+
+
+@needs_snakemake
+def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
+    found: dict[str, Any] = {}
+    for executor in ("pool", "local"):
+        process = cluster.workflow(place / executor, "--executor", executor)
+        assert process.wait(600) == 0, (place / executor / "log").read_text()
+        found[executor] = cluster.made(place / executor)
+    assert found["local"] == found["pool"]
+    assert sorted(found["pool"])[1:] == [f"seed{seed}/metrics/02_train.csv" for seed in (0, 2)]
+    folder = place / "local" / "runs" / "smoke" / "workflow"
+    for part, suffix in (("log", ".log"), ("benchmark", ".tsv")):
+        assert (folder / part / "seed2" / "models" / "Reacher" / f"prior{suffix}").exists()
+    steps = json.loads((folder / "steps.json").read_text())
+    assert all((folder / step["done"]).exists() for step in steps.values())
+    again = cluster.workflow(place / "local", "--executor", "local")
+    assert again.wait(600) == 0
+    assert "Nothing to be done" in (place / "local" / "log").read_text()
+
+
+@pytest.mark.skipif(bool(cluster.missing()), reason=f"{cluster.missing()}: apt-get install slurm-wlm munge, as root")
+def test_a_killed_job_on_a_cluster_changes_no_table() -> None:
+    cluster.killed_on_a_cluster(1).check()

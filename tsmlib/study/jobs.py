@@ -1,0 +1,208 @@
+"""Jobs: data sets, models, scores, plans and policies that a run keeps in its folder, each with what it needs.
+
+A notebook's are listed by ``needs``. ``parallel.precompute`` makes them on this machine, ``workflow`` on any number.
+Whether a kept file still holds is judged where it is made, from its header, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import ClassVar, Protocol
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation import prediction
+from tsmlib.figures.method import Method
+from tsmlib.storage.files import Json
+from tsmlib.study import models, plans, policies, predictions, zoo
+from tsmlib.study.data import dataset, sizes
+from tsmlib.study.plans import AGAIN, CANDIDATES, ITERATIONS, TORQUES
+from tsmlib.study.policies import USUAL, Budget
+from tsmlib.study.runs import Run
+from tsmlib.study.tasks import load_task
+
+
+class Job(Protocol):
+    """Something that a run keeps. Two jobs of one name are the same."""
+
+    @property
+    def kind(self) -> str:
+        """Data, model, scores, plan or policy."""
+
+    @property
+    def name(self) -> str:
+        """Its file, relative to the run's folder and without suffix."""
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        """What has to be there before."""
+
+    def make(self, run: Run) -> object:
+        """Find it, or make it and keep it."""
+
+    def settings(self, run: Run) -> Json:
+        """Numbers that decide what is made. A workflow does the job, and what needs it, again where they change."""
+
+    def seconds(self, run: Run) -> float:
+        """About how long it takes on one core."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """A split of an environment's data."""
+
+    env: str
+    split: str
+    kind: ClassVar[str] = "data"
+
+    @property
+    def name(self) -> str:
+        return f"data/{EnvSpec.parse(self.env).name}/{self.split}"
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        return ()
+
+    def make(self, run: Run) -> object:
+        return dataset(run, self.env, self.split)
+
+    def settings(self, run: Run) -> Json:
+        return {"n": sizes(run, self.env)[self.split]}
+
+    def seconds(self, run: Run) -> float:
+        return sizes(run, self.env)[self.split] / 100
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model of the zoo, by its word. A training of several seeds at once would be a job like this one."""
+
+    env: str
+    word: str
+    kind: ClassVar[str] = "model"
+
+    @property
+    def name(self) -> str:
+        return f"models/{EnvSpec.parse(models.trained_on(self.env, self.word)).name}/{self.word}"
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        shipped = run.scale == "laptop" and run.seed == 0 and (run.shipped.parent / f"{self.name}.safetensors").exists()
+        return () if shipped else [Data(models.trained_on(self.env, self.word), s) for s in ("train", "validation")]
+
+    def make(self, run: Run) -> object:
+        return models.load_or_train(run, self.env, self.word)
+
+    def settings(self, run: Run) -> Json:
+        env = models.trained_on(self.env, self.word)
+        return {
+            "schedule": [stage.stated() for stage in models.schedule(run, env, self.word)],
+            "arguments": zoo.find(self.word).arguments(EnvSpec.parse(env)),
+        }
+
+    def seconds(self, run: Run) -> float:
+        return models.training_seconds(run, models.trained_on(self.env, self.word), self.word)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a model on test episodes, open loop or of ``segments`` from the true past."""
+
+    env: str
+    model: str
+    segments: bool = False
+    kind: ClassVar[str] = "scores"
+
+    @property
+    def name(self) -> str:
+        return f"scores/{EnvSpec.parse(self.env).name}/{self.model}{'-segments' * self.segments}"
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        return [Model(self.env, self.model), Data(self.env, "validation"), Data(self.env, "test")]
+
+    def make(self, run: Run) -> object:
+        return predictions.scores(run, self.env, self.model, segments=self.segments)
+
+    def settings(self, run: Run) -> Json:
+        return {"version": prediction.VERSION, "rows": prediction.ROWS, **predictions.score_sizes(run)}
+
+    def seconds(self, run: Run) -> float:
+        return run.pick(smoke=1, laptop=20, paper=200)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plans for the first ``n`` targets of an environment's task; see ``plans.plan``."""
+
+    env: str
+    n: int
+    method: Method
+    iterations: int = 0
+    every: int = 0
+    kind: ClassVar[str] = "plan"
+
+    @property
+    def name(self) -> str:
+        return f"plans/{plans.file_name(self.env, self.method, iterations=self.iterations, every=self.every)}"
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        first = [Plan(self.env, self.n, self.method)] if self.every else []  # which a closed loop begins with
+        return [*(Model(self.env, word) for word in plans.models_of(self.method)), *first]
+
+    def make(self, run: Run) -> object:
+        task = load_task(self.env).take(self.n)
+        return plans.plan(run, task, self.method, iterations=self.iterations, every=self.every)
+
+    def settings(self, run: Run) -> Json:
+        own = (AGAIN if self.every else ITERATIONS)[self.method.planner.partition("+")[0].replace("mppi", "cem")]
+        iterations = self.iterations or own[run.scale]
+        return {"version": plans.VERSION, "n": self.n, "candidates": CANDIDATES[run.scale], "iterations": iterations}
+
+    def seconds(self, run: Run) -> float:
+        each = 12.0 if self.method.model == "oracle" else 3.0  # for each target
+        return self.n * each * (10 if self.every else 1) * run.pick(smoke=0.01, laptop=0.5, paper=1)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy learned inside a model, measured on the first ``n`` targets; see ``policies.learn``."""
+
+    env: str
+    n: int
+    method: Method
+    budget: Budget = USUAL
+    kind: ClassVar[str] = "policy"
+
+    @property
+    def name(self) -> str:
+        return f"models/{EnvSpec.parse(self.env).name}/{policies.file_name(self.method)}"
+
+    def needs(self, run: Run) -> Sequence[Job]:
+        words = [self.method.model] + ["prior"] * (self.method.search_space == "latent")
+        return [*(Model(self.env, word) for word in words), Data(self.env, "train")]
+
+    def make(self, run: Run) -> object:
+        return policies.learn(run, load_task(self.env).take(self.n), self.method, self.budget)
+
+    def settings(self, run: Run) -> Json:
+        return {**asdict(policies.complete(run, self.budget)), "episodes": policies.EPISODES[run.scale]}
+
+    def seconds(self, run: Run) -> float:
+        return policies.complete(run, self.budget).iterations * run.pick(smoke=0.5, laptop=1.0, paper=1.0)
+
+
+def complete(run: Run, wanted: Iterable[Job]) -> dict[str, Job]:
+    """Name -> job: those that are wanted and all that they need, each after what it needs."""
+    found: dict[str, Job] = {}
+
+    def add(job: Job) -> None:
+        if job.name not in found:
+            for other in job.needs(run):
+                add(other)
+            found[job.name] = job
+
+    for job in wanted:
+        add(job)
+    return found
+
+
+def plan_jobs(env: str, n: int, methods: Iterable[Method], *, iterations: int = 0, every: int = 0) -> list[Job]:
+    """A job for each method that plans; random and zero torques need none."""
+    return [Plan(env, n, each, iterations, every) for each in methods if each.model not in TORQUES]
