@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 PIP := $(PY) -m pip --disable-pip-version-check install --progress-bar on
 TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
-.PHONY: help quickstart collect train predict latent control robustness action_prior claims your_own test reliability bench explorer docs lint clean
+.PHONY: help quickstart collect train predict latent control robustness action_prior claims your_own explore test reliability bench explorer docs lint clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
@@ -20,6 +20,7 @@ help:
 	@echo "make action_prior   plans with and without the action prior (notebooks/07_action_prior.ipynb)"
 	@echo "make claims    verdicts on the paper's claims from the results that ship (notebooks/08_claims.ipynb)"
 	@echo "make your_own  robots that no one here made, from id to film (notebooks/09_your_own.ipynb)"
+	@echo "make explore   rounds of planning and learning, a model adapted to a changed arm (notebooks/10_explore.ipynb)"
 	@echo "make test      all tests, among them every notebook, cut down"
 	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"
 	@echo "make bench     speed of everything against references, and docs/speed.md"
@@ -28,7 +29,7 @@ help:
 	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
-quickstart collect train predict latent control robustness action_prior claims your_own: $(READY)
+quickstart collect train predict latent control robustness action_prior claims your_own explore: $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import registry, spec
 from torch import Tensor
 
 import tsmlib as tsm
@@ -170,6 +171,42 @@ def test_an_unstable_episode_is_left_out_and_counted(monkeypatch: pytest.MonkeyP
     found = explored(*learners(), options=options(rounds=1))
     assert found.records[0]["lost"] == 1
     np.testing.assert_array_equal(asked[1], asked[0][[0, 2]])
+
+
+def test_what_disturbs_a_plan_is_no_candidate_of_its_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[Any, float, torch.Generator]] = []
+
+    def perturbed(planner: Any, deviation: float, generator: torch.Generator) -> Any:
+        made.append((planner, deviation, generator))
+        return planner
+
+    monkeypatch.setattr(exploration, "_Perturbed", perturbed)
+    explored(*learners(), options=options(rounds=1, noise=0.5))
+    ((planner, _, generator),) = made
+    searched = torch.Generator().manual_seed(planner.keywords["seed"])
+    assert not torch.equal(torch.randn(8, generator=generator), torch.randn(8, generator=searched))
+
+
+def test_a_limit_of_time_ends_an_episode_without_terminating_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry, "tests/Limited-v0", replace(spec("Pendulum-v1"), id="tests/Limited-v0",
+                                                              max_episode_steps=12))  # fmt: skip
+    train = tsm.collect_random("tests/Limited-v0", 6, horizon=HORIZON)
+
+    def swings(k: int) -> tsm.Task:
+        def reward(x: Tensor, u: Tensor) -> Tensor:
+            return x[..., 0]
+
+        return tsm.Task.from_env("tests/Limited-v0", n=3, horizon=HORIZON, reward=reward, seed=k)
+
+    model, once = tsm.OneStep.for_data(train, hidden=8), replace(options().model, past_len=1)
+    found = tsm.explore(model, None, train, train, swings, options(model=once, prior=None, rounds=1))
+    assert set(found.train.steps) == {12}
+    assert found.train.terminated == ()
+
+
+def test_some_episodes_of_a_round_are_always_trained_on() -> None:
+    found = explored(*learners(), options=options(rounds=1, held_out=0.99))
+    assert (len(found.train), len(found.held_out)) == (6 + 1, 2 + EPISODES - 1)
 
 
 @pytest.mark.parametrize(("given", "said"), [

@@ -12,6 +12,7 @@ from typing import Any
 import nbformat
 import pytest
 
+from tsmlib import study
 from tsmlib.storage import manifest, tables
 from tsmlib.study import notebooks, parameters, runs
 
@@ -82,5 +83,10 @@ def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monke
     status = manifest.statuses(tmp_path / "smoke" / "seed0")
     assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
     manifest.verify(tmp_path)
+    each = [runs.resolve(path.stem, scale="smoke", run_dir=str(tmp_path)) for path in NOTEBOOKS]
+    declared = {f"{job.name}.safetensors" for run in each for job in study.needs(run)}
+    folders = [each[0].dir / name for name in ("data", "models", "plans", "scores")]
+    made = {path.relative_to(each[0].dir).as_posix() for place in folders for path in place.rglob("*.safetensors")}
+    assert made == declared
     assert not list(tmp_path.rglob("*.tmp-*"))
     assert changed() == before  # only publish writes what is tracked

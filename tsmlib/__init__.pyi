@@ -6,6 +6,7 @@ from .evaluation.prediction import score as score
 from .exploration import Exploration as Exploration
 from .exploration import ExplorationOptions as ExplorationOptions
 from .exploration import explore as explore
+from .fine_tuning import fine_tune as fine_tune
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout

@@ -59,7 +59,7 @@ class ExplorationOptions:
 
     model, prior: one round's training of each, from the weights it has; prior=None leaves it as it is. every,
     candidates, elites, iterations: of the planning (``mpc``, ``cem``). held_out: share of each round's episodes that
-    join the held-out data, at least one.
+    join the held-out data, at least one and never all.
     noise: standard deviation of what is added to the parameters of every plan, in those of the search space.
     bonus: reward for each step per unit of disagreement, the standard deviation over ``samples`` predicted states, as a
     share of the data's, mean over dimensions; 0: none.
@@ -131,7 +131,7 @@ def explore(
     weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
     identity: dict[str, Json] = {
         "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
-        "data": [_digest(data) for data in (train, held_out)],
+        "data": [artifacts.trajectories_digest(data) for data in (train, held_out)],
     }  # fmt: skip
     found, began = Exploration(train, held_out), time.process_time()
     with ExitStack() as stack:
@@ -140,7 +140,7 @@ def explore(
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
             place = None if folder is None else _Round(folder / f"round-{k:03d}", identity)
             episodes, record = _collected(k, model, prior, train, tasks, options, seed, place)
-            n = max(1, round(options.held_out * len(episodes)))
+            n = min(len(episodes) - 1, max(1, round(options.held_out * len(episodes))))
             found.held_out = found.held_out.joined(episodes.take(slice(n)))
             found.train = found.train.joined(episodes.take(slice(n, None)))
             before = found.records[-1]["env_steps"] if found.records else 0
@@ -171,7 +171,7 @@ def _collected(
         cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations, seed=draw
     )
     if options.noise:
-        planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(draw))
+        planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(-1 - draw))  # of no search
     judge: Judge = partial(model_predictor, samples=options.samples) if options.bonus else model_predictor
     lost = 0
     while True:
@@ -183,11 +183,8 @@ def _collected(
                 raise
             aim, lost = _without(aim, fault.episode), lost + 1
     record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost}
-    lengths = trial.lengths or (trial.actions.shape[1],) * len(trial.actions)
-    episodes = replace(
-        like, states=(trial.states if trial.observed is None else trial.observed).numpy(),
-        actions=trial.actions.numpy(), lengths=lengths, terminated=tuple(n < task.horizon for n in lengths),
-    )  # fmt: skip
+    seen = cast(Trajectories, trial.seen)  # of mpc, there always
+    episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
     if place is not None:
         place.keep_episodes(episodes, record)
     return episodes, record
@@ -265,10 +262,6 @@ def _without(task: Task, i: int) -> Task:
     kept = np.delete(np.arange(len(task)), i)
     seeds = tuple(task.seeds[j] for j in kept) if task.seeds else ()
     return replace(task, start=task.start[kept], target=task.target[torch.from_numpy(kept)], seeds=seeds)
-
-
-def _digest(data: Trajectories) -> str:
-    return artifacts.digest({"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)})[:16]
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ class OneStep(Featured, Configured):
         widths = [self.features.dim + action_dim, *[hidden] * layers]
         inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
         self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
+        self.output_layers = (f"net.{len(inner)}",)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """f: (..., dx), (..., du) -> (..., dx)."""
@@ -69,7 +70,7 @@ class LSTM(Featured, Configured):
     steps as one call asks for, so a whole horizon is one segment.
     """
 
-    stochastic = False
+    stochastic, output_layers = False, ("out",)
 
     def __init__(
         self,

@@ -47,6 +47,7 @@ class Ensemble(Featured, Configured, EnsembleModel):
             drawn = [nn.Linear(i, o) for _ in range(members)]
             self.weights.append(nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn])))  # (M, i, o)
             self.biases.append(nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn])))  # (M, 1, o)
+        self.output_layers = (f"weights.{layers}", f"biases.{layers}")
         if gaussian:  # limits of the stated log variance, learned as in PETS
             self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
             self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))

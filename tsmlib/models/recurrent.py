@@ -61,7 +61,7 @@ class RecurrentTSM(Featured, Configured, EnsembleModel):
     mode_weight: of the distance of the mode (z = 0) from the truth, beside the energy score.
     """
 
-    stochastic = True
+    stochastic, code_statistics = True, None  # no encoder
 
     def __init__(
         self,
@@ -87,8 +87,14 @@ class RecurrentTSM(Featured, Configured, EnsembleModel):
         self.decoders = nn.ModuleList(
             Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim) for _ in range(members)
         )
+        self.output_layers = tuple(f"decoders.{k}.head" for k in range(members))
         # Not Muon: their columns are the codes' dimensions, of which some go unused.
         self.adam_only = tuple(f"decoders.{k}.codes" for k in range(members))
+
+    @property
+    def code_layers(self) -> list[tuple[nn.Linear, list[nn.Linear]]]:
+        """V and the gates, of each decoder."""
+        return [(decoder.codes, [decoder.cell]) for decoder in cast(list[Decoder], self.decoders)]
 
     def alone(self, k: int) -> "RecurrentTSM":
         """Decoder ``k`` as a model of its own, whose weights and features are these."""

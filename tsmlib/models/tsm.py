@@ -7,10 +7,10 @@
 All that is uncertain about a segment lives in its code. The decoder predicts increments of the physical state.
 """
 
-from typing import Unpack
+from typing import Unpack, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tsmlib.models.base import Step
 from tsmlib.models.config import Configured
@@ -41,7 +41,7 @@ class TSM(Featured, Configured):
         dilations: receptive field 1 + sum = 20 = 2 H. plain: no residual or skip connections, an ablation.
     """
 
-    stochastic = True
+    stochastic, output_layers = True, ("decoder.head",)
 
     def __init__(
         self,
@@ -64,6 +64,16 @@ class TSM(Featured, Configured):
         seen = (self.features.dim + action_dim, 2 * segment_len) if full_encoder else (self.features.dim, segment_len)
         self.encoder = Encoder(*seen, latent_dim)
         self.decoder = CausalDecoder(self.features.dim + action_dim, state_dim, latent_dim, **decoder)
+
+    @property
+    def code_layers(self) -> list[tuple[nn.Linear, list[nn.Linear]]]:
+        """V and the two taps of every layer."""
+        return [(self.decoder.codes, [cast(nn.Linear, layer.taps) for layer in self.decoder.layers])]
+
+    @property
+    def code_statistics(self) -> nn.Linear:
+        """The last layer of the encoder."""
+        return self.encoder.project
 
     def config(self) -> dict[str, Json]:
         options = DecoderOptions.__annotations__

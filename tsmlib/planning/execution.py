@@ -35,7 +35,8 @@ class Trial:
     with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
 
     success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
-    returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none.
+    returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none. seen: the
+    episodes as they were collected, with what the sensors said and how each of them ended.
     """
 
     actions: Tensor
@@ -47,6 +48,7 @@ class Trial:
     success: Tensor | None = None
     lengths: tuple[int, ...] = ()
     own_return: Tensor | None = None
+    seen: Trajectories | None = None
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -212,4 +214,5 @@ def _measured(task: Task, run: Simulation, seen: Trajectories, actions: Tensor, 
         success=success,
         lengths=seen.lengths or ((seen.horizon,) * len(seen) if missing else ()),
         own_return=torch.from_numpy(run.returns).float(),
+        seen=seen,
     )

@@ -304,3 +304,9 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     for name, tensor in sorted(tensors.items()):
         found.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
     return found.hexdigest()
+
+
+def trajectories_digest(data: Trajectories) -> str:
+    """The first 16 digits of the ``digest`` of states, actions and, where episodes differ in length, lengths."""
+    arrays = {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
+    return digest(arrays | ({"lengths": torch.tensor(data.lengths)} if data.lengths else {}))[:16]

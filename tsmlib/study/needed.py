@@ -48,6 +48,18 @@ def chosen(run: Run) -> Chosen:
     return Chosen(envs, parse_choice("models", str(run.parameter("models")), known))
 
 
+APART = ("tsm", "tsm+teacher", "tsm+energy", "tsm+direct", "tsm+energy+direct")  # TSM with parts put in or taken away
+
+
+def ablations(run: Run) -> list[tuple[str, str]]:
+    """Environments and models that 03_predict scores beside those that are chosen: of seed 0, where all are."""
+    envs, words = chosen(run)
+    if run.scale == "laptop" or run.seed or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
+        return []
+    choices = run.pick(smoke=["tsm+plain"], laptop=[], paper=["tsm+full", "tsm+plain"])
+    return [(PUSH, word) for word in (*APART, "onestep", *choices)]
+
+
 class Control(NamedTuple):
     """What 05_control plans with, for ``n`` targets of each task in ``envs``, and which policies it learns."""
 
@@ -180,8 +192,8 @@ def _for_models(run: Run) -> list[Job]:
 
 
 def _for_predict(run: Run) -> list[Job]:
-    envs, words = chosen(run)
-    return [Scores(env, word, segments) for env, word, segments in product(envs, words, (False, True))]
+    pairs = [*product(*chosen(run)), *ablations(run)]
+    return [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
 
 
 def _for_control(run: Run) -> list[Job]:

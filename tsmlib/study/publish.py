@@ -17,6 +17,7 @@ from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL
 from tsmlib.study.notebooks import require
 from tsmlib.study.predictions import RESULTS
+from tsmlib.study.results import exploration as exploration_results
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results import prediction as prediction_results
@@ -39,6 +40,7 @@ POOLED = (
     "06_robustness",
     "07_action_prior",
     "09_your_own",
+    "10_explore",
 )  # tables that ship with all seeds
 
 
@@ -159,16 +161,17 @@ def readme_costs(env: str) -> str:
     """One sentence: what plans of each method cost, the cheapest first; and the longer training of OURS."""
     rows = _shipped("05_control_rows")
     costs = planning_results.paired_table(rows, env, OURS)
-    said = ", ".join(f"{line['method'].look.name} {line['cost (m)']}" for line in costs.to_dict("records"))
+    named = [line for line in costs.to_dict("records") if line["method"] != zoo.method("random")]
+    said = ", ".join(f"{line['method'].look.name} {line['cost (m)']}" for line in named)
     seeds = ", ".join(str(seed) for seed in sorted(planning_results.chosen(rows, env=env)["seed"].unique()))
     targets = costs["n"].max()
     closed = planning_results.chosen(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
     again, hits = (table.values(table.select(closed, metric=metric)) for metric in ("return_true", "success"))
     loops = ", ".join(f"`{model}` {-found.mean():.2f} ({hits[model].mean():.0%})" for model, found in again.items())
     return (
-        f"Costs (m, {targets} targets, seed {seeds}): {said}; planned again every ten steps (ending within 5 cm): "
-        f"{loops}. For pushing `{OURS}` has three decoders, each trained as long as a baseline; on 50 validation "
-        "targets one decoder is level with the LSTM, and three baselines judging together "
+        f"Costs (m, {targets} targets, seed {seeds}): {said}; planned again every ten steps (within 5 cm): {loops}. "
+        f"For pushing `{OURS}` has three decoders, each trained as long as a baseline; on 50 validation targets one is "
+        "level with the LSTM, and two LSTMs, or three baselines, judging together "
         "[plan as well](benchmarks/settings/README.md). "
         "[Target by target](docs/results.md#pushing-target-by-target)."
     )
@@ -222,6 +225,8 @@ def results_page() -> str:
         for env, n in seeds.items()
     )
     planned = ", ".join(str(seed) for seed in sorted(control["seed"].dropna().unique()))
+    pages = robots_page(_shipped("09_your_own")), exploration_page(_shipped("10_explore"))
+    later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
 
@@ -231,7 +236,8 @@ def results_page() -> str:
 observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
 seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
 of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`), but `{OURS}` of
-pushing, which has three decoders, each trained that long. `pets` is the same kind of model as `ensemble`, by mbrl-lib
+pushing, which has three decoders, each trained that long. Pushing is trained by Muon; elsewhere `{OURS}` is, and all
+other models by Adam. `pets` is the same kind of model as `ensemble`, by mbrl-lib
 (`benchmarks/peers`).
 
 {scores}
@@ -266,7 +272,7 @@ over k copies or seeds, with half the 95 % t interval.
 
 {policies_results.policies_table(policies_results.learning_curves(learned))}
 
-{robots_page(_shipped("09_your_own"))}"""
+{later}"""
 
 
 def robots_page(rows: pd.DataFrame) -> str:
@@ -296,3 +302,23 @@ Model-free learners as [RL Baselines3 Zoo]({robots_results.SOURCE}) published th
 MuJoCo robots and over whole episodes; they were not run here:
 
 {robots_results.model_free_table()}"""
+
+
+def exploration_page(rows: pd.DataFrame) -> str:
+    """Rounds of exploration and adapted models of 10_explore; empty without rows."""
+    if not len(rows):
+        return ""
+    seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    return f"""## Exploration and adaptation
+
+Written from the rows that `python -m tsmlib run explore --scale paper` made, training seed {seeds};
+`python -m tsmlib publish --table explore` copies them. Plans of the pendulum are made anew every ten steps, from n
+starts that no round trains on; steps count the random episodes before the first round.
+
+{exploration_results.rounds_table(rows)}
+
+The arm has lost 30 % of its torque; n test episodes, open loop after ten observed steps, in units of the standard arm:
+
+{exploration_results.ways_table(rows)}
+
+{exploration_results.sentences(rows)}"""

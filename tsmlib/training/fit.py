@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.storage.artifacts import digest
+from tsmlib.storage.artifacts import trajectories_digest
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.training.muon import Muon, matrices
@@ -105,7 +105,8 @@ def fit(
     Windows and noise are functions of (seed, step), so a run that is resumed from ``checkpoint``, a folder, continues
     as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
     weights so far in ``model``, and StoreError for a checkpoint of another run, or one that another process writes.
-    A model of states whose features have no statistics yet takes those of ``train`` first.
+    A model of states whose features have no statistics yet takes those of ``train`` first. Parameters with
+    ``requires_grad`` False stay as they are.
     """
     features = getattr(model, "features", None)
     if isinstance(features, Statistics) and not features.fitted:
@@ -119,8 +120,10 @@ def fit(
     )  # fmt: skip
     identity = asdict(options) | dict(
         seed=seed, loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
-        data=[_digest(data) for data in (train, validation)],
+        data=[trajectories_digest(data) for data in (train, validation)],
     )  # fmt: skip
+    if frozen := [name for name, weight in model.named_parameters() if not weight.requires_grad]:
+        identity["frozen"] = frozen
     bf16 = o.bf16 and native_bf16(device)
     keep_freed_memory()
     with _trained_on(device, model):
@@ -230,11 +233,6 @@ def _trained_on(device: str, model: nn.Module) -> Iterator[None]:
     finally:
         torch.set_autocast_enabled(kind, False)
         model.to("cpu")
-
-
-def _digest(data: Trajectories) -> str:
-    arrays = {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
-    return digest(arrays | ({"lengths": torch.tensor(data.lengths)} if data.lengths else {}))[:16]
 
 
 def schedule(

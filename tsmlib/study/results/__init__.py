@@ -3,5 +3,6 @@
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, ["action_prior", "latent", "planning", "policies", "prediction", "robots", "robustness", "table"]
+    __name__,
+    ["action_prior", "exploration", "latent", "planning", "policies", "prediction", "robots", "robustness", "table"],
 )

@@ -1,0 +1,70 @@
+"""Figures of exploration: what rounds of planning and learning bring, and where episodes go.
+
+Letters in shapes: k seeds, R rounds, n states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from tsmlib.figures import axes
+from tsmlib.figures.checks import finite, per_panel, shaped
+from tsmlib.figures.method import Method
+from tsmlib.figures.style import DARK, GRID, WIDTH, entry, panels, styled
+
+Rounds = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> method -> steps (R,), values (k, R)
+
+
+@styled
+def rounds(curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None = None) -> Figure:
+    """What was measured after each round, against environment steps: mean over seeds, band for the 95 % t interval.
+
+    curves: title -> method -> environment steps (R,) and values (k, R); ylabel: one for all, or title -> text; yours:
+    as curves, drawn over them as hollow diamonds. A line begins before the first round.
+    """
+    own, every = yours or {}, {title: {**(yours or {}).get(title, {}), **rows} for title, rows in curves.items()}
+    look_of, ylabels = axes.looks(curves, own), per_panel("ylabel", ylabel, curves)
+    width = WIDTH if len(curves) > 1 else 3.8
+    figure, grid = panels(len(curves), len(curves), 2.0, width=width, head=0)
+    banded = False
+    for ax, (title, rows) in zip(grid, curves.items(), strict=True):
+        values = np.concatenate([np.ravel(found) for _, found in every[title].values()])
+        ax.set_ylim(axes.limits(values, values))
+        notes = []
+        for i, (method, given) in enumerate(rows.items()):
+            at, found = _checked(f"{title}, {method.label}", *given)
+            mean, half = axes.band(found)
+            axes.curve(ax, at, mean, half, look_of[method] | {"ms": 4.5}, shift=i / max(1, len(rows)))
+            notes += axes.outside(ax, at, mean, method)
+            banded |= bool(half.any())
+        for method, given in own.get(title, {}).items():
+            at, found = _checked(f"{title}, {method.label}, yours", *given)
+            notes += axes.diamonds(ax, "y", at, found.mean(0), method)
+        ax.set_xlim(left=0)
+        ax.locator_params(axis="x", nbins=5)
+        ax.grid(axis="y", color=GRID, lw=0.6)
+        ax.set(title=title, ylabel=ylabels[title])
+        axes.foot(ax, "environment steps", notes, width / len(curves) - 0.5)
+    handles = axes.entries(look_of)
+    if banded:
+        handles.append(entry("95 % interval over seeds", color="#DDDDDD", lw=5, solid_capstyle="butt"))
+    return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 3 if len(curves) > 1 else 2)
+
+
+def _checked(word: str, at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    steps = finite(f"{word}, steps", at, "R")
+    return steps, finite(word, values, f"k {len(steps)}")
+
+
+@styled
+def visited(states: Mapping[str, np.ndarray], labels: tuple[str, str], notes: Mapping[str, str]) -> Figure:
+    """States on a plane, a panel for each source: title -> (n, 2); labels: of both axes; notes: below a title."""
+    figure, grid = panels(len(states), len(states), 1.75, head=0, sharex=True, sharey=True)
+    for ax, (title, points) in zip(grid, states.items(), strict=True):
+        ax.plot(*shaped(title, points, "n 2").T, ".", ms=1.6, mew=0, alpha=0.5, color=DARK)
+        ax.set(title="\n".join(filter(None, (title, notes.get(title, "")))), xlabel=labels[0])
+    grid[0].set_ylabel(labels[1])
+    return figure

@@ -1,0 +1,121 @@
+"""Few-shot adaptation: shipped models of the standard arm on a changed one, beside models of its episodes alone.
+
+A way is what is done with ``n`` episodes of the changed arm: ``zero-shot`` nothing, ``all``, ``head`` and ``codes``
+fine-tuning of that part, ``scratch`` a new model trained on them. A fifth of the episodes, at least one, is held out to
+choose among validations. The numbers of updates of a model are the same whatever the arm and the episodes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Literal, NamedTuple, cast
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation.prediction import Scores, score
+from tsmlib.fine_tuning import Part, fine_tune
+from tsmlib.models.base import DynamicsModel
+from tsmlib.models.features import Features
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.study import zoo
+from tsmlib.study.data import HELD_OUT_SEED, random_data
+from tsmlib.study.models import TrainedModel, load_pretrained
+from tsmlib.study.results import exploration as results
+from tsmlib.study.results.table import Row
+from tsmlib.study.runs import Run
+from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.trajectory import Trajectories
+
+Way = Literal["zero-shot", "all", "head", "codes", "scratch"]
+WAYS: tuple[Way, ...] = ("zero-shot", "all", "head", "codes", "scratch")
+SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
+FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
+FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen
+
+
+class Budget(NamedTuple):
+    """Updates of a fine-tuning and of a training from scratch, and peak learning rates of each way.
+
+    The rates are the best of three, on held-out episodes of the pushing arm with 70 % of its torque.
+    """
+
+    tuning: int
+    scratch: int
+    lr: Mapping[Part, float]
+
+
+BUDGETS: Mapping[str, Budget] = {
+    "rtsm": Budget(120, 300, {"all": 1e-3, "head": 3e-3, "codes": 0.1}),
+    "lstm": Budget(300, 800, {"all": 1e-3, "head": 1e-2}),
+    "ensemble+mse": Budget(300, 800, {"all": 1e-3, "head": 1e-2}),
+}
+
+
+def ways(word: str) -> tuple[Way, ...]:
+    """The ways of a model: without codes there are none to fit."""
+    return tuple(way for way in WAYS if way in ("zero-shot", "scratch") or way in BUDGETS[word].lr)
+
+
+def few(env: str, n: int, *, seed: int = 0) -> tuple[Trajectories, Trajectories]:
+    """Training and validation data among ``n`` episodes of an arm."""
+    data, held = random_data(env, n, seed=FEW_SEED + seed), max(1, n // 5)
+    return data.take(slice(held, None)), data.take(slice(held))
+
+
+def adapted(
+    word: str, env: str, way: Way, data: tuple[Trajectories, Trajectories] | None, *, seed: int = 0, share: float = 1.0
+) -> tuple[TrainedModel, float]:
+    """A model of ``env`` by one of WAYS, and the CPU seconds of its training. share: of the updates."""
+    if way == "zero-shot" or data is None:
+        return load_pretrained(word, env=EnvSpec.parse(env).standard.id), 0.0
+    (train, validation), began, title = data, time.process_time(), f"{env} {word}: {way}"
+    if way == "scratch":
+        spec = zoo.find(word)
+        arguments = {k: v for k, v in spec.arguments(EnvSpec.parse(env)).items() if k != "members"}
+        net = cast(type[RecurrentTSM], spec.load()).for_data(train, seed=seed, **arguments)
+        fit(net, net.loss, train, validation, options(net, word, way, share), seed=seed, progress=title)
+    else:
+        net = cast(RecurrentTSM, load_pretrained(word, env=EnvSpec.parse(env).standard.id))
+        how = options(net, word, way, share)
+        fine_tune(net, net.loss, train, validation, how, part=way, seed=seed, progress=title)
+    return net, time.process_time() - began
+
+
+def options(net: DynamicsModel, word: str, way: Way, share: float = 1.0) -> TrainingOptions:
+    """How a model is trained by a way. share: of the updates."""
+    budget = BUDGETS[word]
+    steps = max(2, round(share * (budget.scratch if way == "scratch" else budget.tuning)))
+    lr, muon = (2e-3, 0.02) if way in ("scratch", "zero-shot") else (budget.lr[cast(Part, way)], 0.0)
+    every = max(1, steps // 10)
+    return TrainingOptions(
+        net.past_len, 20, steps, batch_size=64, lr=lr, muon=muon, warmup=10, validate_every=every
+    )  # fmt: skip
+
+
+def held_out(env: str, n_test: int) -> tuple[Trajectories, Trajectories]:
+    """Test episodes, and half as many validation episodes, to which the noise of the scores is fitted."""
+    return (
+        random_data(env, n_test, seed=HELD_OUT_SEED["test"]),
+        random_data(env, max(2, n_test // 2), seed=HELD_OUT_SEED["validation"]),
+    )
+
+
+def scored(model: TrainedModel, env: str, data: tuple[Trajectories, Trajectories], *, seed: int = 0) -> Scores:
+    """Scores on ``held_out`` data, in units of the standard arm's data."""
+    units = units_of(env)
+    return score(model, units, *data, samples=SAMPLES, horizon=max(AHEAD), starts=(SEEN,), seed=seed)
+
+
+def units_of(env: str) -> Features:
+    """Features of the standard arm's shipped model."""
+    return load_pretrained(FEATURES_OF, env=EnvSpec.parse(env).standard.id).features
+
+
+def rows(
+    run: Run, word: str, env: str, *, way: Way, episodes: int, n_test: int, share: float = 1.0
+) -> tuple[TrainedModel, list[Row]]:
+    """A model of ``env`` by a way, and the rows of its scores."""
+    net, seconds = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
+    scores = scored(net, env, held_out(env, n_test), seed=run.seed)
+    n = 0 if way == "zero-shot" else episodes
+    return net, results.adapted_rows(run, env, word, way, scores, episodes=n, ahead=AHEAD, seconds=seconds)

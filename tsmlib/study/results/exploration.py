@@ -1,0 +1,155 @@
+"""Results of 10_explore: rows of rounds of exploration and of adapted models; panels, tables and sentences from rows.
+
+Rounds are ``closed loop``; ``iteration`` is the round, ``env_steps`` were executed until then, random ones included,
+and ``configuration`` says whose episodes were learned from. Adapted models are ``open loop``; ``env_steps`` are those
+of the changed arm that they know, and ``configuration`` is the way (``study.adaptation``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation.prediction import Scores
+from tsmlib.figures.method import Look, Method
+from tsmlib.study import zoo
+from tsmlib.study.results import table
+from tsmlib.study.results.planning import CLOSED, OPEN
+from tsmlib.study.results.table import Row
+from tsmlib.study.runs import Run
+
+PENDULUM, HORIZON = "Pendulum-v1", 100
+PLANNED, RANDOM = "own plans", "random episodes"
+ROUNDS = {"return_true": "executed return", "gap_absolute": "size of the gap", "success": "share upright",
+          "highest": "highest by random codes"}  # fmt: skip
+SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
+WAYS = {
+    "zero-shot": Look("zero-shot", "#7A7A7A", "o"), "all": Look("all weights", "#003C8F", "*"),
+    "head": Look("head", "#56B4E9", "s"), "codes": Look("codes", "#CC79A7", "D"),
+    "scratch": Look("from scratch", "#E69F00", "^"),
+}  # fmt: skip
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def round_rows(
+    run: Run, word: str, records: Sequence[Mapping[str, float]], n: int, *, first: int, random: bool = False
+) -> list[Row]:
+    """What was measured on ``n`` starts after each round. first: environment steps before round 1."""
+    common = dict(
+        env=PENDULUM, task="swing up", model=word, planner="cem", horizon=HORIZON, execution=CLOSED, n=n,
+        search_space="latent" if "highest" in records[0] else "direct", configuration=RANDOM if random else PLANNED,
+        seed=run.seed, scale=run.scale,
+    )  # fmt: skip
+    return [
+        common | dict(
+            iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
+            value=float(record[metric]),
+        )
+        for record in records for metric in ROUNDS if metric in record
+    ]  # fmt: skip
+
+
+def adapted_rows(
+    run: Run, env: str, word: str, way: str, scores: Scores, *, episodes: int, ahead: Sequence[int], seconds: float
+) -> list[Row]:
+    """Both scores of an adapted model at some steps ahead, and the CPU ``seconds`` of its training."""
+    curves = scores.against_horizon()
+    common = dict(
+        env=env, sim=EnvSpec.parse(env).simulator, model=word, planner="none", execution=OPEN, configuration=way,
+        env_steps=100 * episodes, n=len(scores.outside), seed=run.seed, scale=run.scale,
+    )  # fmt: skip
+    found = [
+        common | dict(metric=metric, steps_ahead=steps, value=float(curves[metric][steps - 1]), unit="1")
+        for metric in SCORES for steps in ahead
+    ]  # fmt: skip
+    return [*found, common | dict(metric="train_seconds", value=seconds, unit="s")]
+
+
+# Panels --------------------------------------------------------------------------------------------------------------
+
+
+def round_panels(rows: pd.DataFrame, titles: Sequence[str]) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
+    """Title of ROUNDS -> learner -> environment steps (R,) and values (k, R), for ``figures.rounds``."""
+    found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
+    rounds = table.select(rows, execution=CLOSED)
+    for metric, title in ROUNDS.items():
+        for (word, space, data), own in table.groups(
+            table.select(rounds, metric=metric), ["model", "search_space", "configuration"]
+        ):
+            if title in titles:
+                wide = own.pivot(index="seed", columns="env_steps", values="value").dropna()
+                method = zoo.method(word, space, "cem", variant="" if data == PLANNED else data)
+                found.setdefault(title, {})[method] = wide.columns.to_numpy(float), wide.to_numpy(float)
+    return found
+
+
+def way_panels(rows: pd.DataFrame, steps_ahead: int, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
+    """Model -> arm -> way -> energy score, one value per seed, for ``figures.figure5``."""
+    found: dict[str, dict[str, dict[Method, np.ndarray]]] = {}
+    here = table.select(
+        rows, execution=OPEN, metric="energy_score_noise", steps_ahead=steps_ahead, env_steps=[0, 100 * episodes]
+    )
+    for (word, env), own in table.groups(here, ["model", "env"]):
+        values = table.values(own, "configuration")
+        named = {Method(way, look=WAYS[way]): values[way] for way in WAYS if way in values}
+        found.setdefault(zoo.look(word).name, {})[EnvSpec.parse(env).physics.word.lstrip("-")] = named
+    return found
+
+
+# Tables and sentences ------------------------------------------------------------------------------------------------
+
+
+@table.sourced
+def rounds_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """A line for each learner and round."""
+    lines = []
+    keys = ["model", "configuration", "iteration"]
+    for (word, data, k), own in table.groups(table.select(rows, execution=CLOSED), keys):
+        line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{int(own['env_steps'].max()):,}"}
+        for metric, title in ROUNDS.items():
+            values = table.select(own, metric=metric)["value"]
+            line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+        lines.append({**line, "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+@table.sourced
+def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """A line for each arm, model, way and number of episodes: both scores, and CPU seconds of training."""
+    lines = []
+    keys = ["env", "model", "configuration", "env_steps"]
+    for (env, word, way, steps), own in table.groups(table.select(rows, execution=OPEN), keys):
+        line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name, "episodes": int(steps) // 100}
+        for metric, title in SCORES.items():
+            for ahead, part in table.groups(table.select(own, metric=metric), "steps_ahead"):
+                line[f"{title}, {ahead} steps"] = table.spell(part["value"])
+        line["CPU s"] = table.spell(table.select(own, metric="train_seconds")["value"], "{:.0f}")
+        lines.append({**line, "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+@table.told
+def sentences(rows: pd.DataFrame) -> Iterator[str]:
+    """What the rounds changed, learner by learner; how much of the zero-shot error fine-tuning leaves."""
+    for (word, data), own in table.groups(table.select(rows, execution=CLOSED), ["model", "configuration"]):
+        first, last = own["iteration"].min(), own["iteration"].max()
+        means = own.groupby(["metric", "iteration"])["value"].mean()
+        said = [
+            f"{title} {means[metric, first]:.2f} -> {means[metric, last]:.2f}"
+            for metric, title in ROUNDS.items() if metric in means
+        ]  # fmt: skip
+        yield f"`{word}` on {data}, round {first} -> {last}: {', '.join(said)}."
+    last_steps = table.select(rows, execution=OPEN, metric="energy_score_noise")
+    last_steps = last_steps[last_steps["steps_ahead"] == last_steps["steps_ahead"].max()]
+    for (env, word), own in table.groups(last_steps, ["env", "model"]):
+        keyed = table.groups(own, ["configuration", "env_steps"])
+        left = {(str(way), int(steps)): float(part["value"].mean()) for (way, steps), part in keyed}
+        if (zero := left.pop(("zero-shot", 0), None)) is not None:
+            said = [f"{WAYS[way].name} ({steps // 100}) {value / zero:.0%}" for (way, steps), value in left.items()]
+            ahead = own["steps_ahead"].max()
+            yield f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left by {', '.join(said)}."
