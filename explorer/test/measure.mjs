@@ -21,7 +21,7 @@ async function open(options = {}, link = '') {
   const page = await browser.newPage({ viewport: { width: 1440, height: 900 }, ...options });
   await page.addInitScript(listen);
   page.bodies = new Map();
-  page.on('response', answer => page.bodies.set(answer.url(), answer.body()));
+  page.on('response', answer => page.bodies.set(answer.url(), answer.body().catch(() => ''))); // '': the page is closed
   await page.goto(url + link);
   await ready(page);
   return page;
