@@ -67,7 +67,7 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     ])  # fmt: skip
     assert "is left by all weights (20) 25%" in results.sentences(rows)
     panels = results.way_panels(rows, 80, 20)
-    assert [float(row[0]) for row in panels["recurrent TSM"]["gain0.7"].values()] == [2.0, 0.5]
+    assert [float(row[0]) for row in panels["recurrent TSM"]["torque gain 0.7"].values()] == [2.0, 0.5]
 
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:

@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
@@ -181,7 +180,7 @@ def _collected(
         except SimulationUnstable as fault:
             if len(aim) <= 2:
                 raise
-            aim, lost = _without(aim, fault.episode), lost + 1
+            aim, lost = aim.take([i for i in range(len(aim)) if i != fault.episode]), lost + 1
     record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost}
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
     episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
@@ -255,13 +254,6 @@ class _Perturbed:
         parameters = plan.parameters + self.deviation * space.scale * noise
         with torch.no_grad():
             return replace(plan, parameters=parameters, actions=space.decode(parameters[None])[0])
-
-
-def _without(task: Task, i: int) -> Task:
-    """The task without instance ``i``."""
-    kept = np.delete(np.arange(len(task)), i)
-    seeds = tuple(task.seeds[j] for j in kept) if task.seeds else ()
-    return replace(task, start=task.start[kept], target=task.target[torch.from_numpy(kept)], seeds=seeds)
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,9 @@ def way_panels(rows: pd.DataFrame, steps_ahead: int, episodes: int) -> dict[str,
     for (word, env), own in table.groups(here, ["model", "env"]):
         values = table.values(own, "configuration")
         named = {Method(way, look=WAYS[way]): values[way] for way in WAYS if way in values}
-        found.setdefault(zoo.look(word).name, {})[EnvSpec.parse(env).physics.word.lstrip("-")] = named
+        changed = EnvSpec.parse(env).physics.changed.items()
+        arm = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in changed)
+        found.setdefault(zoo.look(word).name, {})[arm] = named
     return found
 
 
