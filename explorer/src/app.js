@@ -369,7 +369,7 @@ function plan() {
   forget();
   state.id += 1;
   Object.assign(state, { planning: true, progress: null, result: { parts: [], executed: new Float64Array(0), dx: about().stateDim, done: null } });
-  worker.postMessage({ type: 'plan', id: state.id, scene: { ...state.scene, start: startState(state.scene, state.manifest.arm) } });
+  worker.postMessage({ type: 'plan', id: state.id, live: !still.matches, scene: { ...state.scene, start: startState(state.scene, state.manifest.arm) } });
   show();
 }
 

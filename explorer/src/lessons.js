@@ -71,7 +71,7 @@ export const TOUR = [
   },
   {
     title: 'Planning again',
-    link: '#task=push&model=rtsm&space=latent&replan=1&seed=1&arm=-1.68,-2.45&target=-0.02,-0.12&block=0.04,0.09',
+    link: '#task=push&model=rtsm&space=latent&replan=1&seed=2&arm=-1.68,-2.45&target=0,-0.11&block=0.05,0.09',
     text: 'A long way round. One plan, executed without looking, misses by about 10 cm (untick “Plan again” and see). Looking every ten '
       + 'steps (0.2 s) and planning the rest anew, it ends far nearer; how near depends on the candidates this machine has time for.',
   },

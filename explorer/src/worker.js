@@ -46,9 +46,10 @@ const library = (async () => {
 
 library.then(({ manifest }) => postMessage({ type: 'ready', manifest }), fail);
 
-async function plan(id, scene) {
+/** live: whether the plan is played while it is made, so that later parts have to be in time. */
+async function plan(id, scene, live) {
   const { library: files } = await library;
-  for await (const event of attempt(files, scene, { budget: BUDGET, keep: plan => { kept = { id, ...plan }; } })) {
+  for await (const event of attempt(files, scene, { budget: live ? BUDGET : Infinity, keep: plan => { kept = { id, ...plan }; } })) {
     if (id !== current) return;
     postMessage({ ...event, id });
     await pause();
@@ -61,7 +62,7 @@ onmessage = async ({ data }) => {
     if (data.type === 'stop') current = 0;
     if (data.type === 'plan') {
       current = data.id;
-      await plan(data.id, data.scene);
+      await plan(data.id, data.scene, data.live);
     }
     if (data.type === 'load') {
       const { library: files } = await library;

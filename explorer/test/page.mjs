@@ -144,7 +144,7 @@ const steps = {
     measured.tour = seen;
     const gap = k => seen[k].predicted - seen[k].executed, arrived = k => seen[k].distance < 5;
     for (const [k, agrees] of [[0, Math.abs(gap(0)) < 1], [3, Math.abs(gap(3)) < 2]]) assert.ok(agrees && arrived(k), JSON.stringify(seen[k]));
-    assert.ok(seen[4].distance < 6, JSON.stringify(seen[4])); // how near depends on the machine
+    assert.ok(seen[4].distance < 6, JSON.stringify(seen[4])); // with reduced motion, the full search
     assert.ok(gap(2) > 4 && !arrived(2), JSON.stringify(seen[2]));
     await accessible(page, 'tour');
     await page.uncheck('#replan');
