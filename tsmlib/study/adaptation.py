@@ -33,7 +33,7 @@ FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm ar
 FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen
 
 
-class Budget(NamedTuple):
+class TuningBudget(NamedTuple):
     """Updates of a fine-tuning and of a training from scratch, and peak learning rates of each way.
 
     The rates are the best of three, on held-out episodes of the pushing arm with 70 % of its torque.
@@ -44,10 +44,10 @@ class Budget(NamedTuple):
     lr: Mapping[Part, float]
 
 
-BUDGETS: Mapping[str, Budget] = {
-    "rtsm": Budget(120, 300, {"all": 1e-3, "head": 3e-3, "codes": 0.1}),
-    "lstm": Budget(300, 800, {"all": 1e-3, "head": 1e-2}),
-    "ensemble+mse": Budget(300, 800, {"all": 1e-3, "head": 1e-2}),
+BUDGETS: Mapping[str, TuningBudget] = {
+    "rtsm": TuningBudget(120, 300, {"all": 1e-3, "head": 3e-3, "codes": 0.1}),
+    "lstm": TuningBudget(300, 800, {"all": 1e-3, "head": 1e-2}),
+    "ensemble+mse": TuningBudget(300, 800, {"all": 1e-3, "head": 1e-2}),
 }
 
 

@@ -165,7 +165,7 @@ def robustness(run: Run) -> Robustness:
     )  # fmt: skip
 
 
-class ActionPrior(NamedTuple):
+class PriorPlans(NamedTuple):
     """What 07_action_prior plans with, for ``n`` targets of each task."""
 
     n: int
@@ -173,13 +173,13 @@ class ActionPrior(NamedTuple):
     methods: list[Method]
 
 
-def action_prior(run: Run) -> ActionPrior:
+def action_prior(run: Run) -> PriorPlans:
     """What 07_action_prior asks for at a run's scale."""
     few = [(PAPERS, "cem"), ("oracle", "cem")]
     many = [(PAPERS, "adam"), *few, (OURS, "cem")]
     ways = [way for model, planner in run.pick(smoke=many, laptop=few, paper=many) for way in methods([model], planner)]
     n = int(str(run.parameter("n_targets"))) or run.pick(smoke=2, laptop=10, paper=100)
-    return ActionPrior(n, (REACH, PUSH), ways)
+    return PriorPlans(n, (REACH, PUSH), ways)
 
 
 def _for_collect(run: Run) -> list[Job]:
