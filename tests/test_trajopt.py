@@ -17,6 +17,7 @@ import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import rewards
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import rollout
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
@@ -32,10 +33,10 @@ from tsmlib.planning.planners import (
     reevaluate,
     sampled_starts,
 )
-from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.predictors import EnsemblePredictor, fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.rewards import Reward
-from tsmlib.sampling import Noise, standard_normal
+from tsmlib.sampling import Noise, NoNoise, standard_normal
 from tsmlib.trajectory import Segment, Window, initial_past
 
 T, B, DT = 10, 3, 0.5
@@ -293,6 +294,51 @@ def test_mppi_at_a_low_temperature_takes_the_best_candidate_and_at_a_high_one_th
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected 2 or more, 1 or more, above 0, and above 0 to 1"):
         mppi(predictor(), reward, DirectActions(T, 1), B, **wrong)
+
+
+# Ensembles -----------------------------------------------------------------------------------------------------------
+
+
+def counted(asked: list[int], predict: Predictor) -> Predictor:
+    """``predict``, adding the number of its candidates to ``asked``."""
+
+    def predicted(actions: Tensor) -> Tensor:
+        asked.append(len(actions))
+        return predict(actions)
+
+    return predicted
+
+
+def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_likes_best() -> None:
+    first, second = list[int](), list[int]()
+    judge = EnsemblePredictor((counted(first, predictor()), counted(second, predictor())))
+    planned = {share: cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=2,
+                          screened=share) for share in (1.0, 0.25)}  # fmt: skip
+    assert (first.count(40), second.count(40), second.count(10)) == (4, 2, 2)
+    torch.testing.assert_close(planned[0.25].actions, planned[1.0].actions)  # since they are of one opinion
+
+
+def test_a_screened_plan_promises_what_all_members_predict() -> None:
+    judge = EnsemblePredictor((predictor(), lambda actions: 0.9 * predictor()(actions)))
+    plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
+    promised = expected_return(judge(plan.actions[None]), plan.actions[None], reward)[0]
+    torch.testing.assert_close(plan.curve[-1], promised)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_a_share_that_is_none_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match="expected 2 <= elites <= candidates, at least one iteration and a share"):
+        cem(predictor(), reward, DirectActions(T, 1), B, screened=share)
+
+
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_the_mode_of_a_member_alone_is_its_part_of_the_ensembles_modes(gaussian: bool) -> None:
+    model, past = in_units(Ensemble(6, 2, hidden=16, gaussian=gaussian)), initial_past(torch.randn(B, 6), 1, 2)
+    actions = 0.5 * torch.randn(4, B, 12, 2)
+    rows = Segment(*(part.repeat(4 * model.members, 1, 1) for part in past))
+    at_once = rollout(model, rows, actions.flatten(0, 1).repeat(model.members, 1, 1), generator=NoNoise(4 * B))
+    modes = model_predictor(model, past)(actions)
+    torch.testing.assert_close(modes, at_once.unflatten(0, (model.members, 4, B)))
 
 
 # Common random numbers -----------------------------------------------------------------------------------------------

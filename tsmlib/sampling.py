@@ -27,9 +27,10 @@ class SeparateNoise:
 
 @dataclass(frozen=True)
 class NoNoise:
-    """Zeros; of an ensemble each member in turn, the first for ``period`` rows, then the second, and so on."""
+    """Zeros; of an ensemble each member in turn, member ``first`` for ``period`` rows, then the next, and so on."""
 
     period: int
+    first: int = 0
 
 
 Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
@@ -51,6 +52,6 @@ def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
 def draw_members(n_members: int, rows: int, noise: Noise, like: Tensor) -> Tensor:
     """A member of an ensemble for each row, (rows,) from 0 to ``n_members`` - 1."""
     if isinstance(noise, NoNoise):
-        return torch.arange(rows, device=like.device) // noise.period % n_members
+        return (noise.first + torch.arange(rows, device=like.device) // noise.period) % n_members
     uniform = torch.special.ndtr(standard_normal((rows,), noise, like))
     return (n_members * uniform).long().clamp(max=n_members - 1)

@@ -1,12 +1,13 @@
 """Planning through models from files: do errors that a plan exploits average out over several decoders, how well must
-each be trained for that, and what does more training buy a baseline?
+each be trained for that, what does more training buy a baseline, and must all judge every candidate?
 
     python benchmarks/settings/decoders.py --name "three, full budget" --files a.safetensors b.safetensors c.safetensors
     python benchmarks/settings/decoders.py --compare "three, full budget"
 
 The cross-entropy method over codes of the prior, 96 x 10, on validation targets, executed open loop; a candidate is
-judged by its mean return over the modes of all files' models. A line in decoders.csv per call: cost with its standard
-error, share within 5 cm, what the judge predicted beyond the executed return, and the costs of the single targets.
+judged by its mean return over the modes of all files' models, or only the share --screened that the first likes best.
+A line in decoders.csv per call: cost with its standard error, share within 5 cm, what the judge predicted beyond the
+executed return, and the costs of the single targets.
 --compare prints the table: the cost of that line minus those of the others, paired by target, with half the 95 % t
 interval over targets. ``budgets.py`` trains such files.
 """
@@ -21,13 +22,12 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import torch
-from torch import Tensor
 
 from tsmlib import study
 from tsmlib.models.base import Model
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import cem
-from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.predictors import EnsemblePredictor, model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.storage import artifacts
 from tsmlib.study import runs, zoo
@@ -42,18 +42,17 @@ def load(path: Path) -> Model:
     return cast(Model, artifacts.load_model(path, zoo.find(artifacts.read_header(path)["model"]).load()))
 
 
-def planned(name: str, files: list[Path], env: str, n_targets: int) -> dict[str, object]:
+def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float) -> dict[str, object]:
     """A line of the table."""
     task = study.task(env, "validation").take(n_targets)
     prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
     through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
-
-    def modes(actions: Tensor) -> Tensor:
-        return torch.cat([predict(actions) for predict in through])
-
+    each = [one for found in through for one in (found.each if isinstance(found, EnsemblePredictor) else [found])]
     began = time.process_time()
     space = LatentActions(prior, task.horizon)
-    plan = cem(modes, task.reward, space, len(task), candidates=96, elites=9, iterations=10, seed=0)
+    judge = EnsemblePredictor(tuple(each))
+    options = dict(candidates=96, elites=9, iterations=10, screened=screened, seed=0)
+    plan = cem(judge, task.reward, space, len(task), **options)
     trial = execute(task, plan)
     cost = -trial.executed_return
     return {
@@ -87,6 +86,7 @@ def main() -> None:
     what.add_argument("--name", help="of the line that is added")
     what.add_argument("--compare", metavar="NAME", help="print the table, every line against this one")
     parser.add_argument("--files", nargs="+", type=Path, default=[], help="models, each with one decoder or several")
+    parser.add_argument("--screened", type=float, default=1.0, help="share that all judge (default 1: all candidates)")
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
     parser.add_argument("--targets", type=int, default=50, help="of the 100 of validation (default 50)")
     parser.add_argument(
@@ -102,7 +102,7 @@ def main() -> None:
         return
     if not given.files:
         parser.error("--name wants --files: the models that a candidate is judged by")
-    line = planned(given.name, given.files, given.env, given.targets)
+    line = planned(given.name, given.files, given.env, given.targets, given.screened)
     pd.concat([lines, pd.DataFrame([line])]).to_csv(given.out, index=False)
     print({name: value for name, value in line.items() if name != "costs"})
 

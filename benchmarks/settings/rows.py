@@ -5,8 +5,9 @@
 
 predict: open loop and on segments (03_predict). control: plans by each planner in both search spaces, open loop, and by
 the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes, no torque and
-random torques beside them (05_control). Models, scores and plans are those of the run, so what is missing is made
-first.
+random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in both search
+spaces, of the others direct alone, as in 05_control, by --copies and --iterations. Models, scores, plans and policies
+are those of the run, so what is missing is made first.
 
 Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
 """
@@ -25,7 +26,8 @@ from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
 from tsmlib.study import runs, zoo
-from tsmlib.study.jobs import Job, Scores, plan_jobs
+from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
+from tsmlib.study.policies import Budget
 from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import planning
 from tsmlib.study.results.table import Row
@@ -70,12 +72,14 @@ def controlled(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("predict", "control"))
+    parser.add_argument("part", choices=("predict", "control", "policies"))
     parser.add_argument("--envs", nargs="+", required=True, choices=ENV_IDS, metavar="ENV")
     parser.add_argument("--models", nargs="+", required=True, choices=zoo.words(), metavar="MODEL")
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
+    parser.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
+    parser.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -86,6 +90,14 @@ def main() -> None:
         wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
         study.precompute(run, wanted)
         publish(notebook, study.score_rows(run, pairs))
+    elif given.part == "policies":
+        budget, codes = Budget(given.copies, given.iterations), set(zoo.words(cls=zoo.CODED))
+        wanted = [
+            (study.load_task(env), way, budget) for env in given.envs for way in zoo.methods(given.models, "policy")
+            if way.search_space == "direct" or way.model in codes
+        ]  # fmt: skip
+        study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in wanted])
+        publish(notebook, study.policy_rows(run, wanted))
     else:
         rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)

@@ -52,11 +52,14 @@ class Ensemble(Featured, Configured, EnsembleModel):
             self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
             self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
 
-    def increments(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``."""
+    def increments(self, x: Tensor, u: Tensor, which: slice = slice(None)) -> tuple[Tensor, Tensor | None]:
+        """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``.
+
+        which: the members asked, M of them.
+        """
         s = torch.cat([self.features(x), u], dim=-1)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            s = torch.baddbmm(bias, F.silu(s) if i else s, weight)
+            s = torch.baddbmm(bias[which], F.silu(s) if i else s, weight[which])
         if not self.gaussian:
             return s, None
         mean, log_variance = s.chunk(2, dim=-1)
@@ -77,23 +80,25 @@ class Ensemble(Featured, Configured, EnsembleModel):
 
     def _begin(self, past: Segment, steps: int, generator: Noise | None) -> Step:
         """Rows are sorted into one block per member, of equal size, so that a step is one batched product."""
-        x, rows, taken = past.states[:, -1], len(past.states), 0
+        x, rows, taken, which = past.states[:, -1], len(past.states), 0, slice(None)
         if generator is None:
-            place, noise = torch.arange(rows, device=x.device).repeat(self.members), None
+            place, noise, block = torch.arange(rows, device=x.device).repeat(self.members), None, rows
         else:
             member = draw_members(self.members, rows, generator, x)
             noise = standard_normal((rows, steps if self.gaussian else 0, x.shape[1]), generator, x)
-            counts = member.bincount(minlength=self.members)
+            which = slice(int(member.min()), int(member.max()) + 1)  # those between which some are
+            member = member - which.start
+            counts = member.bincount()
             order, block = member.argsort(stable=True), int(counts.max())
             rank = torch.arange(rows, device=x.device) - (counts.cumsum(0) - counts)[member[order]]
             slot = torch.empty_like(member).index_copy(0, order, member[order] * block + rank)  # of each row
-            place = torch.zeros(self.members * block, dtype=torch.long, device=x.device)
+            place = torch.zeros(len(counts) * block, dtype=torch.long, device=x.device)
             place = place.index_copy(0, slot[order], order)
 
         def step(u: Tensor) -> Tensor:
             nonlocal x, taken
-            blocks = (part.index_select(0, place).unflatten(0, (self.members, -1)) for part in (x, u))
-            mean, log_variance = self.increments(*blocks)  # (M, block, dx)
+            rows_x, rows_u = (part.index_select(0, place).unflatten(0, (-1, block)) for part in (x, u))
+            mean, log_variance = self.increments(rows_x, rows_u, which)  # (M, block, dx)
             if noise is None:
                 change = mean.mean(0)
             else:

@@ -20,6 +20,7 @@ from tqdm.auto import tqdm
 
 from tsmlib.models.layers import BLOCK
 from tsmlib.planning.base import Plan, Predictor, SearchSpace
+from tsmlib.planning.predictors import EnsemblePredictor
 from tsmlib.rewards import Reward, rewarded
 
 
@@ -90,17 +91,21 @@ def cem(
     elites: int = 24,
     iterations: int = 10,
     keep: float = 0.1,  # of the old mean and deviation, against collapse
+    screened: float = 1.0,
     seed: int = 0,
     progress: str = "",
 ) -> Plan:
     """Cross-entropy method: sample around a mean, refit mean and deviation to the elites, keep the best ever seen.
 
     The mean begins at the best of ``start`` (C, B, *shape), or at zero for as many targets.
+
+    screened: where an ensemble judges (``EnsemblePredictor``), the share of the candidates that all members judge,
+    those that are best by the first member; never fewer than the elites. 1: all candidates.
     """
-    if not 2 <= elites <= candidates or iterations < 1:
+    if not 2 <= elites <= candidates or iterations < 1 or not 0 <= screened <= 1:
         raise ValueError(
-            f"candidates is {candidates}, elites {elites}, iterations {iterations}; expected 2 <= elites <= candidates "
-            "and at least one iteration"
+            f"candidates is {candidates}, elites {elites}, iterations {iterations}, screened {screened}; expected "
+            "2 <= elites <= candidates, at least one iteration and a share from 0 to 1"
         )
 
     def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,7 +113,10 @@ def cem(
         elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
         return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
 
-    return _sample(_Search(predict, reward, space, start), refit, candidates, iterations, seed, progress)
+    search = _Search(predict, reward, space, start)
+    if isinstance(predict, EnsemblePredictor):
+        search.judged = max(elites, round(screened * candidates))
+    return _sample(search, refit, candidates, iterations, seed, progress)
 
 
 def mppi(
@@ -158,8 +166,9 @@ def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, see
         parameters = mean + deviation * space.noise(candidates, len(mean), generator)
         if iteration:
             parameters[0] = search.parameters
-        returns = search.returns_of(parameters)
-        finite = torch.isfinite(returns)  # a candidate on which the model diverges is as bad as the worst
+        returns = search.returns_of_many(parameters)
+        # A candidate on which the model diverges, or that was sorted out, is as bad as the worst.
+        finite = torch.isfinite(returns)
         worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
         returns = returns.where(finite, worst)
         mean, deviation = refit(parameters, returns, mean, deviation)
@@ -252,6 +261,7 @@ class _Search:
         if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
             raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
         self.predict, self.reward, self.space, self.start = predict, reward, space, start
+        self.judged = 0  # candidates that a whole ensemble judges; 0: all
         self.began = time.perf_counter()
         self.parameters = start[0].clone()
         self.returns = start.new_full((start.shape[1],), -torch.inf)
@@ -260,6 +270,18 @@ class _Search:
 
     def returns_of(self, parameters: Tensor) -> Tensor:
         return evaluate(self.predict, self.reward, self.space, parameters)
+
+    def returns_of_many(self, parameters: Tensor) -> Tensor:
+        """``returns_of``, but -inf for all candidates except the ``judged`` best by the first member of an ensemble."""
+        if not 0 < self.judged < len(parameters) or not isinstance(self.predict, EnsemblePredictor):
+            return self.returns_of(parameters)
+        first, *others = self.predict.each
+        rough = evaluate(first, self.reward, self.space, parameters).nan_to_num(nan=-torch.inf)
+        best = rough.topk(self.judged, dim=0).indices
+        chosen = parameters.gather(0, _like(best, parameters).expand(-1, -1, *self.space.shape))
+        rest = evaluate(EnsemblePredictor(tuple(others)), self.reward, self.space, chosen)
+        returns = (rough.gather(0, best) + len(others) * rest) / len(self.predict.each)
+        return torch.full_like(rough, -torch.inf).scatter(0, best, returns)
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:
         value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)

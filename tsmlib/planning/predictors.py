@@ -1,5 +1,8 @@
 """Predictors: candidate actions to states, through a model or through the true simulator."""
 
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
@@ -31,24 +34,39 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
             f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
             "mode, samples=0"
         )
-    draws = samples or members(model)
+    if not samples and members(model) > 1:
+        alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(members(model)))
+        return EnsemblePredictor(tuple(partial(_predict, model, past, 1, noise) for noise in alone))
 
-    def predict(actions: Tensor) -> Tensor:
-        n, n_targets, _, du = actions.shape
-        if du != past.actions.shape[2]:
-            raise ValueError(
-                f"actions have {du} dimensions, those of the past {past.actions.shape[2]}; give the search space "
-                "the size of this robot's actions: DirectActions(task.horizon, task.action_dim)"
-            )
-        rows = actions[:, None].expand(-1, draws, -1, -1, -1).flatten(0, 2)  # (C S B, T, du)
-        pasts = Segment(*(part.repeat(n * draws, 1, 1) for part in past))
-        noise: Noise | None = None if draws == 1 else NoNoise(n_targets)
-        if samples:
-            noise = SharedNoise(torch.Generator().manual_seed(seed), draws * n_targets)
-        states = rollout(model, pasts, rows, generator=noise)
-        return states.unflatten(0, (n, draws, n_targets)).transpose(0, 1)
+    def common() -> Noise:
+        return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
 
-    return predict
+    return partial(_predict, model, past, max(1, samples), common if samples else None)
+
+
+@dataclass(frozen=True)
+class EnsemblePredictor:
+    """Predict by the mode of each member, S of them. each: the members by themselves, S = 1, as ``cem`` screens by."""
+
+    each: tuple[Predictor, ...]
+
+    def __call__(self, actions: Tensor) -> Tensor:
+        """(C, B, T, du) -> (S, C, B, T, dx)."""
+        return torch.cat([predict(actions) for predict in self.each])
+
+
+def _predict(model: Model, past: Segment, draws: int, noise: Callable[[], Noise] | None, actions: Tensor) -> Tensor:
+    """``draws`` rollouts of every candidate, or the mode without noise: (C, B, T, du) -> (S, C, B, T, dx)."""
+    n, n_targets, _, du = actions.shape
+    if du != past.actions.shape[2]:
+        raise ValueError(
+            f"actions have {du} dimensions, those of the past {past.actions.shape[2]}; give the search space "
+            "the size of this robot's actions: DirectActions(task.horizon, task.action_dim)"
+        )
+    rows = actions[:, None].expand(-1, draws, -1, -1, -1).flatten(0, 2)  # (C S B, T, du)
+    pasts = Segment(*(part.repeat(n * draws, 1, 1) for part in past))
+    states = rollout(model, pasts, rows, generator=noise() if noise else None)
+    return states.unflatten(0, (n, draws, n_targets)).transpose(0, 1)
 
 
 def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FRESH) -> Predictor:

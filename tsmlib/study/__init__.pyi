@@ -26,8 +26,7 @@ from .policies import Budget as Budget
 from .policies import assess as assess
 from .policies import execute_policy as execute_policy
 from .policies import learn as learn
-from .policies import learn_all as learn_all
-from .policies import learned_rows as learned_rows
+from .policies import policy_rows as policy_rows
 from .policies import stored_budget as stored_budget
 from .policies import within_data as within_data
 from .predictions import RESULTS as RESULTS

@@ -2,11 +2,12 @@
 
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -19,11 +20,12 @@ from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.tasks import Task
 from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
-from tsmlib.storage import artifacts
+from tsmlib.storage import artifacts, tables
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior
-from tsmlib.study.results.policies import learning_rows
-from tsmlib.study.results.table import Row
+from tsmlib.study.predictions import table
+from tsmlib.study.results.policies import finished, learning_curves, learning_rows, plateau_rows
+from tsmlib.study.results.table import Row, of_task
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
@@ -89,11 +91,6 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
     return _learn(run, task, net, prior, budget, own, about)
 
 
-def learn_all(run: Run, wanted: Iterable[tuple[Task, Method, Budget]]) -> dict[tuple[str, Method], Learned]:
-    """(environment, method) -> the policy."""
-    return {(task.env, method): learn(run, task, method, budget) for task, method, budget in wanted}
-
-
 def complete(run: Run, budget: Budget) -> Budget:
     """The budget with the scale's iterations where it has none of its own."""
     return replace(budget, iterations=budget.iterations or run.pick(smoke=4, laptop=300, paper=2200))
@@ -137,14 +134,27 @@ def _initialise(run: Run, data: Trajectories, prior: ActionPrior | None, budget:
     return policy
 
 
-def learned_rows(run: Run, task: Task, method: Method, found: Learned) -> list[Row]:
-    """Rows of a learned policy, with what its model and prior have cost and its steps within the data's torques."""
-    words = [method.model] + ["prior"] * (method.search_space == "latent")
-    seconds = sum(cast("float", load_or_train(run, task.env, word).header["seconds"]) for word in words)
-    return learning_rows(
-        found.header, samples=100 * sizes(run, task.env)["train"], train_seconds=seconds, n=len(task),
-        within_data=within_data(run, task, found.policy).tolist(),
-    )  # fmt: skip
+def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[Row]:
+    """Rows of policies: how each was learned and what its model and prior have cost, its steps within the data's
+    torques, and when those with a prior and the model-free ones came to their common plateau (``plateau_rows``).
+
+    Learned where they are missing.
+    """
+    rows: list[Row] = []
+    for task, method, budget in wanted:
+        found, words = learn(run, task, method, budget), [method.model] + ["prior"] * (method.search_space == "latent")
+        seconds = sum(cast("float", load_or_train(run, task.env, word).header["seconds"]) for word in words)
+        rows += learning_rows(
+            found.header, samples=100 * sizes(run, task.env)["train"], train_seconds=seconds, n=len(task),
+            within_data=within_data(run, task, found.policy).tolist(),
+        )  # fmt: skip
+    free = finished(table(run, "model_free.csv"))
+    curves = learning_curves(tables.frame(pd.concat([tables.frame(rows), free[free["seed"] == run.seed]])))
+    for task in {task.env: task for task, *_ in wanted}.values():
+        compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}
+        common = of_task(task, run) | {"horizon": None}
+        rows += plateau_rows(compared, steps=task.horizon * EPISODES[run.scale], **common)
+    return rows
 
 
 def stored_budget(run: Run, env: str, method: Method) -> Budget | None:
