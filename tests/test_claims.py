@@ -349,7 +349,15 @@ def test_the_ledger_holds_every_claim_once_and_in_order() -> None:
     assert set().union(*(c.why for c in LEDGER)) <= set(VERDICTS)
 
 
-@pytest.mark.parametrize("claim", LEDGER, ids=lambda c: c.id)
+def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows() -> None:
+    questions = ledger.questions()
+    assert [c.id for c in questions] == ["Q1", "Q2", "Q3"]
+    assert {c.subject for c in questions} == {"rtsm"}
+    rows = evaluate.tables(questions)
+    assert "NOT TESTABLE" not in {evaluate.judge(question, rows).word for question in questions}
+
+
+@pytest.mark.parametrize("claim", [*LEDGER, *ledger.questions()], ids=lambda c: c.id)
 def test_a_claim_points_to_a_section_and_a_figure_that_exist(claim: Claim) -> None:
     path = NOTEBOOKS / f"{claim.shown.notebook}.ipynb"
     cells = json.loads(path.read_text())["cells"]

@@ -38,6 +38,7 @@ AGAIN = {  # of each later plan of a closed loop, which starts from what is left
     "cem": {"smoke": 1, "laptop": 3, "paper": 4}, "adam": {"smoke": 2, "laptop": 20, "paper": 20},
 }  # fmt: skip
 SAMPLES = 0  # by which a candidate is judged: its mode (benchmarks/settings, section 3)
+SCREENED = 0.25  # of the candidates of cem, which all members of an ensemble judge (benchmarks/settings, section 6)
 KEPT = 4  # samples of the predicted states, of those behind a predicted return
 TORQUES: dict[str, Callable[[Task], Tensor]] = {"random": random_torques, "zero": zero_torques}
 
@@ -160,6 +161,8 @@ class _Problem:
         judge: dict[str, Json] = {} if self.model is None else {"samples": SAMPLES}
         if self.model is not None and members(self.model) > 1:
             judge["members"] = members(self.model)
+            if self.method.planner == "cem":
+                judge["screened"] = SCREENED
         return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
             "every": self.every, "seed": self.run.seed, "candidates": self.candidates, "iterations": self.iterations,
@@ -184,7 +187,9 @@ class _Problem:
         word, seed, candidates = self.method.planner, self.run.seed, self.candidates
         if word == "cem":
             elites = max(2, candidates // 10)
-            found: Callable[..., Plan] = partial(cem, candidates=candidates, elites=elites, seed=seed)
+            found: Callable[..., Plan] = partial(
+                cem, candidates=candidates, elites=elites, screened=SCREENED, seed=seed
+            )
         elif word == "mppi":
             found = partial(mppi, candidates=candidates, seed=seed)
         else:

@@ -113,6 +113,13 @@ def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
     return [evaluate.judge(claim, rows) for claim in claims]
 
 
+def shipped_answers() -> list[evaluate.Verdict]:
+    """What the tables that ship say of the questions of the paper's outlook."""
+    questions = ledger.questions()
+    rows = evaluate.tables(questions)
+    return [evaluate.judge(question, rows) for question in questions]
+
+
 def _between(page: Path, marks: tuple[str, str], written: str) -> None:
     """Put ``written`` between two marks of a page."""
     before, _, rest = page.read_text().partition(marks[0])
@@ -210,7 +217,14 @@ def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) ->
 
 ## The others
 
-{others}"""
+{others}
+
+## Questions of its outlook
+
+The paper ends on what it leaves to future work (section 6). These questions and their thresholds are ours, asked
+of `{OURS}`, and are not counted above.
+
+{claims_report.answers(shipped_answers(), root="../")}"""
 
 
 def results_page() -> str:

@@ -59,6 +59,7 @@ ONE_STEPS, BASELINES = (ONE_STEP, MULTI_STEP), (ONE_STEP, MULTI_STEP, LSTM)
 REACHER, OBSTACLE, PUSH = map(Place, ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v1"))
 CLEAN = REACHER._replace(table="06_robustness")
 NOISE, DELAY = CLEAN._replace(noise=0.25), CLEAN._replace(delay=5)
+PENDULUM, WEAK_MOTORS = Place("Pendulum-v1"), Place("tsm/Reacher-gain0.7-v0")
 TASKS, ARMS = (REACHER, PUSH), (REACHER, OBSTACLE, PUSH)
 
 # Other readings of the paper: name -> fields of Query. A1 to A33 are numbers of docs/deviations.md.
@@ -106,7 +107,7 @@ class Term(NamedTuple):
         return f"{self.metric}({', '.join(word for word in words if word not in ('', 'none'))})"
 
 
-TOLD = ("planner", "search_space", "steps_ahead", "subset", "lag")  # what tells a term from its like
+TOLD = ("planner", "search_space", "steps_ahead", "subset", "lag", "configuration")  # what tells a term from its like
 INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
 NAMES = {"absolute": "abs", "negative": "-"}
 COMPARED = {"greater": ">", "greater_equal": ">=", "less": "<", "less_equal": "<="}
@@ -296,6 +297,16 @@ class Query:
     def data(self, metric: str, place: Place, *, lag: float | str = "") -> Number:
         """A property of the training data."""
         return self._ask("01_collect", metric, "none", place, split="train", lag=lag)
+
+    def explored(
+        self, metric: str, model: Model, place: Place, configuration: str, *,
+        env_steps: float | str = "", steps_ahead: float | str = "",
+    ) -> Number:  # fmt: skip
+        """Of rounds of exploration after so many steps, or of an adapted model; configuration: by which data or how."""
+        if not env_steps:
+            env_steps = 0 if configuration == "zero-shot" else 2000
+        return self._ask("10_explore", metric, model.word, place, configuration=configuration, env_steps=env_steps,
+                         steps_ahead=steps_ahead)  # fmt: skip
 
     def gradient_error(self) -> Number:
         return self._ask("02_train", "gradient_error", PAPERS, PUSH)

@@ -40,6 +40,19 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
     return markdown(pd.DataFrame(lines))
 
 
+def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
+    """Questions of the paper's outlook with what our rows say, one line for each check, in Markdown."""
+    lines = [
+        {
+            "": verdict.claim.id, "question": f"{verdict.claim.statement} ({verdict.claim.place})",
+            "measured": verdict.claim.statistic, "verdict": f"**{verdict.word}**",
+            "found": f"{effect.text}, asked {effect.check.asked}", "shown in": _links(verdict.claim, root),
+        }
+        for verdict in verdicts for effect in verdict.effects[""]
+    ]  # fmt: skip
+    return markdown(pd.DataFrame(lines))
+
+
 def _links(claim: Claim, root: str) -> str:
     notebook, section, figure = claim.shown
     at = f"#{section.replace(' ', '-')}" if section else ""

@@ -29,3 +29,5 @@ FIGURE6 = Shown("05_control", "Figure 6: predicted and executed returns", "figur
 FIGURE7 = Shown("05_control", "Figure 7: policies", "figure7")
 ROBUSTNESS, FIGURE8 = Shown("06_robustness"), Shown("06_robustness", figure="figure8")
 ACTION_PRIOR, FIGURE10 = Shown("07_action_prior"), Shown("07_action_prior", "Action statistics", "figure10")
+ROUNDS = Shown("10_explore", "3. What the rounds bring")
+ADAPTED = Shown("10_explore", "6. Zero-shot, fine-tuned, from scratch")

@@ -6,15 +6,27 @@ through every model. No margin moved. Adam is a reading wherever it was primary.
 """
 
 from dataclasses import replace
+from types import ModuleType
 
 from tsmlib.study.claims.claim import Claim
-from tsmlib.study.claims.ledger import introduction, latent, method, results
-from tsmlib.study.zoo import PAPERS
+from tsmlib.study.claims.ledger import introduction, latent, method, outlook, results
+from tsmlib.study.zoo import OURS, PAPERS
 
-_FOUND = [value for part in (introduction, method, results, latent) for value in vars(part).values()]
-LEDGER = sorted({value for value in _FOUND if isinstance(value, Claim)}, key=lambda claim: claim.id)
+
+def _of(*parts: ModuleType) -> list[Claim]:
+    found = {value for part in parts for value in vars(part).values() if isinstance(value, Claim)}
+    return sorted(found, key=lambda claim: claim.id)
+
+
+LEDGER = _of(introduction, method, results, latent)
+QUESTIONS = _of(outlook)
 
 
 def claims(subject: str = PAPERS) -> list[Claim]:
     """All claims in order. subject: the model that stands where the paper's own model is meant."""
     return [replace(claim, subject=subject) for claim in LEDGER]
+
+
+def questions() -> list[Claim]:
+    """The questions of the paper's outlook, asked of our own model."""
+    return [replace(question, subject=OURS) for question in QUESTIONS]
