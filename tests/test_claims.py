@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scripts import run_script
 
 from tsmlib import figures
 from tsmlib.statistics import holm, interval, random_effects
@@ -347,6 +348,11 @@ def test_the_ledger_holds_every_claim_once_and_in_order() -> None:
     assert sum(c.headline for c in LEDGER) == 21
     assert [c.id for c in LEDGER if c.definition] == ["C14", "C49"]
     assert set().union(*(c.why for c in LEDGER)) <= set(VERDICTS)
+
+
+def test_the_page_says_how_often_simulated_verdicts_were_wrong() -> None:
+    printed = run_script(ROOT / "benchmarks" / "verdicts" / "run.py", "--table")
+    assert printed in publish.CLAIMS_PAGE.read_text(), "put the output of benchmarks/verdicts/run.py --table there"
 
 
 def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows() -> None:

@@ -1,6 +1,7 @@
 """How often verdicts are wrong: the checker on simulated worlds whose truth is known, and its power on published rows.
 
     python benchmarks/verdicts/run.py
+    python benchmarks/verdicts/run.py --table          the table of docs/claims.md, from worlds.csv
 
 worlds.csv: claims of 1, 3 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
 every seed. A check's value is effect + seed + target + rest, each normal, of the deviations in PLANS and SCORES.
@@ -112,11 +113,38 @@ def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def page_table(found: pd.DataFrame) -> str:
+    """What docs/claims.md says of worlds, in Markdown: wrong verdicts at an effect of 1, right ones at 2.
+
+    Scores of one seed have no interval, and so no verdict.
+    """
+    decided = found[(found["seeds"] > 1) | (found["rows"] == "plans")]
+    lines = [
+        "| rows | training seeds | checks | wrongly replicated, effect 1 | wrongly not replicated, effect 1 | "
+        "replicated, effect 2 |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (rows, seeds, n_checks), pair in decided.groupby(["rows", "seeds", "checks"], sort=False):
+        false, true = (pair[pair["effect"] == effect].iloc[0] for effect in (1, 2))
+        shares = [false[REPLICATED.lower()], false[FAILED.lower()], true[REPLICATED.lower()]]
+        lines.append(f"| {rows} | {seeds} | {n_checks} | {' | '.join(map(percent, shares))} |")
+    return "\n".join(lines)
+
+
+def percent(share: float) -> str:
+    """Two digits."""
+    return f"{100 * share:.2g} %" if 0 < share < 0.995 else f"{share:.0%}".replace("%", " %" if share else "")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=400, help="of each line (default 400)")
     parser.add_argument("--out", type=Path, default=HERE, help="folder (default: that of this script)")
+    parser.add_argument("--table", action="store_true", help="print the table that docs/claims.md has, and stop")
     given = parser.parse_args()
+    if given.table:
+        print(page_table(pd.read_csv(HERE / "worlds.csv")))
+        return
     rng = np.random.default_rng(0)
     for name, lines in {"checks": checks(given.studies, rng), "worlds": worlds(given.studies, rng)}.items():
         files.write_bytes(given.out / f"{name}.csv", lines.to_csv(index=False).encode())
