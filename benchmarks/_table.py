@@ -20,8 +20,8 @@ from tsmlib.storage import files
 from tsmlib.study import runs
 
 ORDER = (
-    *("collect", "robots", "train", "avx2", "rollout", "plan", "policy", "score", "seed", "parallel", "growth"),
-    "trust",
+    *("collect", "robots", "train", "avx2", "rollout", "plan", "policy", "score", "seed", "parallel", "copies"),
+    *("growth", "trust"),
 )
 DOCS = runs.ROOT / "docs" / "speed.md"
 PICTURE = runs.ROOT / "figures" / "bench_growth"

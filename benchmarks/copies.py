@@ -1,0 +1,105 @@
+"""Several trainings of one model as one, with stacked weights, against one alone: what a gradient takes.
+
+A gradient of a training loss, at the batch and the future of the study's schedule, of one model and of --copies with
+weights, windows and noise of their own, put through ``torch.func.vmap`` as one call. Windows are drawn beforehand, and
+the optimiser's step is left out, which costs as much per weight either way. CPU seconds; on --device cuda by the clock.
+Models that step through a backward pass of their own (LSTM, rtsm) have no such form.
+
+    python benchmarks/copies.py        or        python -m tsmlib bench copies
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from _rounds import Row, interleaved, parsed, parser, save
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+
+from tsmlib import study
+from tsmlib.study import runs
+from tsmlib.study.zoo import Updates
+from tsmlib.trajectory import Segment, Window, batches
+
+ENV = "tsm/ReacherPush-v1"
+
+
+class Loss(nn.Module):
+    """A loss of a model as a module, which can be called with other weights."""
+
+    def __init__(self, net: Any, loss: str) -> None:
+        super().__init__()
+        self.net, self.loss = net, loss
+
+    def forward(self, window: Window, generator: torch.Generator) -> Tensor:
+        return getattr(self.net, self.loss)(window, generator)
+
+
+def timed(device: str, call: Callable[[], object]) -> Callable[[], float]:
+    """Seconds of ``call``."""
+
+    def run() -> float:
+        clock = time.process_time if device == "cpu" else time.perf_counter
+        began = clock()
+        call()
+        if device != "cpu":
+            torch.cuda.synchronize()
+        return clock() - began
+
+    return run
+
+
+def ways(word: str, stage: Updates, copies: int, device: str) -> dict[str, Callable[[], float]]:
+    """One gradient, and ``copies`` of them."""
+    run, data = runs.resolve("bench", scale="laptop"), study.random_data(ENV, 50, seed=0)
+    losses: list[nn.Module] = [Loss(study.initialise(run, word, data), stage.loss).to(device) for _ in range(copies)]
+    net: Any = losses[0].net
+    generator = torch.Generator().manual_seed(0)
+    draw = batches(data.padded(net.past_len).to(device), past_len=net.past_len, future_len=stage.future_len,
+                   batch_size=stage.batch, generator=generator)  # fmt: skip
+    windows = [next(draw) for _ in range(copies)]
+    stacked = Window(*(
+        Segment(*(torch.stack(parts) for parts in zip(*segments, strict=True)))
+        for segments in zip(*windows, strict=True)
+    ))  # fmt: skip
+    weights, _ = stack_module_state(losses)  # the statistics of the data are the same
+
+    def value(own: dict[str, Tensor], window: Window) -> Tensor:
+        return functional_call(losses[0], own, (window, generator))
+
+    def many() -> None:
+        for weight in weights.values():
+            weight.grad = None
+        vmap(value, randomness="different")(weights, stacked).sum().backward()
+
+    def one() -> None:
+        losses[0].zero_grad()
+        losses[0](windows[0], generator).backward()
+
+    return {"one": timed(device, one), "many": timed(device, many)}
+
+
+def main() -> None:
+    options = parser(__doc__, rounds=7)
+    options.add_argument("--models", default="tsm,onestep,multistep")
+    options.add_argument("--copies", type=int, default=10)
+    options.add_argument("--device", default="cpu")
+    arguments = parsed(options)
+    rows, copies = [], arguments.copies
+    for word in arguments.models.split(","):
+        for stage in study.schedule(runs.resolve("bench", scale="laptop"), ENV, word):
+            seconds = interleaved(ways(word, stage, copies, arguments.device), arguments.rounds)
+            rows.append(Row.of(
+                f"{copies} trainings of {word} as one, {stage.loss}, a gradient: seconds", seconds["many"],
+                "one training", seconds["one"], unit="s", env=ENV, sim="mujoco", task="push", model=word,
+                configuration=stage.loss, metric="seconds",
+            ))  # fmt: skip
+    print(f"{ENV}, {arguments.rounds} rounds, {arguments.threads} threads, {arguments.device}")
+    save("copies", rows)
+
+
+if __name__ == "__main__":
+    main()
