@@ -9,7 +9,7 @@ export const fromShare = ([a, b]) => [(a - 0.5) * 2 * HALF, (0.5 - b) * 2 * HALF
 /** Colours of the page, as the style sheet has them for light and dark. */
 export function palette(element) {
   const style = getComputedStyle(element), colour = name => style.getPropertyValue(`--${name}`).trim();
-  return Object.fromEntries(['ground', 'wall', 'faint', 'ink', 'object', 'obstacle', 'target', 'executed'].map(name => [name, colour(name)]));
+  return Object.fromEntries(['ground', 'wall', 'faint', 'ink', 'object', 'obstacle', 'target', 'executed', 'bent'].map(name => [name, colour(name)]));
 }
 
 export class View {
