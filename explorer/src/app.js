@@ -14,7 +14,7 @@ const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDow
 const LAST = 20; // tries in the plot
 const SAME = 6; // tries in the table
 const WAIT = 200; // ms from a choice or a key to the plan, in case that more follow
-const LABEL = 0.045; // m from what can be dragged to its name
+const LABEL = 0.05; // m from what can be dragged to its name
 const FOOLED = 1; // cm, by which the mean distance to the target may differ from the prediction
 const still = matchMedia('(prefers-reduced-motion: reduce)'), dark = matchMedia('(prefers-color-scheme: dark)');
 const signed = (v, digits = 2) => v.toFixed(digits).replace('-', '−');
@@ -99,7 +99,7 @@ function draw() {
       view.path([0, 0, ...kinematics(states.subarray(k * dx, k * dx + 2), arm.links).flat()], 3, 2, 0, colours.bent, 0.004);
       if (scene.task === 'push') view.block(states.subarray(k * dx + 6, k * dx + 8), arm.block, colours.bent, { outline: true });
     }
-    view.goal(scene.target, colours.target);
+    view.goal(scene.target, colours.target, colours.ground);
   }
   placeHandles();
 }
@@ -148,16 +148,16 @@ function position(what) {
 
 /** Whether a name has more room below its handle than above. */
 function roomBelow([x, y], others) {
-  const room = up => Math.min(...others.map(([a, b]) => Math.hypot(a - x, b - y - up)));
+  const room = up => Math.min(...others.map(([a, b]) => Math.hypot((a - x) / 2, b - y - up))); // names are wide
   return room(-LABEL) > room(LABEL);
 }
 
 function placeHandles() {
   const near = Object.keys(NAMES).map(position).filter(Boolean), { result, scene } = state;
-  if (result?.done) { // the predicted path, and the arm at its end
-    const [{ predicted }] = result.parts, { dx } = result, place = placeOf(scene.task);
-    for (let i = 4 * dx; i < predicted.length; i += 5 * dx) near.push(predicted.subarray(i + place, i + place + 2));
-    near.push(...kinematics(predicted.slice(-dx), state.manifest.arm.links));
+  if (result?.done) { // the path, and the arm at its end
+    const path = scene.replan ? result.executed : result.parts[0].predicted, { dx } = result, place = placeOf(scene.task);
+    for (let i = 4 * dx; i < path.length; i += 5 * dx) near.push(path.subarray(i + place, i + place + 2));
+    near.push(...kinematics(path.slice(-dx), state.manifest.arm.links));
   }
   for (const handle of handles) {
     const { what } = handle.dataset, point = position(what);
@@ -167,11 +167,13 @@ function placeHandles() {
     const [a, b] = toShare(point), cm = point.map(v => signed(100 * v, 1));
     handle.style.left = `${100 * a}%`;
     handle.style.top = `${100 * b}%`;
-    handle.dataset.side = roomBelow(point, near.filter(other => String(other) !== String(point))) ? 'below' : 'above';
     const name = what === 'block' && state.scene.task === 'obstacle' ? 'Obstacle' : NAMES[what];
     handle.setAttribute('aria-label', `${name} at ${cm[0]}, ${cm[1]} cm; arrow keys move it${what === 'arm' ? ', F bends the elbow the other way' : ''}`);
-    if (!state.touched && handle.tabIndex === 0) handle.dataset.name = name.toLowerCase();
     handle.title = what === 'arm' ? 'Fingertip at the start: drag it, or double-click to bend the elbow the other way' : `${name}: drag it`;
+    if (state.touched || handle.tabIndex) continue;
+    const below = roomBelow(point, near.filter(other => String(other) !== String(point)));
+    Object.assign(handle.dataset, { name: name.toLowerCase(), side: below ? 'below' : 'above' });
+    near.push([point[0], point[1] + (below ? -LABEL : LABEL)]);
   }
 }
 
@@ -300,7 +302,7 @@ function verdict() {
   }
   if (planning || state.waiting) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} predicted so far.` : 'Planning…';
   if (!done) return scene.task === 'push' ? 'Drag the target, the object or the fingertip; or press Plan.' : 'Drag the target or the fingertip; or press Plan.';
-  return `${done.success ? 'Arrived' : 'Missed'}: ${(100 * done.distance).toFixed(1)} cm off target (limit: ${Math.round(100 * about().tolerance)} cm).`;
+  return `${done.success ? 'Arrived' : 'Missed'}: ${(100 * done.distance).toFixed(1)} cm off target (limit ${Math.round(100 * about().tolerance)} cm)`;
 }
 
 /** What has to arrive. */

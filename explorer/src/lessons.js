@@ -49,16 +49,16 @@ export const TOUR = [
   {
     title: 'An easy push',
     link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'The recurrent TSM predicts (left), the planner picks torques, and MuJoCo executes them without looking again (right). '
-      + 'The two agree: predicted and executed return are close, and the object arrives. Turn a knob of the code Z: the future bends '
-      + 'little, for there is little that the past leaves open.',
+    text: 'The recurrent TSM predicts, the planner picks torques, and MuJoCo executes them without looking again. '
+      + 'The two agree: predicted and executed return are close, and the object arrives. Turn a knob of the code Z: another Z, '
+      + 'another future of the same torques.',
   },
   {
     title: 'A bounce',
     link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.53,-0.4&target=-0.15,-0.1&block=0.17,-0.01',
     text: 'Here the object meets a wall and bounces off it. What happens then depends on the last millimetre, which the past does not '
       + 'tell: that is left to the code Z, and the thin lines, one for each random Z, spread. The model is less certain, and the '
-      + 'execution falls among its futures rather than on their middle. Turn a knob of Z.',
+      + 'execution falls among its futures rather than on their middle. Turn both knobs of Z.',
   },
   {
     title: 'A fooled one-step model',

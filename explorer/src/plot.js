@@ -47,7 +47,6 @@ export function drawReturns(svg, tries) {
 /** actions: torques (T, 2) of shoulder and elbow, each from -1 to 1. */
 export function drawTorques(svg, actions) {
   const steps = actions.length / 2;
-  svg.setAttribute('viewBox', '0 0 360 48');
   svg.replaceChildren(element('path', { d: 'M0 24H360', class: 'grid' }), ...[0, 1].map(joint => element('path', {
     class: 'torque', d: Array.from({ length: steps }, (_, t) => `${t ? 'L' : 'M'}${360 * t / (steps - 1)} ${24 - 55 * actions[2 * t + joint]}`).join(''),
   })));
