@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -206,6 +207,14 @@ def test_a_link_that_was_edited_by_hand_is_refused_in_one_sentence() -> None:
     assert found[:2] == ["", ""]
     said = "This link cannot be restored: {}. Here is the first scene instead."
     assert found[2:] == [said.format(what) for what in wrong.values()]
+
+
+def test_what_is_said_to_lie_outside_the_training_data_does_so_in_the_numbers_that_are_said() -> None:
+    places = [f"{0.16955 + 0.0001 * k:.5f}" for k in range(20)]  # metres from the shoulder; 17.0 cm in the data
+    (found,) = ask({"what": "marks", "links": [f"#arm=0,-2&block=0,{y}" for y in places]})
+    said = [re.findall(r"object is (.*) cm .* \((.*) to (.*) in the data", "".join(marks)) for marks in found]
+    assert [bool(one) for one in said] == [float(y) > 0.1705 for y in places]
+    assert all(float(far) > float(high) for one in said for far, _, high in one)
 
 
 @pytest.fixture

@@ -1,18 +1,20 @@
 // The page: what a person does, the worker's answers, and the drawing of both.
 import { LESSONS, TOUR } from './lessons.js';
-import { drawReturns } from './plot.js';
+import { drawReturns, drawTorques } from './plot.js';
 import { kinematics } from './physics.js';
 import { defaultScene, flipped, fromLink, moved, outside, startState, toLink } from './scene.js';
 import { View, fromShare, palette, toShare } from './view.js';
 
 const $ = id => document.getElementById(id);
 const TASKS = { push: 'push the object to the target', obstacle: 'reach past an obstacle', reach: 'reach the target' };
+const SPACES = { latent: 'codes c', direct: 'any torques' };
 const MODELS = { rtsm: 'recurrent TSM', tsm: 'TSM', lstm: 'LSTM', onestep: 'one-step model' };
 const STEP = 0.005, LONG_STEP = 0.02; // metres per key
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const LAST = 20; // tries in the plot
 const SAME = 6; // tries in the table
 const WAIT = 200; // ms from a choice or a key to the plan, in case that more follow
+const LABEL = 0.05; // m from what can be dragged to its name
 const FOOLED = 1; // cm, by which the mean distance to the target may differ from the prediction
 const still = matchMedia('(prefers-reduced-motion: reduce)'), dark = matchMedia('(prefers-color-scheme: dark)');
 const signed = (v, digits = 2) => v.toFixed(digits).replace('-', '−');
@@ -41,6 +43,9 @@ function painted(colour) {
   return getComputedStyle(probe).backgroundColor;
 }
 
+/** Where a state has the position of what has to arrive. */
+const placeOf = task => (task === 'push' ? 6 : 4);
+
 // Drawing ---------------------------------------------------------------------------------------------------------------
 
 let drawn = 0;
@@ -61,14 +66,14 @@ function draw() {
   const { scene, result, time } = state, { arm } = state.manifest, colours = palette(document.body);
   const model = painted(colourOf(scene.model)), start = startState(scene, arm);
   const now = result?.parts.length ? statesAt(time) : { predicted: start, executed: start, part: null };
-  const over = state.view === 'over', place = scene.task === 'push' ? 6 : 4;
+  const over = state.view === 'over', place = placeOf(scene.task);
   for (const [name, view] of Object.entries(views)) {
     if (over && name === 'executed') continue;
     view.fit();
     view.clear(colours, { task: scene.task, arm });
     const predicted = over || name === 'predicted', executed = over || name === 'executed';
     if (time) {
-      view.arm(scene.arm, arm, colours.wall, { alpha: 0.15, ground: colours.ground });
+      view.arm(scene.arm, arm, colours.wall, { alpha: 0.35, ground: colours.ground });
       if (scene.block) view.block(scene.block, arm.block, colours.wall, { outline: true, dashed: true });
     }
     if (now.part && predicted) trails(view, now, model, place, time);
@@ -90,11 +95,11 @@ function draw() {
     if (predicted) draws.predicted();
     if (state.bent && predicted) {
       const { from, states } = state.bent, dx = result.dx, k = Math.max(0, Math.min(states.length / dx, time - from) - 1);
-      view.path(states, states.length / dx, dx, place, colours.target, 0.003);
-      view.path([0, 0, ...kinematics(states.subarray(k * dx, k * dx + 2), arm.links).flat()], 3, 2, 0, colours.target, 0.004);
-      if (scene.task === 'push') view.block(states.subarray(k * dx + 6, k * dx + 8), arm.block, colours.target, { outline: true });
+      view.path(states, states.length / dx, dx, place, colours.bent, 0.004);
+      view.path([0, 0, ...kinematics(states.subarray(k * dx, k * dx + 2), arm.links).flat()], 3, 2, 0, colours.bent, 0.004);
+      if (scene.task === 'push') view.block(states.subarray(k * dx + 6, k * dx + 8), arm.block, colours.bent, { outline: true });
     }
-    view.goal(scene.target, colours.target);
+    view.goal(scene.target, colours.target, colours.ground);
   }
   placeHandles();
 }
@@ -102,10 +107,11 @@ function draw() {
 /** The fan, and the path of what has to arrive as the current plan predicts it, to the end. */
 function trails(view, { part }, colour, place, time) {
   const { dx, parts, executed } = state.result, steps = part.predicted.length / dx;
-  const begin = ({ from }) => Array.from(from ? executed.subarray((from - 1) * dx + place) : startState(state.scene, state.manifest.arm).slice(place));
+  const begin = ({ from }) => Array.from(from ? executed.slice((from - 1) * dx + place) : startState(state.scene, state.manifest.arm).slice(place)).slice(0, 2);
   const [x, y] = begin(part);
   for (const earlier of parts.filter(({ from }) => from < part.from)) { // what each plan before this one predicted
-    view.path(earlier.predicted, earlier.predicted.length / dx, dx, place, colour, 0.002, 0.35, begin(earlier).slice(0, 2));
+    view.path(earlier.predicted, earlier.predicted.length / dx, dx, place, colour, 0.002, 0.35, begin(earlier));
+    view.block(begin(earlier), 0.004, colour);
   }
   if (part.fan) {
     for (let s = 0; s < part.fan.length / steps / 2; s++) {
@@ -140,7 +146,19 @@ function position(what) {
   return what === 'arm' ? kinematics(state.scene.arm, state.manifest.arm.links)[1] : state.scene[what];
 }
 
+/** Whether a name has more room below its handle than above. */
+function roomBelow([x, y], others) {
+  const room = up => Math.min(...others.map(([a, b]) => Math.hypot((a - x) / 2, b - y - up))); // names are wide
+  return room(-LABEL) > room(LABEL);
+}
+
 function placeHandles() {
+  const near = Object.keys(NAMES).map(position).filter(Boolean), { result, scene } = state;
+  if (result?.done) { // the path, and the arm at its end
+    const path = scene.replan ? result.executed : result.parts[0].predicted, { dx } = result, place = placeOf(scene.task);
+    for (let i = 4 * dx; i < path.length; i += 5 * dx) near.push(path.subarray(i + place, i + place + 2));
+    near.push(...kinematics(path.slice(-dx), state.manifest.arm.links));
+  }
   for (const handle of handles) {
     const { what } = handle.dataset, point = position(what);
     handle.hidden = !point;
@@ -151,8 +169,11 @@ function placeHandles() {
     handle.style.top = `${100 * b}%`;
     const name = what === 'block' && state.scene.task === 'obstacle' ? 'Obstacle' : NAMES[what];
     handle.setAttribute('aria-label', `${name} at ${cm[0]}, ${cm[1]} cm; arrow keys move it${what === 'arm' ? ', F bends the elbow the other way' : ''}`);
-    if (!state.touched && handle.tabIndex === 0) handle.dataset.name = name.toLowerCase();
     handle.title = what === 'arm' ? 'Fingertip at the start: drag it, or double-click to bend the elbow the other way' : `${name}: drag it`;
+    if (state.touched || handle.tabIndex) continue;
+    const below = roomBelow(point, near.filter(other => String(other) !== String(point)));
+    Object.assign(handle.dataset, { name: name.toLowerCase(), side: below ? 'below' : 'above' });
+    near.push([point[0], point[1] + (below ? -LABEL : LABEL)]);
   }
 }
 
@@ -216,11 +237,12 @@ function show() {
   $('space').value = scene.space;
   $('replan').checked = scene.replan;
   $('plan').disabled = planning || state.failed;
-  $('plan').textContent = done ? 'Try again' : 'Plan';
-  $('plan').title = done ? 'The same scene, with other random numbers for the planner' : '';
+  $('plan').textContent = done ? 'Other random numbers' : 'Plan';
+  $('plan').title = done ? 'Plan the same scene again: the planner draws its candidates with other random numbers' : '';
   $('views').dataset.view = state.view;
   for (const button of document.querySelectorAll('[data-set-view]')) button.setAttribute('aria-pressed', String(button.dataset.setView === state.view));
   $('caption-predicted').textContent = state.view === 'over' ? `Outline: ${MODELS[scene.model]}. Solid: MuJoCo` : `Predicted by the ${MODELS[scene.model]}`;
+  $('caption-executed').textContent = scene.replan ? 'Executed by MuJoCo, planning every ten steps' : 'Executed by MuJoCo without looking (open loop)';
   $('time').max = horizon();
   $('time').disabled = $('play').disabled = !result?.parts.length;
   $('time').value = state.time;
@@ -232,7 +254,7 @@ function show() {
   $('outside').hidden = !marks.length;
   $('outside').textContent = marks.length ? `Outside the training data: ${marks.join('; ')}. The model may be wrong there.` : '';
   $('outcome').setAttribute('aria-busy', String(planning)); // a screen reader waits for the outcome
-  $('numbers').hidden = $('agreement').hidden = !done;
+  $('numbers').hidden = $('agreement').hidden = $('meaning').hidden = !done;
   $('legend').textContent = legend();
   if (done) {
     $('predicted-return').textContent = signed(done.predicted);
@@ -240,11 +262,12 @@ function show() {
     $('gap').textContent = gapOf(done);
     $('distance').textContent = `${(100 * done.distance).toFixed(1)} cm`;
   }
-  $('guide-result').textContent = done ? `Here: predicted return ${$('predicted-return').textContent}, executed ${$('executed-return').textContent}, gap ${$('gap').textContent}; ends ${$('distance').textContent} from the target.` : '';
   $('verdict').className = `verdict ${done ? (done.success ? 'good' : 'bad') : ''}`;
   $('verdict').textContent = verdict();
   $('agreement').className = `agreement ${done && fooled(done) ? 'fooled' : ''}`;
   $('agreement').textContent = done ? agreement() : '';
+  $('meaning').textContent = `Return: minus the distance to the target (m) and squared torques, summed over ${horizon()} steps; 0 is best. Gap: predicted minus executed.`;
+  drawTorques($('torques'), result?.parts.length ? result.parts[0].actions : []);
   showTries();
   const knobs = model.knobs, usable = knobs.length > 0 && done && !scene.replan;
   $('knobs').disabled = !usable;
@@ -259,17 +282,16 @@ function show() {
 
 /** What is drawn, in words. */
 function legend() {
-  const { scene } = state, what = { push: ' Brown: the object; dashed: where it starts.', obstacle: ' Grey disc: the obstacle.', reach: '' }[scene.task];
-  const fan = look(scene.model).knobs.length ? ` Thin lines: 32 sampled futures of the ${scene.task === 'push' ? 'object' : 'fingertip'}.` : '';
-  return `Red ring: the target.${what} Pale arm: its start.${fan}`;
+  const { scene } = state, what = { push: ' Brown: the object.', obstacle: ' Grey disc: the obstacle.', reach: '' }[scene.task];
+  const fan = look(scene.model).knobs.length ? `Thin lines: 32 futures of the ${mover(scene.task)}, each with a random code Z.` : 'No thin lines: this model gives one future.';
+  return `Red ring: the target.${what} Pale and dashed: the start. ${fan}${scene.replan ? ' Dots: where it planned again; faint lines: what those plans predicted.' : ''}`;
 }
 
 /** What the knobs do. */
 function turned() {
   const { scene } = state, many = look(scene.model).decoders.length > 1;
-  if (scene.replan) return 'For a plan that is made once.';
-  if (!state.result?.done) return 'Two of its eight numbers, which the planner does not search. Plan first, then turn them.';
-  return `Two of its eight numbers, in all segments; not what the planner searches. Red: the future of the same torques under this code${many ? ', by the first of its three networks' : ''}.`;
+  if (scene.replan) return 'For a plan that is made once: untick “Plan again every ten steps”.';
+  return `Another Z, another future of the same torques, in purple${many ? ' (by the first of three networks)' : ''}. These are two of its eight numbers; the planner does not search them.`;
 }
 
 function verdict() {
@@ -280,7 +302,7 @@ function verdict() {
   }
   if (planning || state.waiting) return state.progress ? `Planning: iteration ${state.progress.iteration} of ${state.progress.of}, ${signed(state.progress.value, 1)} predicted so far.` : 'Planning…';
   if (!done) return scene.task === 'push' ? 'Drag the target, the object or the fingertip; or press Plan.' : 'Drag the target or the fingertip; or press Plan.';
-  return `${done.success ? 'Arrived' : 'Missed'}: ${(100 * done.distance).toFixed(1)} cm off target (success: within ${Math.round(100 * about().tolerance)} cm).`;
+  return `${done.success ? 'Arrived' : 'Missed'}: ${(100 * done.distance).toFixed(1)} cm off target (limit ${Math.round(100 * about().tolerance)} cm)`;
 }
 
 /** What has to arrive. */
@@ -294,9 +316,9 @@ const fooled = one => farther(one) > FOOLED;
 function agreement() {
   const { scene, result: { done } } = state, cm = farther(done), much = `${Math.abs(cm).toFixed(1)} cm`;
   if (scene.replan) return 'Planned again every ten steps, from what the arm really did. The predicted return is that of the first plan.';
-  const how = 'Open loop: one plan, executed without looking.', what = `on average the ${mover(scene.task)} was ${much} ${cm > 0 ? 'farther from' : 'nearer to'} the target than predicted`;
-  if (fooled(done)) return `${how} The model was fooled: ${what}.`;
-  return cm < -FOOLED ? `${how} The model was too pessimistic: ${what}.` : `${how} Model and execution agree: ${what}.`;
+  const what = `on average the ${mover(scene.task)} was ${much} ${cm > 0 ? 'farther from' : 'nearer to'} the target than predicted`;
+  if (fooled(done)) return `The model was fooled: ${what}.`;
+  return cm < -FOOLED ? `The model was too pessimistic: ${what}.` : `Model and execution agree: ${what}.`;
 }
 
 /** What of a scene stays the same when another model or another search is tried. */
@@ -310,15 +332,14 @@ function showTries() {
     const cell = (text, className = '') => Object.assign(row.insertCell(), { textContent: text, className });
     Object.assign(swatch, { className: 'swatch' }).style.background = colourOf(one.model);
     cell(MODELS[one.model]).prepend(swatch);
-    cell(`${one.space === 'latent' ? 'like the data’s' : 'any torques'}${one.replan ? ', again every ten steps' : ''}`);
+    cell(`${SPACES[one.space]}${one.replan ? ', again every ten steps' : ''}`);
     cell(signed(one.predicted));
     cell(signed(one.executed));
     cell(`${gapOf(one)}${fooled(one) ? ' fooled' : ''}`, fooled(one) ? 'fooled' : '');
     cell(`${(100 * one.distance).toFixed(1)} cm`);
     return row;
   }));
-  $('meaning').textContent = `${same.length ? '' : 'None yet. '}Return: minus the distance to the target in metres and the squared torques, summed over ${horizon()} steps; nearer to 0 is better. `
-    + `Fooled: open loop, the ${mover(state.scene.task)} was on average over ${FOOLED} cm farther from the target than predicted.`;
+  $('fooled').textContent = `${same.length ? '' : 'None yet. '}Fooled: open loop, the ${mover(state.scene.task)} was on average over ${FOOLED} cm farther from the target than predicted.`;
 }
 
 /** The gap of the returns as they are printed. */
@@ -477,16 +498,16 @@ function visit(k) {
   state.tour = k;
   const place = TOUR[k];
   $('guide').hidden = !place;
-  $('tour').hidden = $('lead').hidden = Boolean(place);
+  $('tour').hidden = $('lead').hidden = $('do').hidden = Boolean(place);
+  $('steps').hidden = !place;
   if (!place) {
     $('tour').focus();
     return;
   }
-  $('guide-count').textContent = `Scene ${k + 1} of ${TOUR.length}`;
-  $('guide-title').textContent = place.title;
+  $('guide-title').textContent = `Scene ${k + 1} of ${TOUR.length}: ${place.title}`;
   $('guide-text').textContent = place.text;
   $('guide-back').disabled = k === 0;
-  $('guide-next').textContent = k + 1 < TOUR.length ? 'Next' : 'Finish';
+  $('guide-next').disabled = k + 1 === TOUR.length;
   $('guide-title').focus({ preventScroll: true });
   $('guide').scrollIntoView({ block: 'nearest', behavior: still.matches ? 'auto' : 'smooth' });
   restore(place.link);
@@ -522,7 +543,7 @@ function start() {
   $('plan').addEventListener('click', tryAgain);
   $('play').addEventListener('click', () => { if (state.playing) { state.playing = false; show(); } else play(); });
   $('time').addEventListener('input', scrub);
-  for (const knob of [0, 1]) $(`knob-${knob}`).addEventListener('input', () => { show(); turn(); });
+  for (const knob of [0, 1]) $(`knob-${knob}`).addEventListener('input', () => { state.touched = true; show(); turn(); });
   for (const button of document.querySelectorAll('[data-set-view]')) {
     button.addEventListener('click', () => { state.view = button.dataset.setView; show(); });
   }

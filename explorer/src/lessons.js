@@ -17,7 +17,7 @@ export const LESSONS = [
       + 'predict one state after the other.',
   },
   {
-    title: '2. Code',
+    title: '2. Code Z',
     math: math('Z is drawn from a standard normal distribution', `${i('Z')}${o('∼')}${i('N')}${o('(')}<mn>0</mn>${o(',')}${i('I')}${o(')')}`),
     text: 'Past and torques do not decide everything: a slightly different touch sends the object elsewhere. What the model cannot '
       + 'know it takes from eight random numbers for each segment, the code Z: another code, another future. The prediction '
@@ -25,13 +25,14 @@ export const LESSONS = [
       + 'The one-step model and the LSTM have no code, so they give one future and cannot say how sure they are.',
   },
   {
-    title: '3. Prior',
+    title: '3. Code c',
     math: math('Maximise over the codes c 1 to c K the expected sum of rewards, with torques from the action prior',
       `<munder><mi>max</mi><mrow>${sub('c', '1')}<mo>…</mo>${sub('c', 'K')}</mrow></munder>${i('E')}<mo>[</mo><munder><mo>∑</mo><mi>t</mi></munder>`
       + `${reward(sub('x', 't'), sub('u', 't'))}<mo>]</mo>${o(',')}<mspace width="0.6em"/>${sub('u', 't')}${o('∼')}${i('P')}${o('(')}${sub('u', 't')}${o('|')}${sub('u', '1:t−1')}${o(',')}${i('c')}${o(')')}`),
     text: 'The planner tries 64 plans in the model, keeps the best, and tries again around them, six times (cross-entropy method). '
-      + 'What it searches is your choice. The action prior is a second model: it turns codes c of its own, not the Z above, into torques '
-      + 'like those of the training data. Searching its codes, the planner finds only such torques; searching the torques themselves, it finds any.',
+      + 'What it searches is your choice. The action prior is a second network: it turns codes c, eight numbers for each 0.2 s and not '
+      + 'the Z above, into torques like those of the training data. Searching codes c, the planner finds only such torques; searching the '
+      + 'torques themselves, it finds any.',
   },
   {
     title: '4. Exploitation',
@@ -39,8 +40,8 @@ export const LESSONS = [
       `<munder><mo>∑</mo><mi>t</mi></munder>${reward(hat, sub('u', 't'))}<mo>−</mo><munder><mo>∑</mo><mi>t</mi></munder>${reward(sub('x', 't'), sub('u', 't'))}`),
     text: 'A plan is chosen because its prediction is good, so the search finds the model’s mistakes: the model is fooled when a '
       + 'plan leads to torques or states that are rare in its training data, where a wrong prediction can look better than the '
-      + 'truth. The gap, predicted minus executed return, says by how much: the third scene of the tour has a large one. A '
-      + 'negative gap is the other mistake, a model that was too pessimistic.',
+      + 'truth. The gap, predicted minus executed return, says by how much: the third scene of the tour has a large one. The '
+      + 'predicted return is the mean over the 32 futures, where there are any. A negative gap is the other mistake, a model that was too pessimistic.',
   },
 ];
 
@@ -48,31 +49,34 @@ export const TOUR = [
   {
     title: 'An easy push',
     link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'The recurrent TSM predicts (left), the planner picks torques, and MuJoCo executes them without looking again (right). '
-      + 'The two agree: predicted and executed return are close, and the object arrives.',
+    text: 'The recurrent TSM predicts, the planner picks torques, and MuJoCo executes them without looking again. '
+      + 'The two agree: predicted and executed return are close, and the object arrives. Turn a knob of the code Z: another Z, '
+      + 'another future of the same torques.',
   },
   {
     title: 'A bounce',
     link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.53,-0.4&target=-0.15,-0.1&block=0.17,-0.01',
-    text: 'Here the object meets a wall and bounces off it. What happens then depends on the last millimetre, so the thin lines '
-      + 'spread: the model is less certain, and the execution falls among its futures rather than on their middle.',
+    text: 'Here the object meets a wall and bounces off it. What happens then depends on the last millimetre, which the past does not '
+      + 'tell: that is left to the code Z, and the thin lines, one for each random Z, spread. The model is less certain, and the '
+      + 'execution falls among its futures rather than on their middle. Turn both knobs of Z.',
   },
   {
     title: 'A fooled one-step model',
     link: '#task=push&model=onestep&space=direct&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'The first scene again, with a model that predicts one state at a time, and a planner free to choose any torques. It found '
-      + 'a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
+    text: 'The first scene again, with a model that predicts one state at a time (it has no code Z, so no thin lines), and a planner free to '
+      + 'choose any torques. It found a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
   },
   {
     title: 'What the prior forbids',
     link: '#task=push&model=onestep&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'Same start, same one-step model, but the planner searches codes of the action prior. Torques unlike the training data, '
-      + 'which fooled the model, are out of its reach: what was predicted is what is executed.',
+    text: 'Same start, same one-step model, but the planner searches codes c, which the action prior turns into torques like those of the '
+      + 'training data. Others, such as those that fooled the model, are out of its reach: the gap is much smaller, and the object arrives.',
   },
   {
     title: 'Planning again',
     link: '#task=push&model=rtsm&space=latent&replan=1&seed=2&arm=-1.68,-2.45&target=0,-0.11&block=0.05,0.09',
     text: 'A long way round. One plan, executed without looking, misses by about 10 cm (untick “Plan again” and see). Looking every ten '
-      + 'steps (0.2 s) and planning the rest anew, it ends far nearer; how near depends on the candidates this machine has time for.',
+      + 'steps (0.2 s) and planning the rest anew, it ends far nearer, on a slow machine less so. Each faint line is what an earlier plan '
+      + 'predicted, from the dot where it was made.',
   },
 ];

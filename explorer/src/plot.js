@@ -1,5 +1,5 @@
-// Predicted against executed return of the last tries, as SVG.
-const NS = 'http://www.w3.org/2000/svg', SIZE = 260, LEFT = 48, BELOW = 34, TOP = 8;
+// Returns of the last tries, and the torques of a plan, as SVG.
+const NS = 'http://www.w3.org/2000/svg', SIZE = 260, LEFT = 48, BELOW = 42, TOP = 8;
 
 function element(name, attributes, text = '') {
   const found = document.createElementNS(NS, name);
@@ -21,13 +21,14 @@ export function drawReturns(svg, tries) {
   for (let v = low; v <= high; v += step) {
     svg.append(
       element('path', { d: `M${x(v)} ${TOP}V${TOP + tall}M${LEFT} ${y(v)}H${LEFT + wide}`, class: 'grid' }),
-      element('text', { x: x(v), y: TOP + tall + 14, 'text-anchor': 'middle' }, `${v}`.replace('-', '−')),
+      element('text', { x: x(v), y: TOP + tall + 20, 'text-anchor': 'middle' }, `${v}`.replace('-', '−')),
       element('text', { x: LEFT - 6, y: y(v) + 4, 'text-anchor': 'end' }, `${v}`.replace('-', '−')),
     );
   }
   svg.append(
     element('path', { d: `M${x(low)} ${y(low)}L${x(high)} ${y(high)}`, class: 'equal' }),
-    element('text', { x: LEFT + wide - 4, y: y(low) - 8, 'text-anchor': 'end', class: 'note' }, 'predicted more than was executed'),
+    ...['predicted more', 'than executed'].map((text, i) =>
+      element('text', { x: LEFT + wide - 6, y: y(low) - 22 + 14 * i, 'text-anchor': 'end', class: 'note' }, text)),
     element('text', { x: LEFT + wide / 2, y: SIZE - 4, 'text-anchor': 'middle' }, 'predicted return'),
     element('text', { x: 0, y: 0, 'text-anchor': 'middle', transform: `translate(11 ${TOP + tall / 2}) rotate(-90)` }, 'executed return'),
   );
@@ -41,4 +42,12 @@ export function drawReturns(svg, tries) {
   svg.setAttribute('aria-label', tries.length
     ? `Predicted against executed return of the last ${tries.length} tries; ${below} predicted more than was executed.`
     : 'Predicted against executed return; no tries yet.');
+}
+
+/** actions: torques (T, 2) of shoulder and elbow, each from -1 to 1. */
+export function drawTorques(svg, actions) {
+  const steps = actions.length / 2;
+  svg.replaceChildren(element('path', { d: 'M0 24H360', class: 'grid' }), ...[0, 1].map(joint => element('path', {
+    class: 'torque', d: Array.from({ length: steps }, (_, t) => `${t ? 'L' : 'M'}${360 * t / (steps - 1)} ${24 - 55 * actions[2 * t + joint]}`).join(''),
+  })));
 }

@@ -63,17 +63,16 @@ export function flipped(scene, arm) {
 
 /** What of a scene lies outside the starts and targets that the training and test data are drawn from, in words. */
 export function outside({ task, arm, block, target }, { start, target: ring }) {
-  const cm = v => (100 * v).toFixed(1), found = [], far = Math.hypot(...target);
-  if (far < ring[0] - 1e-9 || far > ring[1] + 1e-9) found.push(`the target is ${cm(far)} cm from the shoulder (${cm(ring[0])} to ${cm(ring[1])} in the data)`);
-  if (block) {
-    const from = Math.hypot(...block), what = task === 'push' ? 'object' : 'obstacle';
-    if (from < start.block[0] - 1e-9 || from > start.block[1] + 1e-9) {
-      found.push(`the ${what} is ${cm(from)} cm from the shoulder (${cm(start.block[0])} to ${cm(start.block[1])} in the data)`);
-    }
-  }
-  const degrees = v => `${Math.round(v * 180 / Math.PI)}°`;
+  const cm = v => Number((100 * v).toFixed(1)), degrees = v => Math.round(v * 180 / Math.PI), found = []; // judged as printed
+  const distance = (what, point, ends) => {
+    const [far, low, high] = [Math.hypot(...point), ...ends].map(cm);
+    if (far < low || far > high) found.push(`the ${what} is ${far.toFixed(1)} cm from the shoulder (${low.toFixed(1)} to ${high.toFixed(1)} in the data)`);
+  };
+  distance('target', target, ring);
+  if (block) distance(task === 'push' ? 'object' : 'obstacle', block, start.block);
   ['shoulder', 'elbow'].forEach((joint, i) => {
-    if (Math.abs(arm[i]) > start.angles[i] + 1e-9) found.push(`the ${joint} starts at ${degrees(arm[i])} (within ±${degrees(start.angles[i])} in the data)`);
+    const [angle, most] = [arm[i], start.angles[i]].map(degrees);
+    if (Math.abs(angle) > most) found.push(`the ${joint} starts at ${angle}° (within ±${most}° in the data)`);
   });
   return found;
 }

@@ -9,7 +9,7 @@ export const fromShare = ([a, b]) => [(a - 0.5) * 2 * HALF, (0.5 - b) * 2 * HALF
 /** Colours of the page, as the style sheet has them for light and dark. */
 export function palette(element) {
   const style = getComputedStyle(element), colour = name => style.getPropertyValue(`--${name}`).trim();
-  return Object.fromEntries(['ground', 'wall', 'faint', 'ink', 'object', 'obstacle', 'target', 'executed'].map(name => [name, colour(name)]));
+  return Object.fromEntries(['ground', 'wall', 'faint', 'ink', 'object', 'obstacle', 'target', 'executed', 'bent'].map(name => [name, colour(name)]));
 }
 
 export class View {
@@ -57,14 +57,16 @@ export class View {
     this.context.arc(...this.at(point), this.metres(radius), 0, 2 * Math.PI);
   }
 
-  goal(point, colour) {
+  goal(point, colour, halo) {
     const { context: c } = this;
-    c.strokeStyle = c.fillStyle = colour;
-    c.lineWidth = this.metres(0.003);
-    this.circle(point, 0.013);
-    c.stroke();
-    this.circle(point, 0.004);
-    c.fill();
+    for (const [paint, more] of [[halo, 0.003], [colour, 0]]) { // the halo sets it off from the object
+      c.strokeStyle = c.fillStyle = paint;
+      c.lineWidth = this.metres(0.003 + more);
+      this.circle(point, 0.013);
+      c.stroke();
+      this.circle(point, 0.004 + more / 2);
+      c.fill();
+    }
   }
 
   /** A line through points (n, 2) of an array with ``stride`` numbers each, from ``first`` on. */

@@ -4,7 +4,7 @@ import { readFileSync } from 'node:fs';
 import { readManifest } from '../dist/src/files.js';
 import { loadMujoco } from '../dist/src/physics.js';
 import { Library, attempt, evaluate, judge } from '../dist/src/session.js';
-import { fromLink } from '../dist/src/scene.js';
+import { fromLink, outside } from '../dist/src/scene.js';
 import factory from '../dist/vendor/mujoco.js';
 
 const reader = async path => {
@@ -77,7 +77,12 @@ async function plan({ task, model, space, replan = false, starts, targets, seed,
 /** { links } -> what the page says of each; nothing of one that it restores */
 const link = ({ links }) => links.map(one => fromLink(one, library.manifest).problem);
 
-const answers = [], ask = { physics, rollout, decode, judge: judged, sorted, plan, link };
+/** { links } -> what of each scene lies outside the training data, in words */
+function marks({ links }) {
+  return links.map(one => fromLink(one, library.manifest).scene).map(scene => outside(scene, library.manifest.tasks[scene.task]));
+}
+
+const answers = [], ask = { physics, rollout, decode, judge: judged, sorted, plan, link, marks };
 for (const question of JSON.parse(readFileSync(0))) {
   answers.push(await ask[question.what](question));
 }

@@ -20,6 +20,10 @@ const afresh = page => page.waitForFunction(() => document.querySelector('#numbe
 const below = (page, selector) => page.locator(selector).boundingBox().then(({ y, height }) => y + height);
 const tries = page => page.locator('#returns .try').count();
 
+async function onFirstScreen(page, selectors) {
+  for (const one of selectors) assert.ok(await below(page, one) <= 900, `${one} is not on the first screen`);
+}
+
 async function accessible(page, what) {
   assert.deepEqual(await violations(page), [], `axe-core: ${what}`);
 }
@@ -31,7 +35,7 @@ const steps = {
     await ready(page);
     measured.ready_ms = Math.round(await page.evaluate(() => performance.now()));
     await planned(page);
-    for (const id of ['#verdict', '#numbers', '#agreement', '#time']) assert.ok(await below(page, id) <= 900, `${id} is not on the first screen`);
+    await onFirstScreen(page, ['#lead', '#space', '#knob-hint', '#verdict', '#numbers', '#meaning', '#agreement', '#time', '#legend']);
     const trace = await tracing(page);
     const box = await page.locator('#predicted').boundingBox(), handle = await page.locator('#figure-predicted .handle.target').boundingBox();
     const at = [handle.x + 22, handle.y + 22];
@@ -40,7 +44,7 @@ const steps = {
     await page.mouse.move(at[0] - 0.05 * box.width, at[1] + 0.02 * box.height, { steps: 5 });
     await page.mouse.up();
     await planned(page);
-    assert.match(await text(page, '#agreement'), /Open loop/);
+    assert.match(await text(page, '#caption-executed'), /open loop/);
     const [predicted, executed] = await Promise.all(['#predicted-return', '#executed-return'].map(id => text(page, id)));
     assert.ok([predicted, executed].every(value => Number(value.replace('−', '-')) < 0), `${predicted} ${executed}`);
     assert.equal(await tries(page), 2);
@@ -82,6 +86,7 @@ const steps = {
     assert.match(await text(page, '#caption-predicted'), /one-step/);
     assert.equal(await page.locator('#returns rect.try').count(), 1);
     assert.equal(await page.locator('#knob-0').isDisabled(), true);
+    assert.match(await text(page, '#legend'), /this model gives one future/);
     for (const [task, model] of [['obstacle', 'lstm'], ['reach', 'tsm']]) {
       await choose('#task', task);
       await choose('#model', model);
@@ -131,6 +136,7 @@ const steps = {
     const number = async id => Number((await text(page, id)).replace('−', '-').replace(' cm', ''));
     for (let k = 0; k < 5; k++) {
       await planned(page);
+      await onFirstScreen(page, ['#guide', '#numbers', '#meaning', '#agreement', '#time', '#legend']);
       seen.push({
         title: await text(page, '#guide-title'), predicted: await number('#predicted-return'), executed: await number('#executed-return'),
         distance: await number('#distance'),
@@ -152,7 +158,7 @@ const steps = {
     await planned(page);
     measured.tour_without_replanning_cm = await number('#distance');
     assert.ok(measured.tour_without_replanning_cm > 8);
-    await page.click('#guide-next');
+    await page.click('#guide-end');
     assert.equal(await page.isVisible('#guide'), false);
     assert.deepEqual(page.errors, []);
     await page.close();
