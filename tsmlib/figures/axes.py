@@ -61,7 +61,7 @@ def reference_look(method: Method) -> Props:
 
 def spell(value: float) -> str:
     """A number as it is printed: three digits, and a power of ten where it is far from one."""
-    if value == 0 or 1e-2 <= abs(value) < 1e4:
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
         text = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
     else:
         digits, power = f"{value:.1e}".split("e")

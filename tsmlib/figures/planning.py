@@ -295,10 +295,11 @@ def final_distances(
                 ax.step(1000 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **look)
         ax.axvline(1000 * tolerance, color="#999999", lw=0.6, zorder=1)
         ax.set(title=task.capitalize(), xlabel="final distance (mm)", xlim=(0, 250), ylim=(0, 102))
-    axes[0].set_ylabel("targets reached (%)")
+    axes[0].set_ylabel("targets within that distance (%)")
     drawn = dict.fromkeys(method for part in (distances, yours) for rows in part.values() for method in rows)
     handles = [entry(method.label, color=method.look.colour) for method in drawn]
     handles += [entry(f"{way} loop", color=DARK, **looks[way]) for way in looks]
+    handles.append(entry(f"success, {1000 * tolerance:.0f} mm", color="#999999", lw=0.6))
     handles += yours_entry(*yours.values())
     legend(figure, handles, columns=2 * len(distances))
     return figure

@@ -65,8 +65,9 @@ def differences(found: pd.DataFrame, envs: Sequence[str], subject: str) -> Itera
         published, yours = table.pair(found, partial(prediction.paired_panels, subject=subject, titles=SCORES, env=env))
         if published:
             lower = [SCORES["energy_score_noise"]] if SCORES["energy_score_noise"] in published else []
-            ours = zoo.method(subject)
-            figure = figures.differences(published, "difference", ours, lower_is_better=lower, yours=yours)
+            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "nats per step")
+            xlabels |= dict.fromkeys(lower, "energy score, lower is better")
+            figure = figures.differences(published, xlabels, ours, lower_is_better=lower, yours=yours)
             yield Drawing(figure, f"03_differences_{EnvSpec.parse(env).name}", _whole(found, [env]))
 
 
@@ -155,4 +156,6 @@ def advantage_map(
     maps, yours = table.pair(found, ahead)
     if maps:
         rows = table.select(found, metric="ll_horizon", model=(subject, *rivals), execution="open loop")
-        yield Drawing(figures.advantage_map(maps, unit="nats per step", yours=yours), "06_map", rows)
+        yield Drawing(
+            figures.advantage_map(maps, zoo.method(subject), unit="nats per step", yours=yours), "06_map", rows
+        )

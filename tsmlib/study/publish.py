@@ -1,9 +1,12 @@
 """Publishing: a paper-scale run copied into data/ and figures/, and the results in README and docs/ written from it."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import nbformat
 import pandas as pd
 
 from tsmlib import figures, study
@@ -12,7 +15,7 @@ from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, EnvSpec
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import drawings, needed, zoo
+from tsmlib.study import drawings, needed, notebooks, runs, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL
@@ -26,13 +29,14 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
-from tsmlib.study.runs import ROOT, Run
+from tsmlib.study.runs import ROOT, Notebook, Run
 from tsmlib.study.tasks import load_task
 from tsmlib.study.zoo import OURS, PAPERS
 
 README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
+SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 README_MODELS = (PAPERS, OURS, "onestep", "lstm")
@@ -133,13 +137,35 @@ def _shipped(name: str) -> pd.DataFrame:
 
 
 def publish_figures() -> list[Path]:
-    """Draw again every figure of figures/ that is a function of what ships. Returns the pictures that stay as they
-    are, since they are of a run at scale paper."""
-    drawn = set()
+    """Draw again every figure of figures/ that is a function of the rows, or in a few minutes of the models, that ship.
+
+    Returns the others, which stay as they are: they are of a whole run at scale paper, or of a benchmark.
+    """
+    drawn = set[Path]()
     for figure, stem, rows in drawings_of_rows():
         figures.stamp(figure, table.stamp(rows, figure=True))
         drawn |= set(figures.save(figure, FIGURES / stem))
-    return sorted(set(FIGURES.iterdir()) - drawn)
+    with TemporaryDirectory() as folder:
+        for notebook in runs.notebooks().values():
+            for path in drawn_by_cells(notebook, Path(folder)):
+                drawn.add(FIGURES / path.name)
+                files.write_bytes(FIGURES / path.name, path.read_bytes())
+    return sorted(path for path in set(FIGURES.iterdir()) - drawn if path.suffix != ".pdf")
+
+
+def drawn_by_cells(notebook: Notebook, folder: Path) -> list[Path]:
+    """The figures of those cells of a notebook that are tagged SHIPPED, executed in ``folder`` at scale paper: nothing
+    is trained for them, since they need no model but those that ship."""
+    cut = nbformat.read(notebook.path, 4)
+    cut.cells = [cell for cell in cut.cells if {"parameters", SHIPPED} & set(cell.metadata.get("tags", ()))]
+    if not any(SHIPPED in cell.metadata["tags"] for cell in cut.cells):
+        return []
+    copy = Notebook(notebook.name, folder / notebook.path.name)
+    nbformat.write(cut, copy.path)
+    execution = notebooks.prepare(copy, scale="paper", given={"run_dir": str(folder)})
+    shutil.copytree(execution.run.shipped, execution.run.models, dirs_exist_ok=True)
+    notebooks.execute(execution)
+    return sorted(execution.run.figures.iterdir())
 
 
 def drawings_of_rows() -> Iterator[Drawing]:
