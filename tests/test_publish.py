@@ -1,4 +1,4 @@
-"""What ships is of every seed there is, and nothing ships of a run that did not come to its end; figures follow rows."""
+"""What ships is of every seed there is, and of no run that did not come to its end; figures follow rows."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def test_cells_that_run_on_what_ships_use_no_name_of_another_cell(path: Path) ->
     for cell in nbformat.read(path, 4).cells:
         if {"parameters", publish.SHIPPED} & set(cell.metadata.get("tags", ())):
             nodes = list(ast.walk(ast.parse(cell.source)))
-            known |= {(alias.asname or alias.name).partition(".")[0]
-                      for node in nodes if isinstance(node, ast.Import | ast.ImportFrom) for alias in node.names}  # fmt: skip
+            imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+            known |= {(each.asname or each.name).partition(".")[0] for node in imports for each in node.names}
             known |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
             known |= {node.arg for node in nodes if isinstance(node, ast.arg)}
             assert {node.id for node in nodes if isinstance(node, ast.Name)} <= known, cell.source

@@ -69,9 +69,12 @@ def spell(value: float) -> str:
     return text.replace("-", "−")
 
 
+STATES = {"joint0": "shoulder", "joint1": "elbow", "tip": "fingertip", "block": "object", "vel": "velocity"}
+
+
 def dimension(word: str) -> str:
-    """A state dimension in words: ``joint0_vel`` -> ``joint0 velocity``."""
-    return word.replace("_", " ").replace(" vel", " velocity")
+    """A state dimension in words: ``joint0_vel`` -> ``shoulder velocity``."""
+    return " ".join(STATES.get(part, part) for part in word.split("_"))
 
 
 def limits(points: np.ndarray, bars: np.ndarray, also: Sequence[float] = (), log: bool = False) -> tuple[float, float]:
