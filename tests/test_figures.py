@@ -159,6 +159,11 @@ def test_a_share_of_targets_reached_is_a_count() -> None:
     assert ax.lines[1].get_xdata()[0] == 30
 
 
+def test_whatever_is_drawn_beside_a_path_has_an_entry_in_the_legend() -> None:
+    texts = EVERY["plan_paths"]().legends[0].get_texts()
+    assert [text.get_text() for text in texts[2:]] == ["path to follow", "zone to keep away from"]
+
+
 def test_the_interval_of_five_values_is_the_one_in_the_tables() -> None:
     mean, half = statistics.interval(np.arange(5.0))
     assert mean == 2

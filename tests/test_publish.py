@@ -1,15 +1,22 @@
-"""What ships is of every seed there is, and nothing ships of a run that did not come to its end."""
+"""What ships is of every seed there is, and of no run that did not come to its end; figures follow rows."""
 
 from __future__ import annotations
 
+import ast
+import builtins
 from pathlib import Path
 from typing import Any
 
+import nbformat
+import pandas as pd
 import pytest
 
+from tsmlib import figures
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import publish
+from tsmlib.study import publish, runs
+from tsmlib.study.drawings import Drawing
+from tsmlib.study.results import table
 from tsmlib.study.runs import Run, RunError
 
 
@@ -47,3 +54,43 @@ def test_nothing_is_written_before_all_notebooks_have_come_to_their_end(tmp_path
     with pytest.raises(RunError, match="01_collect in .* is not run, expected complete"):
         publish.publish(seed(tmp_path, 0))
     assert publish.README.read_text() == before
+
+
+def rows_of(**seeds: list[int]) -> pd.DataFrame:
+    """Rows of the arms of some names, one for each of their training seeds."""
+    common = dict(metric="kl", value=1.0, scale="paper", n=100)
+    rows = [dict(common, env=f"tsm/{arm}", seed=k) for arm, each in seeds.items() for k in each]
+    return tables_storage.frame(rows).assign(source=table.YOURS)
+
+
+def test_a_figure_of_rows_is_drawn_again_and_what_needs_a_run_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("figure1.png", "figure1.pdf", "of_a_run.png"):
+        (tmp_path / name).write_bytes(b"old")
+    drawn = Drawing(figures.figure1(), "figure1", rows_of(**{"Reacher-v0": [0]}))
+    monkeypatch.setattr(publish, "FIGURES", tmp_path)
+    monkeypatch.setattr(publish, "drawings_of_rows", lambda: iter([drawn]))
+    monkeypatch.setattr(runs, "notebooks", dict)
+    assert publish.publish_figures() == [tmp_path / "of_a_run.png"]
+    assert (tmp_path / "of_a_run.png").read_bytes() == b"old"
+    assert b"old" not in [(tmp_path / name).read_bytes() for name in ("figure1.png", "figure1.pdf")]
+    assert drawn.figure.legends[-1].get_texts()[0].get_text() == "scale paper, seed 0, n = 100"
+
+
+def test_a_stamp_names_the_arms_of_which_there_are_fewer_seeds() -> None:
+    rows = rows_of(**{"Reacher-v0": [0, 1, 2], "ReacherPush-v1": [0]})
+    assert table.stamp(rows, figure=True) == "scale paper, seeds 0, 1, 2 (ReacherPush: 0), n = 100"
+
+
+@pytest.mark.parametrize("path", [each.path for each in runs.notebooks().values()], ids=lambda path: path.stem)
+def test_cells_that_run_on_what_ships_use_no_name_of_another_cell(path: Path) -> None:
+    known = set(dir(builtins))
+    for cell in nbformat.read(path, 4).cells:
+        if {"parameters", publish.SHIPPED} & set(cell.metadata.get("tags", ())):
+            nodes = list(ast.walk(ast.parse(cell.source)))
+            imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+            known |= {(each.asname or each.name).partition(".")[0] for node in imports for each in node.names}
+            known |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+            known |= {node.arg for node in nodes if isinstance(node, ast.arg)}
+            assert {node.id for node in nodes if isinstance(node, ast.Name)} <= known, cell.source

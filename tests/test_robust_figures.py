@@ -60,7 +60,7 @@ def episode(**changed: Any) -> Figure:
 
 
 def grid(given: Any = MAP, yours: Any = None) -> Figure:
-    return advantage_map(given, unit="nats per step", yours=yours)
+    return advantage_map(given, TSM, unit="nats per step", yours=yours)
 
 
 def lines(ax: Axes, method: Method) -> list[Any]:
@@ -202,7 +202,7 @@ def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of
     assert [text.get_text() for text in ax.get_xticklabels()] == ["against one-step", "against LSTM"]
     assert [text.get_text() for text in ax.get_yticklabels()] == list(MAP)
     assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
-    assert bar.get_ylabel() == "ahead by (nats per step)"
+    assert bar.get_ylabel() == "TSM ahead by\n(nats per step)"
 
 
 def test_every_cell_says_its_number_and_yours_in_brackets() -> None:

@@ -65,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     publish = commands.add_parser("publish", help="copy a paper-scale run into data/, figures/ and README")
     publish.add_argument("--seed", default="0")
     publish.add_argument("--claims", action="store_true", help="only judge the claims again, from the tables that ship")
+    publish.add_argument("--figures", action="store_true", help="only draw the figures again of what ships")
     publish.add_argument("--table", default="", help="only the table of this notebook, for example your_own")
     words = list(sys.argv[1:] if argv is None else argv)
     end = words.index("--") if "--" in words else len(words)
@@ -84,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             case "bench":
                 return _bench(arguments.name)
             case "publish":
-                return _publish(arguments.seed, claims=arguments.claims, table=arguments.table)
+                return _publish(arguments.seed, claims=arguments.claims, again=arguments.figures, table=arguments.table)
             case "step":
                 return _step(arguments)
             case _:
@@ -199,12 +200,16 @@ def _verify(path: Path) -> int:
     return 0
 
 
-def _publish(seed: str, *, claims: bool, table: str) -> int:
+def _publish(seed: str, *, claims: bool, again: bool, table: str) -> int:
     from tsmlib.study import publish
 
     _require_checkout("publish")
     if claims:
         publish.publish_claims()
+        return 0
+    if again:
+        left = ", ".join(path.name for path in publish.publish_figures())
+        print(f"as they were, since they need a run at scale paper, or a benchmark: {left}")
         return 0
     run = runs.resolve("publish", scale="paper", seed=parameters.convert("seed", seed))  # type: ignore[arg-type]
     if table:

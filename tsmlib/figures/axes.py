@@ -61,7 +61,7 @@ def reference_look(method: Method) -> Props:
 
 def spell(value: float) -> str:
     """A number as it is printed: three digits, and a power of ten where it is far from one."""
-    if value == 0 or 1e-2 <= abs(value) < 1e4:
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
         text = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
     else:
         digits, power = f"{value:.1e}".split("e")
@@ -69,9 +69,12 @@ def spell(value: float) -> str:
     return text.replace("-", "−")
 
 
+STATES = {"joint0": "shoulder", "joint1": "elbow", "tip": "fingertip", "block": "object", "vel": "velocity"}
+
+
 def dimension(word: str) -> str:
-    """A state dimension in words: ``joint0_vel`` -> ``joint0 velocity``."""
-    return word.replace("_", " ").replace(" vel", " velocity")
+    """A state dimension in words: ``joint0_vel`` -> ``shoulder velocity``."""
+    return " ".join(STATES.get(part, part) for part in word.split("_"))
 
 
 def limits(points: np.ndarray, bars: np.ndarray, also: Sequence[float] = (), log: bool = False) -> tuple[float, float]:

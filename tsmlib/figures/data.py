@@ -82,7 +82,7 @@ def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
     if reach:
         ax.add_patch(Circle((0, 0), reach, fill=False, ec=DARK, lw=0.7, ls="--"))
     ax.plot(0, 0, "+", color="black", ms=5, mew=0.8)
-    ax.set(xlabel="tip x (m)", ylabel="tip y (m)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
+    ax.set(xlabel="fingertip x (m)", ylabel="fingertip y (m)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
     bar = figure.colorbar(bins, ax=ax, label="states per cell", shrink=0.8, aspect=25)
     bar.outline.set_visible(False)
     return figure

@@ -295,10 +295,11 @@ def final_distances(
                 ax.step(1000 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **look)
         ax.axvline(1000 * tolerance, color="#999999", lw=0.6, zorder=1)
         ax.set(title=task.capitalize(), xlabel="final distance (mm)", xlim=(0, 250), ylim=(0, 102))
-    axes[0].set_ylabel("targets reached (%)")
+    axes[0].set_ylabel("targets within that distance (%)")
     drawn = dict.fromkeys(method for part in (distances, yours) for rows in part.values() for method in rows)
     handles = [entry(method.label, color=method.look.colour) for method in drawn]
     handles += [entry(f"{way} loop", color=DARK, **looks[way]) for way in looks]
+    handles.append(entry(f"success, {1000 * tolerance:.0f} mm", color="#999999", lw=0.6))
     handles += yours_entry(*yours.values())
     legend(figure, handles, columns=2 * len(distances))
     return figure
@@ -323,7 +324,7 @@ def plan_paths(
     if len(predicted) != len(executed):
         raise ValueError(f"predicted holds {len(predicted)} paths and executed {len(executed)}, expected equally many")
     n, columns = len(executed), min(4, len(executed))
-    figure, axes = panels(n, columns, 1.8, width=1.7 * columns + 0.5, sharex=True, sharey=True)
+    figure, axes = panels(n, columns, 1.8, width=1.7 * columns + 0.5, head=0.65, sharex=True, sharey=True)
     looks: tuple[Props, Props] = ({"color": method.look.colour, "lw": 0.9, "ls": style.DASHED},
                                   {"color": DARK, "lw": 1.1, "marker": "o", "ms": 3, "markevery": [0]})  # fmt: skip
     goal: Props = {"color": style.PALE, "lw": 3, "solid_capstyle": "round"}
@@ -342,7 +343,14 @@ def plan_paths(
         ax.set(aspect="equal", xlabel="x (m)")
         ax.locator_params(nbins=4)
     axes[0].set_ylabel("y (m)")
-    legend(figure, [entry(f"predicted rollout, {method.label}", **looks[0]), entry("executed plan", **looks[1])])
+    handles = [entry(f"predicted rollout, {method.label}", **looks[0]), entry("executed plan", **looks[1])]
+    if wanted is not None:
+        handles.append(entry("path to follow" if wanted.shape[1] > 1 else "target", **goal))
+    if zone is not None:
+        handles.append(entry("zone to keep away from", color=tint(style.RED, 0.25), ls="", marker="o", ms=6, mew=0))
+    if reach is not None:
+        handles.append(entry("reach of the arm", color=style.PALE, lw=0.6))
+    legend(figure, handles, columns=2)
     return figure
 
 

@@ -94,7 +94,8 @@ def _draw(
     for row in grid:
         row[0].set_ylabel("executed return")
     every = [row for part in (checked, own) for rows in part.values() for row in rows.values()]
-    used = dict.fromkeys(method for own in levels.values() for method in own)
+    lowest = {task: column[0].get_ylim()[0] for column, task in zip(grid.T, checked, strict=True)}
+    used = dict.fromkeys(method for task, own in levels.items() for method in own if own[method] >= lowest[task])
     handles = axes.entries(look_of)
     handles += [entry(method.look.name, **axes.reference_look(method)) for method in used]
     if "iterations" in against and any({"return_predicted", "iterations"} <= row.keys() for row in every):

@@ -93,11 +93,12 @@ def filtering_errors(
 @styled
 def advantage_map(
     differences: Mapping[str, Mapping[Method, float]],
+    subject: Method,
     *,
     unit: str,
     yours: Mapping[str, Mapping[Method, float]] | None = None,
 ) -> Figure:
-    """Advantage of a model over its rivals where something is hidden and where nothing is: a line each.
+    """Advantage of ``subject`` over its rivals where something is hidden and where nothing is: a line each.
 
     differences: place -> rival -> how far the model is ahead, in ``unit``; above zero it is. yours: the same, in
     brackets. Places without numbers are left out by whoever gives them.
@@ -125,5 +126,5 @@ def advantage_map(
     ax.spines[:].set_visible(False)
     ax.tick_params(length=0, labelsize=7)
     ax.set_xlabel("in brackets: yours" if yours else "")
-    figure.colorbar(image, ax=ax, label=f"ahead by ({unit})", shrink=0.9)
+    figure.colorbar(image, ax=ax, label=f"{subject.label} ahead by\n({unit})", shrink=0.9)
     return figure

@@ -1,20 +1,25 @@
 """Publishing: a paper-scale run copied into data/ and figures/, and the results in README and docs/ written from it."""
 
+import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import nbformat
 import pandas as pd
 
-from tsmlib import study
+from tsmlib import figures, study
 from tsmlib.envs import imperfect
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
+from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, EnvSpec
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import zoo
+from tsmlib.study import drawings, needed, notebooks, runs, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL
+from tsmlib.study.drawings import Drawing
 from tsmlib.study.notebooks import require
 from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import exploration as exploration_results
@@ -24,12 +29,15 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
-from tsmlib.study.runs import ROOT, Run
+from tsmlib.study.runs import ROOT, Notebook, Run
+from tsmlib.study.tasks import load_task
 from tsmlib.study.zoo import OURS, PAPERS
 
-README = ROOT / "README.md"
+README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
+SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
+ASKED = {"04_latent": {"env": f"tsm/ReacherObstacle-v0,{PUSH}"}}  # parameters for these cells; without the plain arm
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 README_MODELS = (PAPERS, OURS, "onestep", "lstm")
@@ -57,7 +65,7 @@ def publish(run: Run) -> None:
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
         (run.metrics, "*.csv", RESULTS),
-        (run.figures, "*.*", ROOT / "figures"),
+        (run.figures, "*.*", FIGURES),
     ):
         for path in sorted(source.glob(pattern)):
             if _ships(path):
@@ -131,6 +139,67 @@ def _shipped(name: str) -> pd.DataFrame:
     """A table that ships; without rows where there is none."""
     path = RESULTS / f"{name}.csv"
     return tables_storage.load(path) if path.exists() else tables_storage.frame([])
+
+
+# Figures -------------------------------------------------------------------------------------------------------------
+
+
+def publish_figures() -> list[Path]:
+    """Draw again every figure of figures/ that is a function of the rows, or in a few minutes of the models, that ship.
+
+    Returns the others, which stay as they are: they are of a whole run at scale paper, or of a benchmark.
+    """
+    drawn = set[Path]()
+    for figure, stem, rows in drawings_of_rows():
+        figures.stamp(figure, table.stamp(rows, figure=True))
+        drawn |= set(figures.save(figure, FIGURES / stem))
+    with TemporaryDirectory() as folder:
+        for notebook in runs.notebooks().values():
+            for path in drawn_by_cells(notebook, Path(folder)):
+                drawn.add(FIGURES / path.name)
+                files.write_bytes(FIGURES / path.name, path.read_bytes())
+    return sorted(path for path in set(FIGURES.iterdir()) - drawn if path.suffix != ".pdf")
+
+
+def drawn_by_cells(notebook: Notebook, folder: Path) -> list[Path]:
+    """The figures of those cells of a notebook that are tagged SHIPPED, executed in ``folder`` at scale paper: nothing
+    is trained for them, since they need no model but those that ship."""
+    cut = nbformat.read(notebook.path, 4)
+    cut.cells = [cell for cell in cut.cells if {"parameters", SHIPPED} & set(cell.metadata.get("tags", ()))]
+    if not any(SHIPPED in cell.metadata["tags"] for cell in cut.cells):
+        return []
+    copy = Notebook(notebook.name, folder / notebook.path.name)
+    nbformat.write(cut, copy.path)
+    given = {"run_dir": str(folder)} | ASKED.get(notebook.path.stem, {})
+    execution = notebooks.prepare(copy, scale="paper", given=given)
+    shutil.copytree(execution.run.shipped, execution.run.models, dirs_exist_ok=True)
+    notebooks.execute(execution)
+    return sorted(execution.run.figures.iterdir())
+
+
+def drawings_of_rows() -> Iterator[Drawing]:
+    """Every figure of the tables in data/results, as the run at scale paper draws it whose rows they are."""
+    predict, codes, control, by_target, imperfect = (
+        _shipped(name).assign(source=table.YOURS)
+        for name in ("03_predict", "04_latent", "05_control", "05_control_rows", "06_robustness")
+    )
+    tasks = [load_task(env) for env in (REACH, PUSH)]
+    yield drawings.figure5(predict, MUJOCO_IDS)
+    yield from drawings.horizon(predict, MUJOCO_IDS)
+    yield from drawings.differences(predict, MUJOCO_IDS, OURS)
+    yield drawings.calibration(predict, MUJOCO_IDS)
+    yield drawings.code_use(codes, [env for env in MUJOCO_IDS if env in set(codes["env"])])
+    yield drawings.figure6(control, by_target, tasks)
+    yield drawings.predicted_and_executed(control, by_target, tasks)
+    yield drawings.closed_loop(control, by_target, tasks[-1])
+    free = policies_results.finished(_shipped("model_free")).assign(source=table.YOURS)
+    yield drawings.figure7(tables_storage.frame(pd.concat([control, free])), control)
+    asked = needed.robustness(Run("06_robustness", "paper", 0, ROOT))
+    words = [word for word in zoo.words("dynamics", "ablation") if word in set(imperfect["model"])]
+    yield drawings.filtering(imperfect, asked.worlds["noise"], words)
+    yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
+    subject = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
+    yield from drawings.advantage_map(imperfect, subject, asked.rivals, asked.noises, asked.delays)
 
 
 # README --------------------------------------------------------------------------------------------------------------

@@ -195,7 +195,7 @@ _MODELS = (
         "ablation",
     ),
     ModelSpec(  # the same with the state skip, and more teacher forcing
-        "tsm+energy+direct", Look("TSM + energy + skip", "#4F7FBF", "8"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
+        "tsm+energy+direct", Look("TSM + energy + skip", "#4F7FBF", ">"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
         _skip, "ablation",
     ),
     ModelSpec(

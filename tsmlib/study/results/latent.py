@@ -171,7 +171,8 @@ def use_panels(found: pd.DataFrame, envs: Sequence[str]) -> dict[str, dict[str, 
         for words, kl, spread in parts if spec.has_block else (("", "", ""),):
             title = spec.name + words
             for panel, metric, subset in zip(panels.values(), ("kl", "spread"), (kl, spread), strict=True):
-                panel[title] = table.methods(values(found, metric, env=env, execution="segments", subset=subset))
+                if seeds := values(found, metric, env=env, execution="segments", subset=subset):
+                    panel[title] = table.methods(seeds)
     return panels
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, cast
 
@@ -179,7 +179,13 @@ def return_panels(
 ) -> dict[str, Any]:
     """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
     every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
-    return {task: {m: rows[m] for m in methods or rows if m in rows} for task, rows in every.items()}
+    return {task: {m: rows[m] for m in methods or _ordered(rows) if m in rows} for task, rows in every.items()}
+
+
+def _ordered(rows: Iterable[Method]) -> list[Method]:
+    """Methods in the order of the zoo's models."""
+    order = [*zoo.ZOO, *zoo.LOOKS]
+    return sorted(rows, key=lambda method: order.index(method.model))
 
 
 def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, Any]:

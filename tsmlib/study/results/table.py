@@ -189,8 +189,7 @@ def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
     if figure and beside(found).empty:  # at scale paper it is what will be published
         known |= set(found["env"])
     if missing := [env for env in found["env"].unique() if env and env not in known]:
-        names = ", ".join(EnvSpec.parse(env).name if env.startswith("tsm/") else env for env in missing)
-        said.append(f"of {names} nothing is published")
+        said.append(f"of {', '.join(map(_env_name, missing))} nothing is published")
     return "; ".join(said)
 
 
@@ -199,9 +198,16 @@ def _origin(part: pd.DataFrame) -> str:
     if "target" in part and part["target"].notna().all():  # rows of single targets
         counts = [part["target"].nunique()]
     words = [f"scale {', '.join(part['scale'].unique())}"]
-    words += [f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"] * bool(seeds)
+    of_env = {env: sorted(set(own["seed"].dropna())) for env, own in groups(part, "env")}
+    fewer = [f"{_env_name(env)}: {', '.join(map(str, own))}" for env, own in of_env.items() if own and own != seeds]
+    more = f" ({'; '.join(fewer)})" * bool(fewer)
+    words += [f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}{more}"] * bool(seeds)
     words += [f"n {'up to' if len(counts) > 1 else '='} {counts[-1]:,}"] * bool(counts)
     return ", ".join(words)
+
+
+def _env_name(env: str) -> str:
+    return EnvSpec.parse(env).name if env.startswith("tsm/") else env
 
 
 def sourced(make: Callable[Concatenate[pd.DataFrame, P], pd.DataFrame]) -> Callable[Concatenate[pd.DataFrame, P], str]:

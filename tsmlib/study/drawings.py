@@ -1,0 +1,161 @@
+"""Figures of results tables, drawn alike by the notebooks and, from the tables that ship, by ``publish --figures``.
+
+found: the rows of a notebook's table, with the column ``source`` (``study.evidence``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from tsmlib import figures
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation import scoring
+from tsmlib.figures.method import Method
+from tsmlib.planning.execution import execute
+from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.study import zoo
+from tsmlib.study.results import latent, planning, policies, prediction, robustness, table
+
+SCORES = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance", "energy_score_noise": "energy score"}
+FEW = (zoo.PAPERS, zoo.OURS, "onestep", "lstm", "ensemble+mse")  # models whose scores are drawn step by step
+
+
+class Drawing(NamedTuple):
+    """A figure, what its files are called, and the rows that it draws, for its stamp."""
+
+    figure: Figure
+    stem: str
+    rows: pd.DataFrame
+
+
+# 03_predict ----------------------------------------------------------------------------------------------------------
+
+
+def _whole(found: pd.DataFrame, envs: Sequence[str]) -> pd.DataFrame:
+    return table.select(found, execution="open loop", subset="", env=envs)
+
+
+def figure5(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
+    """Log-likelihoods of all models, by environment."""
+    titles = {metric: title for metric, title in SCORES.items() if metric.startswith("ll_")}
+    published, yours = table.pair(found, partial(prediction.score_panels, titles=titles, envs=envs))
+    return Drawing(figures.figure5(published, yours=yours), "figure5", _whole(found, envs))
+
+
+def horizon(found: pd.DataFrame, envs: Sequence[str]) -> Iterator[Drawing]:
+    """Three scores of the models FEW at every step ahead."""
+    titles = {"ll_paper": "log-likelihood", "energy_score_noise": "energy score", "nrmse": "error"}
+    few = table.select(_whole(found, envs), model=FEW)
+    published, yours = table.pair(few, partial(prediction.horizon_panels, titles=titles, envs=envs))
+    ylabels = {title: title.partition(": ")[2].replace("error", "error / data's s.d.") for title in published}
+    log = [title for title in published if not title.endswith("likelihood")]
+    if published:
+        figure = figures.against_horizon(published, ylabels, log=log, columns=len(titles), yours=yours)
+        yield Drawing(figure, "03_horizon", few)
+
+
+def differences(found: pd.DataFrame, envs: Sequence[str], subject: str) -> Iterator[Drawing]:
+    """``subject`` minus each other model, paired by seed, a figure for each environment with another model."""
+    for env in envs:
+        published, yours = table.pair(found, partial(prediction.paired_panels, subject=subject, titles=SCORES, env=env))
+        if published:
+            lower = [SCORES["energy_score_noise"]] if SCORES["energy_score_noise"] in published else []
+            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "nats per step")
+            xlabels |= dict.fromkeys(lower, "energy score, lower is better")
+            figure = figures.differences(published, xlabels, ours, lower_is_better=lower, yours=yours)
+            yield Drawing(figure, f"03_differences_{EnvSpec.parse(env).name}", _whole(found, [env]))
+
+
+def calibration(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
+    """Observed coverage of central intervals, over all steps and after contact."""
+    published, yours = table.pair(found, partial(prediction.calibration_panels, envs=envs))
+    figure = figures.calibration(scoring.LEVELS.numpy(), published, yours=yours)
+    return Drawing(figure, "03_calibration", _whole(found, envs))
+
+
+# 04_latent -----------------------------------------------------------------------------------------------------------
+
+
+def code_use(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
+    """KL of the codes and spread of samples, of single segments."""
+    units = {"KL per segment": "nats", "spread of samples": "share of the data's deviation"}
+    thresholds = {"KL per segment": {"Reacher": 0.1}, "spread of samples": {"Reacher": 0.01}}
+    rows = table.select(found, env=envs, execution="segments", metric=("kl", "spread"))
+    published, yours = table.pair(rows, partial(latent.use_panels, envs=envs))
+    return Drawing(figures.code_use(published, units, thresholds, yours=yours), "04_use", rows)
+
+
+# 05_control ----------------------------------------------------------------------------------------------------------
+
+
+def figure6(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
+    """Costs and gaps of open-loop plans. by_target: rows with a ``target``."""
+    published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks))
+    return Drawing(figures.figure6(published, yours), "figure6", planning.chosen(found))
+
+
+def predicted_and_executed(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
+    """Returns of single targets, of the best method and of direct plans. by_target: rows with a ``target``."""
+    some = [zoo.method(zoo.OURS, "latent", "cem"), *zoo.methods((zoo.PAPERS, "lstm", "onestep"), "cem", ["direct"])]
+    published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks, methods=some))
+    figure = figures.predicted_vs_true(published, yours)
+    return Drawing(figure, "05_predicted_and_executed", planning.chosen(found))
+
+
+def closed_loop(found: pd.DataFrame, by_target: pd.DataFrame, task: Task) -> Drawing:
+    """Final distances open loop and closed loop. by_target: rows with a ``target``."""
+    published, yours = table.pair(by_target, partial(planning.distance_panels, task=task))
+    figure = figures.final_distances(published, task.tolerance, yours)
+    return Drawing(figure, "05_closed_loop", table.select(found, execution=planning.CLOSED))
+
+
+def figure7(learned: pd.DataFrame, found: pd.DataFrame) -> Drawing:
+    """Learning curves of policies. learned: their rows and those of model_free.csv; found: with those of plans."""
+    curves, yours = table.pair(learned, policies.learning_curves)
+    references = policies.references(planning.chosen(table.drawn(found)))
+    references = {task: levels for task, levels in references.items() if task in curves}
+    figure = figures.figure7(curves, references, yours=yours)
+    return Drawing(figure, "figure7", table.select(learned, execution="policy"))
+
+
+# 06_robustness -------------------------------------------------------------------------------------------------------
+
+
+def filtering(found: pd.DataFrame, env: str, words: Sequence[str]) -> Drawing:
+    """Errors to the clean state of models and filters behind noisy sensors."""
+    panels = robustness.filtering_panels(table.drawn(found), env, words)
+    yours = robustness.own_errors(table.beside(found), env, words)
+    rows = prediction.select(found, "rmse_clean", env=env, execution="segments", model=(*words, "filter"))
+    return Drawing(figures.filtering_errors(*panels, yours=yours), "06_filtering", rows)
+
+
+def floors(task: Task) -> dict[Method, float]:
+    """Mean executed returns of random and of zero torques."""
+    torques = {"random": random_torques(task), "zero": zero_torques(task)}
+    return {zoo.method(word): float(execute(task, each).executed_return.mean()) for word, each in torques.items()}
+
+
+def figure8(found: pd.DataFrame, floor: Mapping[Method, float]) -> Iterator[Drawing]:
+    """Learning curves of policies with noise and delay. floor: returns of random and zero torques."""
+    curves, yours = table.pair(found, robustness.learning_curves)
+    if curves:  # policies are learned in the models of seed 0
+        rows = table.select(found, execution="policy", metric="return_true")
+        yield Drawing(figures.figure8(curves, floor, yours), "figure8", rows)
+
+
+def advantage_map(
+    found: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
+) -> Iterator[Drawing]:
+    """``subject`` minus each rival, by noise and delay."""
+    ahead = partial(robustness.advantage, subject=subject, rivals=rivals, noises=noises, delays=delays)
+    maps, yours = table.pair(found, ahead)
+    if maps:
+        rows = table.select(found, metric="ll_horizon", model=(subject, *rivals), execution="open loop")
+        yield Drawing(
+            figures.advantage_map(maps, zoo.method(subject), unit="nats per step", yours=yours), "06_map", rows
+        )
