@@ -237,7 +237,7 @@ function show() {
   $('space').value = scene.space;
   $('replan').checked = scene.replan;
   $('plan').disabled = planning || state.failed;
-  $('plan').textContent = done ? 'Other random numbers' : 'Plan';
+  $('plan').textContent = done ? 'Plan with new random numbers' : 'Plan';
   $('plan').title = done ? 'Plan the same scene again: the planner draws its candidates with other random numbers' : '';
   $('views').dataset.view = state.view;
   for (const button of document.querySelectorAll('[data-set-view]')) button.setAttribute('aria-pressed', String(button.dataset.setView === state.view));
@@ -272,7 +272,7 @@ function show() {
   const knobs = model.knobs, usable = knobs.length > 0 && done && !scene.replan;
   $('knobs').disabled = !usable;
   [0, 1].forEach(k => {
-    $(`knob-name-${k}`).innerHTML = `<var>z</var><sub>${knobs.length ? knobs[k] + 1 : k + 1}</sub>`;
+    $(`knob-name-${k}`).innerHTML = `<var>z</var><sub>${knobs.length ? knobs[k] + 1 : ''}</sub>`;
     $(`knob-value-${k}`).textContent = signed(Number($(`knob-${k}`).value), 1);
   });
   $('knob-hint').textContent = knobs.length ? turned() : `The ${MODELS[scene.model]} has no code: it predicts one future.`;
@@ -283,7 +283,7 @@ function show() {
 /** What is drawn, in words. */
 function legend() {
   const { scene } = state, what = { push: ' Brown: the object.', obstacle: ' Grey disc: the obstacle.', reach: '' }[scene.task];
-  const fan = look(scene.model).knobs.length ? `Thin lines: 32 futures of the ${mover(scene.task)}, each with a random code Z.` : 'No thin lines: this model gives one future.';
+  const fan = look(scene.model).knobs.length ? `Thick line: Z = 0, by which the plan was chosen. Thin: 32 futures of the ${mover(scene.task)}, each with a random Z.` : 'No thin lines: this model gives one future.';
   return `Red ring: the target.${what} Pale and dashed: the start. ${fan}${scene.replan ? ' Dots: where it planned again; faint lines: what those plans predicted.' : ''}`;
 }
 
@@ -291,7 +291,7 @@ function legend() {
 function turned() {
   const { scene } = state, many = look(scene.model).decoders.length > 1;
   if (scene.replan) return 'For a plan that is made once: untick “Plan again every ten steps”.';
-  return `Another Z, another future of the same torques, in purple${many ? ' (by the first of three networks)' : ''}. These are two of its eight numbers; the planner does not search them.`;
+  return `Another Z, another future of the same torques, in purple${many ? ' (by the first of the model’s three networks)' : ''}. These are two of its eight numbers; the planner does not search them.`;
 }
 
 function verdict() {

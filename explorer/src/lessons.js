@@ -63,13 +63,13 @@ export const TOUR = [
   {
     title: 'A fooled one-step model',
     link: '#task=push&model=onestep&space=direct&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'The first scene again, with a model that predicts one state at a time (it has no code Z, so no thin lines), and a planner free to '
-      + 'choose any torques. It found a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
+    text: 'The first scene again, with two changes: a model that predicts one state at a time (it has no code Z, so no thin lines), and a '
+      + 'planner free to choose any torques. It found a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
   },
   {
     title: 'What the prior forbids',
     link: '#task=push&model=onestep&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
-    text: 'Same start, same one-step model, but the planner searches codes c, which the action prior turns into torques like those of the '
+    text: 'One of the two changes taken back: the same one-step model, but the planner searches codes c, which the action prior turns into torques like those of the '
       + 'training data. Others, such as those that fooled the model, are out of its reach: the gap is much smaller, and the object arrives.',
   },
   {
