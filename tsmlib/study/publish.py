@@ -230,9 +230,8 @@ def readme_results() -> str:
 
 *Published rows of `{env}`; means over training seeds (of predicting / of planning), half the 95 % t interval; -: no
 rows yet. Predicting: {episodes:,} test episodes, 90 steps open loop; error as a share of the data's deviation (nRMSE);
-the energy score judges 32 samples (the order by likelihood turns with its protocol). Planning: {targets} targets, CEM
-over codes; the share is 1 for plans through the true simulator, 0 for doing nothing; the gap is the mean size of
-predicted minus executed return.*
+energy score of 32 samples (the order by likelihood turns with its protocol). Planning: {targets} targets, CEM over codes;
+share: 1 for plans through the simulator, 0 for doing nothing; gap: mean size of predicted minus executed return.*
 {readme_costs(env)}"""
 
 
