@@ -230,7 +230,7 @@ def readme_results() -> str:
 
 *Published rows of `{env}`; means over training seeds (of predicting / of planning), half the 95 % t interval; -: no
 rows yet. Predicting: {episodes:,} test episodes, 90 steps open loop; error as a share of the data's deviation (nRMSE);
-energy score of 32 samples (the order by likelihood turns with its protocol). Planning: {targets} targets, CEM over codes;
+energy score of 32 samples (the order by likelihood turns with its protocol). Planning: {targets} targets, CEM, codes;
 share: 1 for plans through the simulator, 0 for doing nothing; gap: mean size of predicted minus executed return.*
 {readme_costs(env)}"""
 
@@ -338,7 +338,8 @@ over steps.
 ## Pushing, target by target
 
 The cross-entropy method over codes; the cost of `{OURS}` and its size of the gap minus those of each other method on
-the same targets, with half the 95 % t interval over targets, of one training seed:
+the same targets, means over the training seeds above; half the 95 % t interval is over targets, and says nothing of
+other training seeds:
 
 {table.markdown(planning_results.paired_table(by_target, PUSH, OURS))}
 
