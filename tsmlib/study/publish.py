@@ -241,18 +241,24 @@ def readme_costs(env: str) -> str:
     costs = planning_results.paired_table(rows, env, OURS)
     named = [line for line in costs.to_dict("records") if line["method"] != zoo.method("random")]
     said = ", ".join(f"{line['method'].look.name} {line['cost (m)']}" for line in named)
-    seeds = ", ".join(str(seed) for seed in sorted(planning_results.chosen(rows, env=env)["seed"].unique()))
+    seeds = _seeds(planning_results.chosen(rows, env=env))
     targets = costs["n"].max()
     closed = planning_results.chosen(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
     again, hits = (table.values(table.select(closed, metric=metric)) for metric in ("return_true", "success"))
     loops = ", ".join(f"`{model}` {-found.mean():.2f} ({hits[model].mean():.0%})" for model, found in again.items())
     return (
-        f"Costs (m, {targets} targets, seed {seeds}): {said}; planned again every ten steps (within 5 cm): {loops}. "
+        f"Costs (m, {targets} targets, {seeds}): {said}; planned again every ten steps (within 5 cm): {loops}. "
         f"For pushing `{OURS}` has three decoders, each trained as long as a baseline; on 50 validation targets one is "
         "level with the LSTM, and two LSTMs, or three baselines, judging together "
         "[plan as well](benchmarks/settings/README.md). "
         "[Target by target](docs/results.md#pushing-target-by-target)."
     )
+
+
+def _seeds(rows: pd.DataFrame) -> str:
+    """Seeds of rows in words: seed 0, or seeds 0, 1."""
+    found = [str(seed) for seed in sorted(rows["seed"].dropna().unique())]
+    return f"seed{'s' * (len(found) > 1)} {', '.join(found)}"
 
 
 def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
@@ -309,7 +315,7 @@ def results_page() -> str:
         + prediction_results.scores_table(predict, METRICS, env=env)
         for env, n in seeds.items()
     )
-    planned = ", ".join(str(seed) for seed in sorted(control["seed"].dropna().unique()))
+    planned = _seeds(control)
     pages = robots_page(_shipped("09_your_own")), exploration_page(_shipped("10_explore"))
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
@@ -329,7 +335,7 @@ other models by Adam. `pets` is the same kind of model as `ensemble`, by mbrl-li
 
 ## Planning
 
-Training seed {planned}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
+Training {planned}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
 over steps.
 
