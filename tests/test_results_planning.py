@@ -132,6 +132,23 @@ def test_how_soon_a_plan_was_nearly_done_is_counted_target_by_target() -> None:
     assert cells(planning_results.convergence_table(tables.frame(rows)))[1][2:] == ["3", "60", "66.7%", "66.7%"]
 
 
+def test_the_size_of_a_gap_is_that_of_each_seed_before_seeds_are_averaged() -> None:
+    given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", execution="open loop")
+    predicted = {0: 3.0, 1: -1.0}  # of 1: two too much, and two too little
+    rows = [dict(given, metric="return_true", target=i, seed=seed, value=1.0) for seed in predicted for i in range(3)]
+    rows += [dict(given, metric="return_predicted", target=i, seed=seed, value=value)
+             for seed, value in predicted.items() for i in range(3)]  # fmt: skip
+    np.testing.assert_array_equal(planning_results.gap_sizes(tables.frame(rows))[TSM], [2.0, 2.0, 2.0])
+
+
+def test_distances_that_are_drawn_are_those_of_every_seed() -> None:
+    given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", metric="final_distance")
+    rows = [dict(given, execution=way, target=i, seed=seed, value=i + seed)
+            for way in ("open loop", "closed loop") for seed in (0, 10) for i in range(2)]  # fmt: skip
+    drawn = planning_results.final_distances(tables.frame(rows), "tsm/Reacher-v0")[TSM]
+    assert sorted(drawn["closed"]) == sorted(drawn["open"]) == [0, 1, 10, 11]
+
+
 def test_seeds_are_averaged_target_by_target() -> None:
     given = dict(model="tsm", search_space="latent", planner="cem", metric="return_true")
     rows = [dict(given, target=i, seed=seed, value=i + seed) for seed in (0, 2) for i in range(3)]
@@ -204,7 +221,7 @@ def test_tables_keep_models_planners_and_loops_apart() -> None:
 
 def test_what_the_prior_changes_is_paired_by_target() -> None:
     hard = np.random.default_rng(0).normal(size=50)  # targets differ much, the two methods little
-    given = dict(env=PUSH, model="tsm", planner="cem", execution=planning_results.OPEN)
+    given = dict(env=PUSH, model="tsm", planner="cem", execution=planning_results.OPEN, seed=0)
     rows = [
         dict(given, search_space=space, metric=metric, target=i, value=value)
         for space, more in (("latent", 0.1), ("direct", 0.0))

@@ -169,8 +169,14 @@ def returns(
 
 
 def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.ndarray]]:
-    """What ``figures.final_distances`` draws of one task, from rows with a ``target``: open beside closed loop."""
-    opened, closed = (by_target(chosen(found, env=env, execution=way), "final_distance") for way in (OPEN, CLOSED))
+    """What ``figures.final_distances`` draws of one task, from rows with a ``target``: open beside closed loop, the
+    targets of every seed."""
+    opened, closed = (
+        {method: part["value"].to_numpy() for method, part in table.groups(table.with_method(own), "method")}
+        for own in (
+            table.select(chosen(found, env=env, execution=way), metric="final_distance") for way in (OPEN, CLOSED)
+        )
+    )
     return {method: {"open": opened[method], "closed": distances} for method, distances in closed.items()}
 
 
@@ -275,15 +281,17 @@ def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
     """What the action prior changes, in Markdown: latent minus direct, paired by target, with half the 95 % t interval.
     found: rows with a ``target``."""
     own = table.select(chosen(found), metric=["return_true", "return_predicted"], search_space=["latent", "direct"])
-    wide = own.pivot_table("value", ["env", "model", "planner", "target"], ["search_space", "metric"], sort=False)
+    by = ["env", "model", "planner", "seed", "target"]
+    wide = own.pivot_table("value", by, ["search_space", "metric"], sort=False)
     lines = []
     for (env, model, planner), part in table.groups(wide.dropna(), ["env", "model", "planner"]):
         latent, direct = part["latent"], part["direct"]
         gaps = [(space["return_predicted"] - space["return_true"]).abs() for space in (latent, direct)]
         cells = {"executed return (m)": latent["return_true"] - direct["return_true"],
                  "size of the gap (m)": gaps[0] - gaps[1]}  # fmt: skip
-        line = {"env": env, "method": zoo.method(model, "", planner), "n": len(part)}
-        lines.append(line | {title: table.spell(values, "{:+.3f} ± {:.3f}") for title, values in cells.items()})
+        over_seeds = {title: values.groupby("target").mean() for title, values in cells.items()}
+        line = {"env": env, "method": zoo.method(model, "", planner), "n": len(over_seeds["size of the gap (m)"])}
+        lines.append(line | {title: table.spell(values, "{:+.3f} ± {:.3f}") for title, values in over_seeds.items()})
     return pd.DataFrame(lines)
 
 
@@ -291,28 +299,30 @@ def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str 
     """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
     subject's cost and size of the gap minus theirs with half the 95 % t interval over targets. Closed loop, the gap is
     that of the first plan. found: rows with a ``target``."""
-    planned = returns(found, env, execution=execution)
-    every = {method: rows for method, rows in planned.items() if method.search_space != "direct"}
-    ours = next((rows for method, rows in every.items() if method.model == subject), None)
+    planned = chosen(found, env=env, execution=execution, planners=["cem"])
+    costs = {way: -true for way, true in by_target(planned, "return_true").items() if way.search_space != "direct"}
+    gaps, ours = gap_sizes(planned), next((way for way in costs if way.model == subject), None)
     lines = []
-    for method, rows in sorted(every.items(), key=lambda each: _cost(each[1]).mean()):
-        line = {"method": method, "cost (m)": f"{_cost(rows).mean():.2f}"}
-        if ours is not None and rows is not ours:
-            line[f"cost of {subject} minus this"] = table.spell(_cost(ours) - _cost(rows), "{:+.2f} ± {:.2f}")
-            if rows["predicted"] is not None:
-                line[f"size of the gap of {subject} minus this"] = table.spell(
-                    _gap(ours) - _gap(rows), "{:+.2f} ± {:.2f}"
-                )
-        lines.append(line | {"n": len(_cost(rows))})
+    for method, cost in sorted(costs.items(), key=lambda each: each[1].mean()):
+        line = {"method": method, "cost (m)": f"{cost.mean():.2f}"}
+        if ours is not None and method is not ours:
+            line[f"cost of {subject} minus this"] = table.spell(costs[ours] - cost, "{:+.2f} ± {:.2f}")
+            if method in gaps:
+                spelt = table.spell(gaps[ours] - gaps[method], "{:+.2f} ± {:.2f}")
+                line[f"size of the gap of {subject} minus this"] = spelt
+        lines.append(line | {"n": len(cost)})
     return pd.DataFrame(lines)
 
 
-def _cost(rows: Mapping[str, np.ndarray | None]) -> np.ndarray:
-    return -cast(np.ndarray, rows["true"])
-
-
-def _gap(rows: Mapping[str, np.ndarray | None]) -> np.ndarray:
-    return np.abs(cast(np.ndarray, rows["predicted"]) - cast(np.ndarray, rows["true"]))
+def gap_sizes(found: pd.DataFrame) -> dict[Method, np.ndarray]:
+    """Size of predicted minus executed return: method -> (targets,), means over seeds of each seed's own size. found:
+    rows with a ``target``."""
+    own = table.with_method(table.select(found, metric=["return_true", "return_predicted"]))
+    wide = table.means(own, ["method", "seed", "target"])
+    if "return_predicted" not in wide:
+        return {}
+    sizes = (wide["return_predicted"] - wide["return_true"]).abs().rename("value").reset_index().dropna()
+    return table.arrays(table.means(sizes, "target", "method").sort_index())
 
 
 @table.sourced
