@@ -141,6 +141,22 @@ def test_the_size_of_a_gap_is_that_of_each_seed_before_seeds_are_averaged() -> N
     np.testing.assert_array_equal(planning_results.gap_sizes(tables.frame(rows))[TSM], [2.0, 2.0, 2.0])
 
 
+def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_as_well() -> None:
+    given = dict(
+        env="tsm/Reacher-v0", search_space="latent", planner="cem", execution="open loop", metric="return_true"
+    )
+    costs = {
+        ("tsm", 0): [1.0, 2.0, 3.0],
+        ("lstm", 0): [2.0, 3.0, 4.0],
+        ("tsm", 1): [1.0, 2.0, 3.0],
+        ("lstm", 1): [4.0, 5.0, 6.0],
+    }
+    rows = [dict(given, model=model, target=i, seed=seed, value=-cost)
+            for (model, seed), each in costs.items() for i, cost in enumerate(each)]  # fmt: skip
+    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict("records")
+    assert (line["cost of tsm minus this"], line["in each seed"]) == ("-2.00", "-1.00, -3.00")
+
+
 def test_distances_that_are_drawn_are_those_of_every_seed() -> None:
     given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", metric="final_distance")
     rows = [dict(given, execution=way, target=i, seed=seed, value=i + seed)

@@ -96,6 +96,21 @@ def test_differences_are_paired_by_seed(found: pd.DataFrame) -> None:
     np.testing.assert_allclose(prediction_results.paired(fewer, "tsm", "ll_paper", env=ENV)[LSTM], [-10, -12])
 
 
+def test_a_score_stands_over_that_of_the_best_other_model_of_the_same_seed() -> None:
+    scored = {
+        (0, "rtsm"): 1.0,
+        (0, "lstm"): 2.0,
+        (0, "onestep"): 4.0,
+        (1, "rtsm"): 3.0,
+        (1, "lstm"): 4.0,
+        (2, "lstm"): 1.0,
+    }
+    rows = [dict(env=ENV, model=model, seed=seed, metric="crps", execution="open loop", steps_ahead=10, value=value)
+            for (seed, model), value in scored.items()]  # fmt: skip
+    told = prediction_results.over_the_best(tables.frame(rows), "rtsm", "crps", env=ENV, steps_ahead=[10])
+    assert told.to_dict("list") == {"seed": [0, 1], "at 10 steps": ["0.50 (LSTM)", "0.75 (LSTM)"]}
+
+
 def test_curves_pass_through_the_rows(found: pd.DataFrame) -> None:
     curves = prediction_results.curves(found, "ll_paper", env=ENV)
     assert curves[LSTM].shape == (3, 90)

@@ -318,11 +318,11 @@ def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_
     torch.testing.assert_close(planned[0.25].actions, planned[1.0].actions)  # since they are of one opinion
 
 
-def test_a_screened_plan_promises_what_all_members_predict() -> None:
+def test_the_return_of_a_screened_plan_is_the_mean_of_what_all_members_predict() -> None:
     judge = EnsemblePredictor((predictor(), lambda actions: 0.9 * predictor()(actions)))
     plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
-    promised = expected_return(judge(plan.actions[None]), plan.actions[None], reward)[0]
-    torch.testing.assert_close(plan.curve[-1], promised)
+    predicted = expected_return(judge(plan.actions[None]), plan.actions[None], reward)[0]
+    torch.testing.assert_close(plan.curve[-1], predicted)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])

@@ -6,8 +6,9 @@
 predict: open loop and on segments (03_predict). control: plans by each planner in both search spaces, open loop, and by
 the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes, no torque and
 random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in both search
-spaces, of the others direct alone, as in 05_control, by --copies and --iterations. Models, scores, plans and policies
-are those of the run, so what is missing is made first.
+spaces, of the others direct alone, as in 05_control, by --copies and --iterations; name all models in one call, since
+how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are those of the
+run, so what is missing is made first.
 
 Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
 """
@@ -92,12 +93,12 @@ def main() -> None:
         publish(notebook, study.score_rows(run, pairs))
     elif given.part == "policies":
         budget, codes = Budget(given.copies, given.iterations), set(zoo.words(cls=zoo.CODED))
-        wanted = [
+        policies = [
             (study.load_task(env), way, budget) for env in given.envs for way in zoo.methods(given.models, "policy")
             if way.search_space == "direct" or way.model in codes
         ]  # fmt: skip
-        study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in wanted])
-        publish(notebook, study.policy_rows(run, wanted))
+        study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in policies])
+        publish(notebook, study.policy_rows(run, policies))
     else:
         rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)

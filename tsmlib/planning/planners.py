@@ -113,9 +113,7 @@ def cem(
         elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
         return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
 
-    search = _Search(predict, reward, space, start)
-    if isinstance(predict, EnsemblePredictor):
-        search.judged = max(elites, round(screened * candidates))
+    search = _Search(predict, reward, space, start, judged=max(elites, round(screened * candidates)))
     return _sample(search, refit, candidates, iterations, seed, progress)
 
 
@@ -253,15 +251,20 @@ def evaluate(
 
 
 class _Search:
-    """One run of a planner: per target, the parameters with the highest predicted return so far."""
+    """One run of a planner: per target, the parameters with the highest predicted return so far.
 
-    def __init__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int) -> None:
+    judged: the number of candidates that a whole ensemble judges, of many; 0: all.
+    """
+
+    def __init__(
+        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, *, judged: int = 0
+    ) -> None:
         if isinstance(start, int):
             start = torch.zeros(1, start, *space.shape)
         if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
             raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
         self.predict, self.reward, self.space, self.start = predict, reward, space, start
-        self.judged = 0  # candidates that a whole ensemble judges; 0: all
+        self.judged = judged
         self.began = time.perf_counter()
         self.parameters = start[0].clone()
         self.returns = start.new_full((start.shape[1],), -torch.inf)
@@ -279,8 +282,8 @@ class _Search:
         rough = evaluate(first, self.reward, self.space, parameters).nan_to_num(nan=-torch.inf)
         best = rough.topk(self.judged, dim=0).indices
         chosen = parameters.gather(0, _like(best, parameters).expand(-1, -1, *self.space.shape))
-        rest = evaluate(EnsemblePredictor(tuple(others)), self.reward, self.space, chosen)
-        returns = (rough.gather(0, best) + len(others) * rest) / len(self.predict.each)
+        judged = [evaluate(other, self.reward, self.space, chosen) for other in others]
+        returns = torch.stack([rough.gather(0, best), *judged]).mean(0)
         return torch.full_like(rough, -torch.inf).scatter(0, best, returns)
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:

@@ -35,8 +35,10 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
             "mode, samples=0"
         )
     if not samples and members(model) > 1:
-        alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(members(model)))
-        return EnsemblePredictor(tuple(partial(_predict, model, past, 1, noise) for noise in alone))
+        n = members(model)
+        alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))
+        together = partial(_predict, model, past, n, partial(NoNoise, len(past.states)))
+        return EnsemblePredictor(tuple(partial(_predict, model, past, 1, noise) for noise in alone), together)
 
     def common() -> Noise:
         return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
@@ -46,13 +48,17 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
 
 @dataclass(frozen=True)
 class EnsemblePredictor:
-    """Predict by the mode of each member, S of them. each: the members by themselves, S = 1, as ``cem`` screens by."""
+    """Predict by the mode of each member, S of them.
+
+    each: the members by themselves, S = 1, as ``cem`` screens by. together: all at once, where one rollout can.
+    """
 
     each: tuple[Predictor, ...]
+    together: Predictor | None = None
 
     def __call__(self, actions: Tensor) -> Tensor:
         """(C, B, T, du) -> (S, C, B, T, dx)."""
-        return torch.cat([predict(actions) for predict in self.each])
+        return self.together(actions) if self.together else torch.cat([predict(actions) for predict in self.each])
 
 
 def _predict(model: Model, past: Segment, draws: int, noise: Callable[[], Noise] | None, actions: Tensor) -> Tensor:

@@ -300,11 +300,9 @@ class Query:
 
     def explored(
         self, metric: str, model: Model, place: Place, configuration: str, *,
-        env_steps: float | str = "", steps_ahead: float | str = "",
+        env_steps: float, steps_ahead: float | str = "",
     ) -> Number:  # fmt: skip
         """Of rounds of exploration after so many steps, or of an adapted model; configuration: by which data or how."""
-        if not env_steps:
-            env_steps = 0 if configuration == "zero-shot" else 2000
         return self._ask("10_explore", metric, model.word, place, configuration=configuration, env_steps=env_steps,
                          steps_ahead=steps_ahead)  # fmt: skip
 

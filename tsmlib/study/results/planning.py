@@ -297,9 +297,10 @@ def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
 
 def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str = OPEN) -> pd.DataFrame:
     """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
-    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets. Closed loop, the gap is
-    that of the first plan. found: rows with a ``target``."""
+    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets; the cost also in each
+    seed alone. Closed loop, the gap is that of the first plan. found: rows with a ``target``."""
     planned = chosen(found, env=env, execution=execution, planners=["cem"])
+    seeds = [by_target(part, "return_true") for _, part in table.groups(planned, "seed")]
     costs = {way: -true for way, true in by_target(planned, "return_true").items() if way.search_space != "direct"}
     gaps, ours = gap_sizes(planned), next((way for way in costs if way.model == subject), None)
     lines = []
@@ -307,6 +308,10 @@ def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str 
         line = {"method": method, "cost (m)": f"{cost.mean():.2f}"}
         if ours is not None and method is not ours:
             line[f"cost of {subject} minus this"] = table.spell(costs[ours] - cost, "{:+.2f} ± {:.2f}")
+            apart = [table.spell(seed[method] - seed[ours], "{:+.2f} ± {:.2f}") for seed in seeds
+                     if method in seed and ours in seed]  # fmt: skip
+            if len(seeds) > 1:
+                line["in each seed"] = ", ".join(apart)
             if method in gaps:
                 spelt = table.spell(gaps[ours] - gaps[method], "{:+.2f} ± {:.2f}")
                 line[f"size of the gap of {subject} minus this"] = spelt

@@ -251,3 +251,24 @@ def scores_table(
         wide.insert(0, "n", own.groupby("model")["n"].max())
     wide.index = [name + few for name, few in zip(names, fewer, strict=True)]
     return wide.rename_axis("model").reset_index()
+
+
+def over_the_best(
+    found: pd.DataFrame, subject: str, metric: str, *, env: str, steps_ahead: Sequence[int]
+) -> pd.DataFrame:
+    """The subject's score over the lowest of all other models' of the same seed, a line per seed, a column per step
+    ahead; of a seed without others, or without the subject, none."""
+    lines = []
+    for seed, part in table.groups(select(found, metric, env=env, steps_ahead=list(steps_ahead)), "seed"):
+        wide = part.pivot(index="steps_ahead", columns="model", values="value")
+        others = wide.drop(columns=subject, errors="ignore")
+        if subject in wide and others.shape[1]:
+            cells = (
+                (
+                    f"at {h} steps",
+                    f"{wide[subject][h] / others.loc[h].min():.2f} ({zoo.look(others.loc[h].idxmin()).name})",
+                )
+                for h in steps_ahead
+            )
+            lines.append({"seed": seed, **dict(cells)})
+    return pd.DataFrame(lines)
