@@ -266,7 +266,7 @@ def over_the_best(
             cells = (
                 (
                     f"at {h} steps",
-                    f"{wide[subject][h] / others.loc[h].min():.2f} ({zoo.look(others.loc[h].idxmin()).name})",
+                    f"{wide[subject][h] / others.loc[h].min():.2f} ({zoo.look(str(others.loc[h].idxmin())).name})",
                 )
                 for h in steps_ahead
             )
