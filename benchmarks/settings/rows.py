@@ -2,13 +2,18 @@
 
     python benchmarks/settings/rows.py predict --scale paper --envs tsm/ReacherPush-v1 --models tsm rtsm lstm
     python benchmarks/settings/rows.py control --scale paper --envs tsm/ReacherPush-v1 --models rtsm lstm --closed rtsm
+    python benchmarks/settings/rows.py latent --scale paper --envs tsm/ReacherPush-v1 --models tsm rtsm
 
 predict: open loop and on segments (03_predict). control: plans by each planner in both search spaces, open loop, and by
 the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes, no torque and
 random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in both search
 spaces, of the others direct alone, as in 05_control, by --copies and --iterations; name all models in one call, since
 how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are those of the
-run, so what is missing is made first.
+run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques
+and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior).
+
+collect, train and latent execute 01_collect, 02_train and 04_latent in the run's folder for --envs and --models, as far
+as these ask for them, and publish what their tables then say.
 
 Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
 """
@@ -26,14 +31,18 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import runs, zoo
+from tsmlib.study import notebooks, parameters, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget
 from tsmlib.study.predictions import RESULTS
-from tsmlib.study.results import planning
+from tsmlib.study.results import action_prior, planning
 from tsmlib.study.results.table import Row
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "iteration", "seed", "scale")
+NOTEBOOKS = {
+    "collect": "01_collect", "train": "02_train", "predict": "03_predict", "latent": "04_latent",
+    "torques": "07_action_prior",
+}  # fmt: skip
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -71,11 +80,33 @@ def controlled(
     return rows, targets
 
 
+def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[str]) -> list[Row]:
+    """Rows of 07_action_prior.csv."""
+    tasks = [study.load_task(env) for env in envs]
+    ways = [way for planner in planners for way in zoo.methods(models, planner)]
+    study.precompute(run, [job for env in envs for job in plan_jobs(env, 100, ways)])
+    trials, rows = study.trials(run, tasks, ways), list[Row]()
+    for task in tasks:
+        rows += action_prior.task_rows(study.task_torques(run, task), trials[task.env], run)
+        rows += study.gradient_rows(run, task.take(50), models, samples=32)
+    return rows
+
+
+def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
+    """The table that a notebook leaves in the run's folder, for these environments and models."""
+    asked = {"env": ",".join(envs), "models": ",".join(models)}
+    given = {name: value for name, value in asked.items() if name in parameters.declared(notebook.path)}
+    execution = notebooks.prepare(notebook, scale=run.scale, seed=run.seed, given=given)
+    notebooks.execute(execution)
+    found = tables.load(execution.run.metrics / f"{notebook.stem}.csv")
+    return found[found["env"].isin(envs) & (found["seed"] == run.seed)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("predict", "control", "policies"))
+    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies"))
     parser.add_argument("--envs", nargs="+", required=True, choices=ENV_IDS, metavar="ENV")
-    parser.add_argument("--models", nargs="+", required=True, choices=zoo.words(), metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=[], choices=zoo.words(), metavar="MODEL")
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
@@ -84,13 +115,19 @@ def main() -> None:
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    notebook = "03_predict" if given.part == "predict" else "05_control"
+    if not given.models and given.part != "collect":
+        parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
+    notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "predict":
         pairs = list(product(given.envs, given.models))
         wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
         study.precompute(run, wanted)
         publish(notebook, study.score_rows(run, pairs))
+    elif given.part == "torques":
+        publish(notebook, torques(run, given.envs, given.models, given.planners))
+    elif given.part in NOTEBOOKS:
+        publish(notebook, executed(runs.notebooks()[given.part], run, given.envs, given.models))
     elif given.part == "policies":
         budget, codes = Budget(given.copies, given.iterations), set(zoo.words(cls=zoo.CODED))
         policies = [

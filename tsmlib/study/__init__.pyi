@@ -42,6 +42,9 @@ from .tasks import TASK_SEED as TASK_SEED
 from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
 from .tasks import task as task
+from .torques import action_prior as action_prior
+from .torques import gradient_rows as gradient_rows
+from .torques import task_torques as task_torques
 from .zoo import BUDGET as BUDGET
 from .zoo import method as method
 from .zoo import methods as methods
