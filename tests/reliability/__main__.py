@@ -46,7 +46,7 @@ CHECKS: dict[str, list[tuple[Callable[[int], Outcome], int, int]]] = {  # check,
         (files.malice, 0, 0),
         (files.hostile_minari, 0, 500),
         (files.mismatched, 0, 0),
-        (files.hostile_parameters, 0, 0),
+        (files.hostile_parameters, 8, 0),
         (files.fuzz, 400, 5000),
     ],
     "simulators": [

@@ -415,10 +415,13 @@ def hostile_numbers() -> list[str]:
 
 
 def hostile_parameters(trials: int = 0) -> Outcome:
-    """R13: hostile values and names for each parameter of each notebook: exit 2, a line that names it, no file."""
+    """R13: hostile values and names for each parameter of each notebook: exit 2, a line that names it, no file.
+
+    trials: n takes every nth value of a parameter that a notebook before has too; 0 all.
+    """
     from tsmlib.__main__ import main
 
-    found, per_parameter = Outcome(), []
+    found, per_parameter, seen = Outcome(), [], set[str]()
     words = hostile_texts() + hostile_numbers()
     names = ["sed", "", " ", "seed ", "Seed", "__class__", "seed=1; import os; x", "os.system('id')", "a.b", "a[0]",
              "seed\n", "лl", "import os", "lambda: 0", "x" * 300, "run_dir\0", "None", "-p", "--seed", "é"]  # fmt: skip
@@ -428,6 +431,9 @@ def hostile_parameters(trials: int = 0) -> Outcome:
                 hostile = hostile_texts() if name == "run_dir" else words
                 if isinstance(default, str) and name != "run_dir":
                     hostile = [text for text in hostile if text]  # '' is a scale
+                if trials and name in seen:
+                    hostile = hostile[len(per_parameter) % trials :: trials]
+                seen.add(name)
                 per_parameter.append(len(hostile))
                 for text in hostile:
                     given = [f"--{name}={text}"] if name in ("scale", "seed") else [f"-p{name}={text}"]
