@@ -12,8 +12,8 @@ how soon a policy learns is told by the plateau of the best of them. Models, sco
 run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques
 and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior).
 
-collect, train and latent execute 01_collect, 02_train and 04_latent in the run's folder for --envs and --models, as far
-as these ask for them, and publish what their tables then say.
+gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
+and --models, as far as these ask for them, and publish what their tables then say.
 
 Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
 """
@@ -40,7 +40,7 @@ from tsmlib.study.results.table import Row
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "iteration", "seed", "scale")
 NOTEBOOKS = {
-    "collect": "01_collect", "train": "02_train", "predict": "03_predict", "latent": "04_latent",
+    "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "latent": "04_latent",
     "torques": "07_action_prior",
 }  # fmt: skip
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
@@ -88,7 +88,7 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     trials, rows = study.trials(run, tasks, ways), list[Row]()
     for task in tasks:
         rows += action_prior.task_rows(study.task_torques(run, task), trials[task.env], run)
-        rows += study.gradient_rows(run, task.take(50), models, samples=32)
+        rows += study.signal_rows(run, task.take(50), models, samples=32)
     return rows
 
 
@@ -126,6 +126,9 @@ def main() -> None:
         publish(notebook, study.score_rows(run, pairs))
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
+    elif given.part == "gradients":
+        starts = [study.task(env).take(2) for env in given.envs]
+        publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])
     elif given.part in NOTEBOOKS:
         publish(notebook, executed(runs.notebooks()[given.part], run, given.envs, given.models))
     elif given.part == "policies":

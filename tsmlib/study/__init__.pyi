@@ -7,6 +7,8 @@ from .data import datasets as datasets
 from .data import parse_choice as parse_choice
 from .data import random_data as random_data
 from .data import sizes as sizes
+from .gradients import error_rows as error_rows
+from .gradients import signal_rows as signal_rows
 from .models import Trained as Trained
 from .models import TrainedModel as TrainedModel
 from .models import described as described
@@ -43,7 +45,6 @@ from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
 from .tasks import task as task
 from .torques import action_prior as action_prior
-from .torques import gradient_rows as gradient_rows
 from .torques import task_torques as task_torques
 from .zoo import BUDGET as BUDGET
 from .zoo import method as method
