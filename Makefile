@@ -19,7 +19,7 @@ help:
 	@echo "make robustness   noisy sensors and delayed actions (notebooks/06_robustness.ipynb)"
 	@echo "make action_prior   plans with and without the action prior (notebooks/07_action_prior.ipynb)"
 	@echo "make claims    verdicts on the paper's claims from the results that ship (notebooks/08_claims.ipynb)"
-	@echo "make your_own  robots that no one here made, from id to film (notebooks/09_your_own.ipynb)"
+	@echo "make your_own  Gymnasium's robots, from id to film (notebooks/09_your_own.ipynb)"
 	@echo "make explore   rounds of planning and learning, a model adapted to a changed arm (notebooks/10_explore.ipynb)"
 	@echo "make test      all tests, among them every notebook, cut down"
 	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"

@@ -1,4 +1,4 @@
-"""Collecting from a robot that no one here made: MuJoCo's bulk simulation against stepping it, for HalfCheetah-v5.
+"""Collecting from one of Gymnasium's robots: MuJoCo's bulk simulation against stepping it, for HalfCheetah-v5.
 
 Every round times all of them, in turn. The states that they reach must agree to 1e-6. The limit is ``mujoco.rollout``
 itself on as many threads; beyond it, the environment's own code makes each observation, reward and end.

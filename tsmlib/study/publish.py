@@ -245,7 +245,7 @@ def readme_costs(env: str) -> str:
     targets = costs["n"].max()
     closed = planning_results.chosen(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
     again, hits = (table.values(table.select(closed, metric=metric)) for metric in ("return_true", "success"))
-    loops = ", ".join(f"`{model}` {-found.mean():.2f} ({hits[model].mean():.0%})" for model, found in again.items())
+    loops = ", ".join(f"`{model}` {-found.mean():.2f} ({hits[model].mean():.1%})" for model, found in again.items())
     return (
         f"Costs (m, {targets} targets, {seeds}): {said}; planned again every ten steps (within 5 cm): {loops}. "
         f"For pushing `{OURS}` has three decoders, each trained as long as a baseline; on 50 validation targets one is "
@@ -315,7 +315,11 @@ def results_page() -> str:
         + prediction_results.scores_table(predict, METRICS, env=env)
         for env, n in seeds.items()
     )
-    planned = _seeds(control)
+    planned = ", ".join(f"{_seeds(planning_results.chosen(control, env=env))} for {task}" for env, task in
+                        ((REACH, "reaching"), (PUSH, "pushing")))  # fmt: skip
+    peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
+        "pets" in set(predict["model"])
+    )
     pages = robots_page(_shipped("09_your_own")), exploration_page(_shipped("10_explore"))
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
@@ -328,8 +332,7 @@ observed ones; means over steps, in standardised units, with half the 95 % t int
 seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
 of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`), but `{OURS}` of
 pushing, which has three decoders, each trained that long. Pushing is trained by Muon; elsewhere `{OURS}` is, and all
-other models by Adam. `pets` is the same kind of model as `ensemble`, by mbrl-lib
-(`benchmarks/peers`).
+other models by Adam.{peers}
 
 {scores}
 
@@ -339,7 +342,7 @@ Pushing, seed by seed: the energy score of `{OURS}` over that of the best other 
 
 ## Planning
 
-Training {planned}, frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
+Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
 over steps. A candidate is judged by the mode of the model; of an ensemble, as `{OURS}` of pushing is, the first member
 sorts the candidates and the best quarter is judged by the mean over all members (`cem(screened=)`).
@@ -377,7 +380,7 @@ def robots_page(rows: pd.DataFrame) -> str:
     if not len(rows):
         return ""
     seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
-    return f"""## Robots that no one here made
+    return f"""## Gymnasium's robots
 
 Written from the rows that `python -m tsmlib run your_own --scale paper` made, training seed {seeds};
 `python -m tsmlib publish --table your_own` copies them. Data are smooth random actions, collected by the package:

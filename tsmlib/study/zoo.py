@@ -141,7 +141,7 @@ def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> 
 
 
 def _muon(stage: Stage) -> Stage:
-    """The stage with Muon, at the best of three rates (``benchmarks/settings``, pushing)."""
+    """The stage with Muon, at the best of the rates tried on the one-step model (``benchmarks/settings``, pushing)."""
     return replace(stage, muon=0.02, lr=2e-3)
 
 

@@ -18,7 +18,7 @@ def counts(verdicts: Sequence[Verdict]) -> str:
     words = [verdict.word for verdict in verdicts]
     given = ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS if word != DEFINITIONAL)
     single = sum(verdict.word in DECIDED and verdict.key.seeds == 1 for verdict in verdicts)
-    by_one = f" ({single} by one training seed)" if single else ""
+    by_one = f"; {single} of the decided ones rest on one training seed" if single else ""
     return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}{by_one}"
 
 
@@ -45,7 +45,7 @@ def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
     lines = [
         {
             "": verdict.claim.id, "question": f"{verdict.claim.statement} ({verdict.claim.place})",
-            "measured": verdict.claim.statistic, "verdict": f"**{verdict.word}**",
+            "measured": f"`{effect.check.number.text}`", "verdict": f"**{verdict.word}**",
             "found": f"{effect.text}, asked {effect.check.asked}", "shown in": _links(verdict.claim, root),
         }
         for verdict in verdicts for effect in verdict.effects[""]
