@@ -153,6 +153,15 @@ def test_rows_take_the_place_of_those_of_the_same_model_and_method() -> None:
     assert kept == {("tsm", 0, "cost"): 2, ("tsm", 0, "gap"): 3, ("lstm", 0, "cost"): 1, ("tsm", 1, "cost"): 1}
 
 
+def test_rows_of_a_metric_leave_those_of_another_and_a_learning_curve_is_replaced_as_a_whole() -> None:
+    plan = dict(env="e", model="tsm", planner="adam", execution="open loop", seed=0, scale="paper", value=1.0, n=2)
+    policy = dict(plan, planner="policy", metric="return_true")
+    published = tables.frame([dict(plan, metric="cost"), *(dict(policy, iteration=i) for i in (220, 440))])
+    new = [dict(plan, metric="gradient_snr"), *(dict(policy, iteration=i) for i in (88, 176))]
+    found = [(line["metric"], line["iteration"]) for line in tables.records(rows.merged(published, new))]
+    assert found == [("cost", ""), ("gradient_snr", ""), ("return_true", 88), ("return_true", 176)]
+
+
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:
     about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0"}
     lines = pd.DataFrame([

@@ -16,6 +16,8 @@ from tsmlib import study
 from tsmlib.envs import fingerprint, imperfect
 from tsmlib.envs.geometry import HALF_RANGE
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec, gone
+from tsmlib.envs.stepping import UnsupportedEnvironment
+from tsmlib.planning.predictors import simulator_predictor
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 
@@ -161,3 +163,9 @@ assert "mujoco" not in sys.modules"""
     for text in ('import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v1").reset()', program):
         done = subprocess.run([sys.executable, "-W", "error", "-c", text], capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("hidden", [{"noise": 0.25}, {"delay": 2}])
+def test_the_true_simulator_of_an_arm_that_hides_its_state_is_no_predictor(hidden: dict[str, Any]) -> None:
+    with pytest.raises(UnsupportedEnvironment, match="the true simulator of tsm/Reacher-v0 can be asked"):
+        simulator_predictor(imperfect("tsm/Reacher-v0", **hidden))

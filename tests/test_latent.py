@@ -361,3 +361,11 @@ def test_thresholds_stand_beside_the_mean_over_seeds() -> None:
     (line,) = table.splitlines()[2:]  # what was not measured is left out
     assert [cell.strip() for cell in line.split("|")[1:-1]] == ["Reacher: KL (nats)", "at most 0.1", "0.03"]
     assert "9" not in table.replace("0.9", "")
+
+
+def test_a_past_longer_than_what_was_observed_begins_with_the_first_state(test_data: Trajectories) -> None:
+    model = in_units(TSM(test_data.states.shape[2], 2, segment_len=20, dilations=(1, 2, 4, 8), channels=8))
+    past = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=10).window.past
+    assert model.past_len > 10
+    early = past.states[0, : model.past_len - 10].numpy()
+    np.testing.assert_array_equal(early, np.broadcast_to(test_data.states[0, 0], early.shape))

@@ -94,3 +94,12 @@ def test_cells_that_run_on_what_ships_use_no_name_of_another_cell(path: Path) ->
             known |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
             known |= {node.arg for node in nodes if isinstance(node, ast.arg)}
             assert {node.id for node in nodes if isinstance(node, ast.Name)} <= known, cell.source
+
+
+@pytest.mark.parametrize("held", ["<!-- a -->\nREST", "<!-- a -->\n<!-- b -->\n<!-- b -->\nREST"])
+def test_a_page_without_both_its_marks_is_left_as_it_is(tmp_path: Path, held: str) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(held)
+    with pytest.raises(RunError, match="does not hold <!-- a --> and <!-- b --> once each"):
+        publish._between(page, ("<!-- a -->", "<!-- b -->"), "written")
+    assert page.read_text() == held

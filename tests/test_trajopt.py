@@ -21,7 +21,7 @@ from tsmlib.models.base import rollout
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
-from tsmlib.planning.base import Plan, Predictor
+from tsmlib.planning.base import Plan, Planner, Predictor
 from tsmlib.planning.planners import (
     adam,
     cem,
@@ -339,6 +339,30 @@ def test_the_mode_of_a_member_alone_is_its_part_of_the_ensembles_modes(gaussian:
     at_once = rollout(model, rows, actions.flatten(0, 1).repeat(model.members, 1, 1), generator=NoNoise(4 * B))
     modes = model_predictor(model, past)(actions)
     torch.testing.assert_close(modes, at_once.unflatten(0, (model.members, 4, B)))
+
+
+@pytest.mark.parametrize("planner", [cem, mppi])
+@pytest.mark.parametrize("spoilt", [float("nan"), float("inf")])
+def test_a_candidate_on_which_the_model_diverges_is_never_the_plan(planner: Planner, spoilt: float) -> None:
+    def predict(actions: Tensor) -> Tensor:
+        states = predictor()(actions)
+        return states.where(actions[None].abs().amax((-2, -1), keepdim=True) == 0, spoilt)
+
+    plan = planner(predict, reward, DirectActions(T, 1, rms=0.5), B, iterations=2)
+    assert (plan.actions == 0).all()
+    torch.testing.assert_close(plan.curve[-1], plan.predicted_return)
+
+
+def test_a_candidate_that_the_first_member_finds_infinitely_good_is_sorted_out() -> None:
+    def infinite(states: Tensor, actions: Tensor) -> Tensor:
+        return reward(states, actions).where(states[..., 1].abs() < 1e3, torch.inf)
+
+    def diverging(actions: Tensor) -> Tensor:
+        return predictor()(actions) + 1e6 * (actions[None].amax((-2, -1), keepdim=True) > 0.9)
+
+    judge = EnsemblePredictor((diverging, predictor()))
+    plan = cem(judge, infinite, DirectActions(T, 1, rms=0.9), B, candidates=40, elites=4, iterations=2, screened=0.5)
+    assert plan.curve[-1].abs().max() < 1e6
 
 
 # Common random numbers -----------------------------------------------------------------------------------------------

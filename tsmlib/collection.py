@@ -4,6 +4,7 @@ Random data, a running planner and a policy under test are the same call with an
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -29,11 +30,17 @@ def collect(
 
     env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations and actions. Actions
     in [-1, 1] are scaled to the bounds of its action space. Episodes start from the environment's own distribution,
-    drawn from ``seed`` (seed + i in episode i, or a seed for each), or, in the arm's, from ``states`` (N, dx).
+    drawn from ``seed`` (a function of it and of i in episode i; elsewhere than in an arm also a seed for each), or, in
+    an arm's, from ``states`` (N, dx).
     UnsupportedEnvironment, naming what is supported, for anything else.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
+    if isinstance(controller, OpenLoop) and controller.actions.shape[1] < horizon:
+        raise ValueError(
+            f"the actions are of {controller.actions.shape[1]} steps, those of an episode of {horizon} were expected; "
+            f"give as many, or horizon={controller.actions.shape[1]}"
+        )
     episodes: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
     start = episodes.reset(seed=seed, states=states)
     past = initial_past(torch.from_numpy(start).float(), past_len, episodes.action_dim)
@@ -109,6 +116,16 @@ def smooth_torques(
     return torch.from_numpy((torques * (rms / settled)).clip(-1, 1).astype(np.float32))
 
 
-def open_loop(actions: Tensor) -> Controller:
+@dataclass(frozen=True)
+class OpenLoop:
+    """The controller that plays ``actions`` (N, T, du), once, from the start of an episode."""
+
+    actions: Tensor
+
+    def __call__(self, past: Segment) -> Tensor:
+        return self.actions
+
+
+def open_loop(actions: Tensor) -> OpenLoop:
     """The open-loop controller that plays ``actions`` (N, T, du) from the start of an episode."""
-    return lambda past: actions
+    return OpenLoop(actions)

@@ -33,7 +33,7 @@ def main() -> None:
         policy.features.load_state_dict(model.features.state_dict())
         curve = learn_policy(
             policy, model, reward, episodes_from(starts),
-            LearningOptions(iterations=iterations, lr_decay=decay, record_every=iterations),
+            LearningOptions(horizon=task.horizon, iterations=iterations, lr_decay=decay, record_every=iterations),
             measure=lambda p: study.assess(p, model, task, seed=1), progress=name,
         )  # fmt: skip
         executed = torch.tensor(curve.measured["return_true"][-1])

@@ -15,7 +15,7 @@ and those of the prior, and the signal of gradients at the first 50 starts (07_a
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.
 
-Rows take the place of those of the same environment, model, method and seed in data/results; all others stay.
+Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import action_prior, planning
 from tsmlib.study.results.table import Row
 
-KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "iteration", "seed", "scale")
+KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "latent": "04_latent",
     "torques": "07_action_prior",
@@ -49,9 +49,15 @@ FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
     """The published table with ``rows`` in place of those with the same key."""
     new = tables.frame(rows)
-    old, own = (list(part[list(KEY)].astype(str).itertuples(index=False, name=None)) for part in (published, new))
-    kept = published[[key not in set(own) for key in old]]
-    return tables.frame(pd.concat([kept, new]))
+    replaced = set(_keys(new))
+    return tables.frame(pd.concat([published[[key not in replaced for key in _keys(published)]], new]))
+
+
+def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
+    """What a row is about, but for its target: a learning curve is replaced as a whole."""
+    curve = rows["planner"] == "policy"
+    what = {name: rows[name].astype(str).mask(curve, "") for name in ("metric", "iteration", "subset", "steps_ahead")}
+    return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
 def publish(name: str, rows: Iterable[Row]) -> None:

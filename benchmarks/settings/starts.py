@@ -51,7 +51,10 @@ def main() -> None:
     for word, weight in product(spaces, arguments.weights):
         task = posed.with_reward(posed.name, rewards.reach(posed.target, torque_weight=weight))
         past, space = task.past(model.past_len), spaces[word]
-        predict, judge = (model_predictor(model, past, samples=s, seed=run.seed + i) for i, s in enumerate((2, 32)))
+        predict, judge = (
+            model_predictor(model, past, samples=s if model.stochastic else 0, seed=run.seed + i)
+            for i, s in enumerate((2, 32))
+        )
         for start in STARTS[word]:
             noise = torch.randn(1, len(task), *space.shape, generator=torch.Generator().manual_seed(run.seed))
             plan = adam(predict, task.reward, space, start * noise, iterations=arguments.iterations,

@@ -45,5 +45,6 @@ def sample_futures(
     test.require_equal_lengths("a look at the futures of every episode")
     drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)
     episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
-    begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len
-    return SampledFutures(test.env, windows(test.padded(0), episodes, begin, model.past_len, horizon), drawn)
+    before = max(0, model.past_len - min(STARTS))  # a longer past begins before the episode
+    begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len + before
+    return SampledFutures(test.env, windows(test.padded(before), episodes, begin, model.past_len, horizon), drawn)

@@ -69,10 +69,13 @@ class Features(nn.Module):
 
     def difference(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of their features that change within an episode, standardised."""
-        return (self(predicted) - self(true))[..., self.scored]
+        difference, scored = self(predicted) - self(true), self.scored
+        return difference if scored.all() else difference[..., scored]
 
     def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
+        if self.moving.all():
+            return (predicted - true) / self.step_std
         return (predicted - true)[..., self.moving] / self.step_std[self.moving]
 
     def _raw(self, states: Tensor) -> Tensor:

@@ -165,11 +165,10 @@ def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, see
         if iteration:
             parameters[0] = search.parameters
         returns = search.returns_of_many(parameters)
-        # A candidate on which the model diverges, or that was sorted out, is as bad as the worst.
+        # To the refit a candidate on which the model diverges, or that was sorted out, is as bad as the worst.
         finite = torch.isfinite(returns)
         worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
-        returns = returns.where(finite, worst)
-        mean, deviation = refit(parameters, returns, mean, deviation)
+        mean, deviation = refit(parameters, returns.where(finite, worst), mean, deviation)
         search.update(torch.cat([parameters, mean[None]]), torch.cat([returns, search.returns_of(mean[None])]))
     return search.plan()
 
@@ -243,11 +242,18 @@ def evaluate(
     predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK
 ) -> Tensor:
     """Expected return (C, B) of parameters (C, B, *shape), up to ``rows`` at a time: what models decode at once."""
-    returns = []
-    for chunk in parameters.split(max(1, rows // parameters.shape[1])):
-        actions = space.decode(chunk)
-        returns.append(expected_return(predict(actions), actions, reward))
-    return torch.cat(returns)
+    return _returns(predict, reward, _decoded(space, parameters, rows=rows), rows=rows)
+
+
+def _decoded(space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK) -> Tensor:
+    """The actions (C, B, T, du) of parameters (C, B, *shape), decoded up to ``rows`` at a time."""
+    return torch.cat([space.decode(chunk) for chunk in parameters.split(max(1, rows // parameters.shape[1]))])
+
+
+def _returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
+    """Expected return (C, B) of actions (C, B, T, du), predicted up to ``rows`` at a time."""
+    chunks = actions.split(max(1, rows // actions.shape[1]))
+    return torch.cat([expected_return(predict(chunk), chunk, reward) for chunk in chunks])
 
 
 class _Search:
@@ -279,10 +285,12 @@ class _Search:
         if not 0 < self.judged < len(parameters) or not isinstance(self.predict, EnsemblePredictor):
             return self.returns_of(parameters)
         first, *others = self.predict.each
-        rough = evaluate(first, self.reward, self.space, parameters).nan_to_num(nan=-torch.inf)
+        actions = _decoded(self.space, parameters)
+        rough = _returns(first, self.reward, actions)
+        rough = rough.where(torch.isfinite(rough), -torch.inf)
         best = rough.topk(self.judged, dim=0).indices
-        chosen = parameters.gather(0, _like(best, parameters).expand(-1, -1, *self.space.shape))
-        judged = [evaluate(other, self.reward, self.space, chosen) for other in others]
+        chosen = actions.gather(0, _like(best, actions).expand(-1, -1, *actions.shape[2:]))
+        judged = [_returns(other, self.reward, chosen) for other in others]
         returns = torch.stack([rough.gather(0, best), *judged]).mean(0)
         return torch.full_like(rough, -torch.inf).scatter(0, best, returns)
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from tsmlib.collection import collect, open_loop
-from tsmlib.envs.stepping import continued, make_simulation
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.stepping import UnsupportedEnvironment, continued, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
@@ -91,7 +92,7 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
 
     The id of an arm, from ``start`` (B, dx): any state can be one, also one in the middle of an episode. In MuJoCo what
     follows is what would have followed, up to rounding; in pymunk, contacts that last forget the force with which they
-    press.
+    press. UnsupportedEnvironment for an arm with noise or delay.
     """
     if isinstance(env, Task) and env.seeds:
         sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
@@ -103,7 +104,13 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
         return outcomes
     if isinstance(env, Task) and start is None:
         start = env.start
-    make = cache(partial(make_simulation, env.env if isinstance(env, Task) else env))
+    name = env.env if isinstance(env, Task) else env
+    if name != (arm := EnvSpec.parse(name).arm.id):
+        raise UnsupportedEnvironment(
+            f"{name} hides its states behind noisy sensors or delays actions, so what would follow is no function of "
+            f"what is seen; the true simulator of {arm} can be asked"
+        )
+    make = cache(partial(make_simulation, name))
 
     def predict(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape

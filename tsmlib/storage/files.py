@@ -106,7 +106,10 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
         try:
             lock.acquire(timeout=0.2)  # in which a new holder writes its name
         except Timeout:
-            who = holder.read_text() if holder.exists() else "unknown"
+            try:
+                who = holder.read_text()
+            except OSError:  # it may end at any moment
+                who = "unknown"
             if not wait:
                 raise StoreError(
                     f"{Path(folder) / name} is being written by another process ({who}). Wait for it or end it, or "

@@ -101,7 +101,7 @@ def _typed(name: str, values: Sequence[Any]) -> pd.Series:
         if wanted:
             try:
                 return pd.Series([None if value is None else convert(value) for value in given], dtype=dtype)
-            except (ValueError, TypeError):
+            except (ValueError, TypeError, OverflowError):
                 continue
     return pd.Series(["" if value is None else value for value in given], dtype=object)
 

@@ -66,8 +66,10 @@ def adapted(
     word: str, env: str, way: Way, data: tuple[Trajectories, Trajectories] | None, *, seed: int = 0, share: float = 1.0
 ) -> tuple[TrainedModel, float]:
     """A model of ``env`` by one of WAYS, and the CPU seconds of its training. share: of the updates."""
-    if way == "zero-shot" or data is None:
+    if way == "zero-shot":
         return load_pretrained(word, env=EnvSpec.parse(env).standard.id), 0.0
+    if data is None:
+        raise ValueError(f"a model of {env} by the way {way!r} needs episodes; only zero-shot takes none")
     (train, validation), began, title = data, time.process_time(), f"{env} {word}: {way}"
     if way == "scratch":
         spec = zoo.find(word)

@@ -84,7 +84,8 @@ class Model:
         return f"models/{EnvSpec.parse(models.trained_on(self.env, self.word)).name}/{self.word}"
 
     def needs(self, run: Run) -> Sequence[Job]:
-        shipped = run.scale == "laptop" and run.seed == 0 and (run.shipped.parent / f"{self.name}.safetensors").exists()
+        path = run.shipped / EnvSpec.parse(models.trained_on(self.env, self.word)).name / f"{self.word}.safetensors"
+        shipped = run.scale == "laptop" and run.seed == 0 and path.exists()
         return () if shipped else [Data(models.trained_on(self.env, self.word), s) for s in ("train", "validation")]
 
     def make(self, run: Run) -> object:

@@ -30,7 +30,7 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
-from tsmlib.study.runs import ROOT, Notebook, Run
+from tsmlib.study.runs import ROOT, Notebook, Run, RunError
 from tsmlib.study.tasks import load_task
 from tsmlib.study.zoo import OURS, PAPERS
 
@@ -131,7 +131,10 @@ def shipped_answers() -> list[evaluate.Verdict]:
 
 def _between(page: Path, marks: tuple[str, str], written: str) -> None:
     """Put ``written`` between two marks of a page."""
-    before, _, rest = page.read_text().partition(marks[0])
+    text = page.read_text()
+    if any(text.count(mark) != 1 for mark in marks):
+        raise RunError(f"{page} does not hold {' and '.join(marks)} once each; restore it: git checkout -- {page}")
+    before, _, rest = text.partition(marks[0])
     after = rest.partition(marks[1])[2]
     files.write_bytes(page, "\n".join([before + marks[0], "", written, "", marks[1] + after]).encode())
 

@@ -164,7 +164,7 @@ class Learner(NamedTuple):
 
 def learner(word: str, sizes: Sizes, seed: int) -> Learner:
     """One of LEARNERS as a loop begins."""
-    train, held_out = divided(random_episodes(sizes.first, seed))
+    train, held_out = divided(random_episodes(sizes.first, 1000 * seed))  # episode i is of seed + i
     made_for = cast(type[RecurrentTSM], zoo.find(word).load())
     model = made_for.for_data(train, seed=seed, **LEARNERS[word])
     prior = None if word in WITHOUT_PRIOR else ActionPrior.for_data(train, seed=seed, channels=16)
@@ -188,9 +188,9 @@ def loop(run: Run, word: str, sizes: Sizes, *, random: bool = False) -> list[Row
     records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **measured(model, prior)}]
     if random:
         for k in range(1, sizes.rounds + 1):
-            new = random_episodes(sizes.episodes, seed=100_000 * (run.seed + 1) + k)
+            new = random_episodes(sizes.episodes, seed=100_000 * (run.seed + 1) + 1000 * k)
             train, held_out = train.joined(new.take(slice(1, None))), held_out.joined(new.take(slice(1)))
-            _train(cast(nn.Module, model), prior, train, held_out, sizes, run.seed + k)
+            _train(cast(nn.Module, model), prior, train, held_out, sizes, 1000 * run.seed + k)
             steps = k * sizes.episodes * HORIZON
             records.append({"round": k, "env_steps": steps, **measured(model, prior)})
     else:

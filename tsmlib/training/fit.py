@@ -59,11 +59,11 @@ class TrainingOptions:
     bf16: bool = False  # matrix products in bfloat16 where they are native; weights are in float32
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size, self.validate_every) < 1:
-            raise ValueError(
-                f"steps {self.steps}, batch_size {self.batch_size}, validate_every {self.validate_every}: "
-                "expected positive"
-            )
+        for name in ("past_len", "future_len", "steps", "batch_size", "validate_every"):
+            if (value := getattr(self, name)) < 1:
+                raise ValueError(f"{name} {value}: expected positive")
+        if not self.clip > 0:
+            raise ValueError(f"clip {self.clip}: expected above zero; math.inf never clips")
         if not (0 < self.lr < math.inf and 0 <= self.lr_final < math.inf):
             raise ValueError(f"lr {self.lr}, lr_final {self.lr_final}: expected lr above zero, lr_final zero or above")
         for name in ("muon", "weight_decay", "warmup", "patience"):

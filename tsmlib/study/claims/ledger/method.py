@@ -61,7 +61,7 @@ def c14(_: Query) -> Checks:
 @Claim("C15", "section 4.2", ITERATIONS,
        statistic="iterations to 95 % of the gain at 500 iterations: share of targets within 100 and within 150",
        why={FAILED: "On reaching no target gets there within 150 iterations, since from codes of zero a hundred steps "
-                    "of 0.01 do not get far. On pushing most do."})
+                    "of 0.01 do not get far."})
 def c15(q: Query) -> Checks:
     """Adam with step 0.01 converges in about 100 iterations."""
     for task in TASKS:
