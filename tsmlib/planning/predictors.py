@@ -105,7 +105,7 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
     if isinstance(env, Task) and start is None:
         start = env.start
     name = env.env if isinstance(env, Task) else env
-    if name != (arm := EnvSpec.parse(name).arm.id):
+    if name.startswith("tsm/") and name != (arm := EnvSpec.parse(name).arm.id):
         raise UnsupportedEnvironment(
             f"{name} hides its states behind noisy sensors or delays actions, so what would follow is no function of "
             f"what is seen; the true simulator of {arm} can be asked"
