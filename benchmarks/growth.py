@@ -102,8 +102,8 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
     run = runs.resolve("bench", scale="laptop")
     data = study.random_data(ENV, 100, seed=0)
     model, _, _ = models(run, ENV)
-    task = study.task(ENV)
-    reach = study.task("tsm/Reacher-v0", "validation")
+    task = study.load_task(ENV)
+    reach = study.load_task("tsm/Reacher-v0", "validation")
     small, _, _ = models(run, "tsm/Reacher-v0")
 
     def tsm(**options: Any) -> TSM:

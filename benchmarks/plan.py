@@ -71,7 +71,7 @@ def main() -> None:
     arguments = parsed(options)
     few, samples = arguments.few, arguments.samples
     run = runs.resolve("bench", scale="laptop")
-    task = study.task(ENV).take(arguments.targets)
+    task = study.load_task(ENV).take(arguments.targets)
     n_targets, horizon = len(task), arguments.horizon
     model, prior, origin = models(run, ENV)
     plain_prior: Any = PlainPrior(prior)

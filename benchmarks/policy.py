@@ -37,7 +37,7 @@ def main() -> None:
     arguments = parsed(options)
     n, copies, horizon = arguments.iterations, arguments.copies, arguments.horizon
     model, prior, origin = models(runs.resolve("bench", scale="laptop"), arguments.env)
-    task = study.task(arguments.env, "validation")
+    task = study.load_task(arguments.env, "validation")
     draw, reward = episodes_from(torch.from_numpy(task.start)), task.reward_for
     state_dim = task.start.shape[1]
     starts = torch.from_numpy(task.start[:EPISODES])

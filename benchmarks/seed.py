@@ -116,7 +116,7 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
             yield from scores(nets[env, word], few[env])
     for env in (env for env in (REACH, PUSH) if env in envs):
         yield from trainings(run, env, "prior", data[env], arguments.updates)
-        task = study.task(env, "validation")
+        task = study.load_task(env, "validation")
         for word in models:
             if word in planning_results.PAPER:
                 yield from plans(nets[env, word], nets[env, "prior"], task, arguments.little)

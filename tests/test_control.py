@@ -430,11 +430,11 @@ def test_a_closed_loop_without_steps_is_refused() -> None:
 @pytest.mark.skipif(not study.FROZEN.exists(), reason="data/tasks is not there")
 @pytest.mark.parametrize("env", ENV_IDS)
 def test_frozen_tasks_are_those_their_seed_draws(env: str) -> None:
-    frozen, drawn = study.task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
+    frozen, drawn = study.load_task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
     assert (frozen.name, frozen.env, len(frozen)) == (drawn.name, env, 100)
     np.testing.assert_allclose(frozen.start, drawn.start, rtol=0, atol=1e-6)
     torch.testing.assert_close(frozen.target, drawn.target, rtol=0, atol=1e-6)
-    assert not np.allclose(frozen.start, study.task(env, "validation").start)
+    assert not np.allclose(frozen.start, study.load_task(env, "validation").start)
 
 
 @pytest.mark.parametrize("env", ENV_IDS)
@@ -450,14 +450,14 @@ def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number
 @pytest.mark.parametrize("n", [-5, 0, 101])
 def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
     with pytest.raises(ValueError, match="choose a number from 1 to 100"):
-        study.task(REACHER, "validation").take(n)
+        study.load_task(REACHER, "validation").take(n)
 
 
 @pytest.mark.parametrize("split", ["validation", "test"])
 @pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
 def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
     for env in (REACHER, PUSH):
-        plain, task = study.task(env, split), study.task(imperfect(env, **how), split)
+        plain, task = study.load_task(env, split), study.load_task(imperfect(env, **how), split)
         assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (plain.name, plain.horizon, env)
         assert task.env != env
         np.testing.assert_array_equal(task.start, plain.start)

@@ -228,7 +228,7 @@ def test_what_study_makes_there_is_what_it_makes_here(
     def made(place: str) -> tuple[Tensor, ...]:
         run = replace(first, device=place, dir=tmp_path / place)
         shutil.copytree(first.dir, run.dir)
-        task = study.task(REACHER).take(2)
+        task = study.load_task(REACHER).take(2)
         assert study.load_or_train(run, REACHER, "onestep")[1]["device"] == place
         plans = [
             study.plan(run, task, study.method("onestep", "latent", "cem")),

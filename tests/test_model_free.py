@@ -90,7 +90,7 @@ def test_new_episodes_have_other_starts_and_targets_within_the_disc() -> None:
 
 
 def test_doing_nothing_has_the_return_of_zero_torque() -> None:
-    task = study.task("tsm/Reacher-v0").take(10)
+    task = study.load_task("tsm/Reacher-v0").take(10)
     found = model_free.measured(task, lambda seen: np.zeros((len(seen), 2)))
     trial = execute(task, torch.zeros(10, task.horizon, 2))
     assert found["return_true"] == pytest.approx(float(trial.executed_return.mean()), abs=1e-5)
@@ -111,7 +111,7 @@ def records(*steps: int) -> list[dict[str, float]]:
 
 
 def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path) -> None:
-    path, task = tmp_path / "model_free.csv", study.task("tsm/Reacher-v0")
+    path, task = tmp_path / "model_free.csv", study.load_task("tsm/Reacher-v0")
     key = dict(env=task.env, model="ppo", subset="", configuration="std=0.14", seed=1)
     for other in ({"seed": 2}, {"model": "trpo"}, {"subset": "search"}, {"configuration": "std=0.37"}):
         model_free.Table(path).put(key | other, task, records(0, 500))
@@ -126,7 +126,7 @@ def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path
 
 
 def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
-    table, task = model_free.Table(tmp_path / "model_free.csv"), study.task("tsm/Reacher-v0")
+    table, task = model_free.Table(tmp_path / "model_free.csv"), study.load_task("tsm/Reacher-v0")
     for seed in range(3):
         key = dict(env=task.env, model="trpo", subset="", configuration="std=0.14", seed=seed)
         table.put(key, task, [record | {"seconds": 99.0} for record in records(0, 500, 1000)])
@@ -149,7 +149,7 @@ def test_numbers_that_make_no_run_are_refused(tmp_path: Path, arguments: list[st
 @pytest.mark.parametrize("algorithm", model_free.ALGORITHMS)
 def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) -> None:
     setting = dict(model_free.SETTINGS[algorithm][0], episodes=5)
-    task = study.task("tsm/Reacher-v0", "validation").take(5)
+    task = study.load_task("tsm/Reacher-v0", "validation").take(5)
     runs = [list(model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0)) for _ in range(2)]
     assert [record["steps"] for record in runs[0]] == [0, 250, 500]
     returns = [[record["return_true"] for record in found] for found in runs]

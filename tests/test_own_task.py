@@ -96,7 +96,7 @@ def test_a_reward_of_the_wrong_shape_is_refused(wrong: Reward, found: str) -> No
 
 
 def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None:
-    task = study.task("tsm/Reacher-v0").take(4)
+    task = study.load_task("tsm/Reacher-v0").take(4)
     some = task.take([3, 1])
     assert torch.equal(some.target, task.target[[3, 1]])
     assert (some.start == task.start[[3, 1]]).all()

@@ -238,7 +238,7 @@ def test_networks_of_another_size_are_not_compared() -> None:
 
 
 def test_theirs_earns_the_reward_of_the_task_step_by_step() -> None:
-    task, unit = study.task(speed.ENV).take(3), torch.logspace(-1, 1, 10)
+    task, unit = study.load_task(speed.ENV).take(3), torch.logspace(-1, 1, 10)
     generator = torch.Generator().manual_seed(0)
     states, actions = torch.randn(7, 3, 4, 10, generator=generator), torch.randn(7, 3, 4, 2, generator=generator)
     expected = task.reward(states, actions)  # (C, B, T)
@@ -268,7 +268,7 @@ OURS = speed.Way("cem", "direct", "tsm", iterations=1, candidates=4)
 def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    task = replace(study.task(speed.ENV).take(5), horizon=4)
+    task = replace(study.load_task(speed.ENV).take(5), horizon=4)
     now, asked = [0.0], []
 
     def objective(model: Any, unit: Tensor, single: Any, samples: int) -> Any:

@@ -429,7 +429,7 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
 ) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     net, about = study.load_or_train(run, "tsm/Reacher-v0", "onestep")
-    task, method = study.task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", space, "policy")
+    task, method = study.load_task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", space, "policy")
     assert study.stored_budget(run, task.env, method) is None
     actor, header = study.learn(run, task, method, study.Budget(copies=2))
     assert study.stored_budget(run, task.env, method) == study.Budget(copies=2, iterations=4)
@@ -463,7 +463,7 @@ def test_an_unknown_way_to_learn_is_refused_before_anything_is_trained(
 ) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     with pytest.raises(ValueError, match="expected latent or direct, 0"):
-        task, method = study.task("tsm/Reacher-v0"), study.method("tsm", bad[0], "policy")
+        task, method = study.load_task("tsm/Reacher-v0"), study.method("tsm", bad[0], "policy")
         study.learn(run, task, method, study.Budget(iterations=bad[1], copies=bad[2]))
     assert not run.dir.exists() or not any(run.models.rglob("*.safetensors"))
 

@@ -170,7 +170,7 @@ def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pyt
 
 
 def some_task(n: int = 2) -> tasks.Task:
-    return study.task(REACHER, "validation").take(n)
+    return study.load_task(REACHER, "validation").take(n)
 
 
 LATENT, DIRECT = study.method("tsm", "latent", "cem"), study.method("tsm", "direct", "cem")
@@ -400,7 +400,7 @@ def test_a_model_of_version_0_is_refused_with_the_command_that_makes_a_new_one(r
 def test_a_task_of_version_0_is_refused_with_the_command_that_makes_a_new_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    task, path = study.task(V1), tmp_path / "ReacherPush.safetensors"
+    task, path = study.load_task(V1), tmp_path / "ReacherPush.safetensors"
     monkeypatch.setattr(study_tasks, "FROZEN", tmp_path)
     for env, message in ((V0, f"{GONE}python benchmarks/settings/freeze_tasks.py"), (REACHER, f"env is '{REACHER}'")):
         arrays = {"start": task.start, "target": task.target}

@@ -330,12 +330,12 @@ def test_targets_are_drawn_and_allowed_as_far_as_the_variant_gets() -> None:
 
 
 def test_the_task_of_a_variant_with_the_same_shape_is_the_frozen_one() -> None:
-    standard = study.task(PUSH)
-    heavy = study.task(variant(PUSH, mass=2.0))
+    standard = study.load_task(PUSH)
+    heavy = study.load_task(variant(PUSH, mass=2.0))
     assert heavy.env == "tsm/ReacherPush-mass2-v1"
     np.testing.assert_array_equal(heavy.start, standard.start)
     assert torch.equal(heavy.target, standard.target)
-    large = study.task(variant(PUSH, object_radius=0.05))
+    large = study.load_task(variant(PUSH, object_radius=0.05))
     assert len(large) == 100
     assert closest_gap(large.start.astype(float), large.env).min() > 0
     trial, same = (tsm.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3))) for task in (heavy, standard))

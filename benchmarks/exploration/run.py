@@ -47,7 +47,7 @@ def task_of(round_: int, seed: int) -> tsm.Task:
 def measured(model: tsm.DynamicsModel, prior: tsm.ActionPrior | None) -> dict[str, float]:
     """Cost of plans on validation targets."""
     assert prior is not None
-    task = study.task(ENV, "validation").take(TARGETS)
+    task = study.load_task(ENV, "validation").take(TARGETS)
     trial = tsm.mpc(task, model, tsm.LatentActions(prior, task.horizon), partial(tsm.cem, **SEARCH))
     assert trial.success is not None
     return {

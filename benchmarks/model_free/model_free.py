@@ -266,7 +266,7 @@ def run(
     key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
     rows = table.kept(key, steps)
     if not rows:
-        task, found = study.task(env, split), []
+        task, found = study.load_task(env, split), []
         for record in learn(algorithm, task, setting, steps=steps, records=records, seed=seed):
             found.append(record)
             rows = table.put(key, task, found)

@@ -484,7 +484,7 @@ def main() -> None:
     options = dict(transitions=arguments.transitions, rounds=arguments.training_rounds)
     for form in pets.MODELS:
         rows += training(form, features, few, clock, **options)
-    task = study.task(ENV).take(arguments.targets)
+    task = study.load_task(ENV).take(arguments.targets)
     found = outcomes(WAYS, task, models, clock, rounds=arguments.rounds)
     rows += planning(found, task)
     verdicts(found)

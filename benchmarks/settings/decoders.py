@@ -44,7 +44,7 @@ def load(path: Path) -> Model:
 
 def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float) -> dict[str, object]:
     """A line of the table."""
-    task = study.task(env, "validation").take(n_targets)
+    task = study.load_task(env, "validation").take(n_targets)
     prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
     through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
     each = [one for found in through for one in (found.each if isinstance(found, EnsemblePredictor) else [found])]

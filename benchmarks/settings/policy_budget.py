@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--env", choices=("tsm/Reacher-v0", "tsm/ReacherPush-v1"), default="tsm/ReacherPush-v1")
     parser.add_argument("--model", choices=zoo.words("dynamics"), default=zoo.OURS)
     arguments = parser.parse_args()
-    run, task = runs.resolve("bench", scale="laptop"), study.task(arguments.env, "validation")
+    run, task = runs.resolve("bench", scale="laptop"), study.load_task(arguments.env, "validation")
     model, _ = study.load_or_train(run, arguments.env, arguments.model)
     starts = torch.from_numpy(study.random_data(arguments.env, 1000, seed=0).states[:, 0])
     reward = task.reward_for

@@ -34,9 +34,9 @@ from tsmlib.storage import manifest, tables
 from tsmlib.study import notebooks, parameters, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget
-from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import action_prior, planning
 from tsmlib.study.results.table import Row
+from tsmlib.study.runs import RESULTS
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
@@ -133,7 +133,7 @@ def main() -> None:
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "gradients":
-        starts = [study.task(env).take(2) for env in given.envs]
+        starts = [study.load_task(env).take(2) for env in given.envs]
         publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])
     elif given.part in NOTEBOOKS:
         publish(notebook, executed(runs.notebooks()[given.part], run, given.envs, given.models))

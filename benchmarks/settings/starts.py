@@ -41,7 +41,7 @@ def main() -> None:
     arguments = parser.parse_args()
     run = runs.resolve("07_action_prior", scale=arguments.scale)
     path = arguments.out or run.metrics / "07_starts.csv"
-    posed = study.task(ENV, "validation").take(arguments.targets)
+    posed = study.load_task(ENV, "validation").take(arguments.targets)
     model, prior = (study.load_or_train(run, ENV, word)[0] for word in (arguments.model, "prior"))
     held_out, train = (torch.from_numpy(study.dataset(run, ENV, split).actions) for split in ("test", "train"))
     spaces: dict[str, SearchSpace] = {

@@ -156,7 +156,8 @@ from tsmlib.study import runs
 for seed in range(int(sys.argv[4])):
     run = runs.resolve("05_control", scale="smoke", seed=seed, run_dir=sys.argv[1])
     net, header = study.load_or_train(run, "tsm/Reacher-v0", "tsm")
-    trial = study.trial(run, study.task("tsm/Reacher-v0", "validation").take(2), study.method("tsm", "direct", "cem"))
+    task = study.load_task("tsm/Reacher-v0", "validation").take(2)
+    trial = study.trial(run, task, study.method("tsm", "direct", "cem"))
     data = {path.name: manifest.sha256(path) for path in sorted((run.data / "Reacher").glob("*.safetensors"))}
     curve = header["curves"]["loss"]
     print("made", json.dumps({

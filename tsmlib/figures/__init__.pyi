@@ -46,7 +46,6 @@ from .rollouts import rollout_panels as rollout_panels
 from .sliders import slider_panel as slider_panel
 from .style import save as save
 from .style import stamp as stamp
-from .style import use_style as use_style
 from .video import animation as animation
 from .video import embed as embed
 from .video import save_video as save_video

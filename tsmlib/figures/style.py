@@ -29,11 +29,6 @@ DASHED = (0, (3, 1.5))
 JOINTS = ("shoulder", "elbow")
 
 
-def use_style() -> None:
-    """Draw everything that follows, the caller's own plots too, in the style of the package."""
-    plt.style.use(STYLE)
-
-
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     """Run ``draw`` in the package's style and leave no figure open in pyplot, whether it returns or raises."""
 

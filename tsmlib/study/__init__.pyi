@@ -9,8 +9,6 @@ from .data import random_data as random_data
 from .data import sizes as sizes
 from .gradients import error_rows as error_rows
 from .gradients import signal_rows as signal_rows
-from .models import Trained as Trained
-from .models import TrainedModel as TrainedModel
 from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
@@ -23,7 +21,6 @@ from .plans import as_judged as as_judged
 from .plans import plan as plan
 from .plans import trial as trial
 from .plans import trials as trials
-from .policies import EPISODES as EPISODES
 from .policies import Budget as Budget
 from .policies import assess as assess
 from .policies import execute_policy as execute_policy
@@ -31,7 +28,6 @@ from .policies import learn as learn
 from .policies import policy_rows as policy_rows
 from .policies import stored_budget as stored_budget
 from .policies import within_data as within_data
-from .predictions import RESULTS as RESULTS
 from .predictions import pooled_rows as pooled_rows
 from .predictions import score_all as score_all
 from .predictions import score_rows as score_rows
@@ -39,11 +35,11 @@ from .predictions import scores as scores
 from .predictions import table as table
 from .robots import beside_the_oracle as beside_the_oracle
 from .robots import scoreboard as scoreboard
+from .runs import RESULTS as RESULTS
 from .tasks import FROZEN as FROZEN
 from .tasks import TASK_SEED as TASK_SEED
 from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
-from .tasks import task as task
 from .torques import action_prior as action_prior
 from .torques import task_torques as task_torques
 from .zoo import BUDGET as BUDGET

@@ -26,8 +26,7 @@ from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
-from tsmlib.study.predictions import RESULTS
-from tsmlib.study.runs import Run
+from tsmlib.study.runs import RESULTS, Run
 
 VERSION = 2  # of planners and kept plans; others are made again
 CANDIDATES = {"smoke": 8, "laptop": 96, "paper": 96}  # of each iteration of cem and mppi, and for adam+starts

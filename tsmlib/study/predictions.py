@@ -18,10 +18,8 @@ from tsmlib.study.data import dataset
 from tsmlib.study.models import load_or_train
 from tsmlib.study.notebooks import require
 from tsmlib.study.results import prediction as prediction_results
-from tsmlib.study.runs import ROOT, Run, RunError
+from tsmlib.study.runs import RESULTS, Run, RunError
 from tsmlib.trajectory import Segment
-
-RESULTS = ROOT / "data" / "results"
 
 
 def scores(run: Run, env: str, model: str, *, segments: bool = False) -> prediction.Scores:

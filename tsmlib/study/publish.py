@@ -22,7 +22,6 @@ from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL
 from tsmlib.study.drawings import Drawing
 from tsmlib.study.notebooks import require
-from tsmlib.study.predictions import RESULTS
 from tsmlib.study.results import exploration as exploration_results
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import policies as policies_results
@@ -30,7 +29,7 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
-from tsmlib.study.runs import ROOT, Notebook, Run, RunError
+from tsmlib.study.runs import RESULTS, ROOT, Notebook, Run, RunError
 from tsmlib.study.tasks import load_task
 from tsmlib.study.zoo import OURS, PAPERS
 

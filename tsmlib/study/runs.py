@@ -23,6 +23,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
 ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
 NOTEBOOKS = ROOT / "notebooks"
+RESULTS = ROOT / "data" / "results"  # the published tables
 
 T = TypeVar("T")
 

@@ -37,9 +37,6 @@ def load_task(env: str, split: str = "test") -> Task:
     return draw_task(env, seed=TASK_SEED[split])
 
 
-task = load_task
-
-
 def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
     """Starts and targets from the environment's reset."""
     copies = gymnasium.make_vec(env, num_envs=n)

@@ -26,9 +26,8 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Claim
 from tsmlib.study.claims.query import Check, Term
 from tsmlib.study.notebooks import require
-from tsmlib.study.runs import ROOT, Run, notebooks
+from tsmlib.study.runs import RESULTS, Run, notebooks
 
-RESULTS = ROOT / "data" / "results"
 TRIALS = ("target", "copy")  # columns that number the trials inside a seed
 MADE_BY = {  # table -> what to run where it lacks rows; of the others, their notebook
     "03_ablation": "python -m tsmlib run predict --scale paper",
