@@ -15,6 +15,8 @@ and those of the prior, and the signal of gradients at the first 50 starts (07_a
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.
 
+rounds: of exploration on the pendulum, by own plans and as many random episodes (10_explore); --envs is not asked.
+
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
 
@@ -31,7 +33,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import notebooks, parameters, runs, zoo
+from tsmlib.study import notebooks, parameters, rounds, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget
 from tsmlib.study.results import action_prior, planning
@@ -41,7 +43,7 @@ from tsmlib.study.runs import RESULTS
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "latent": "04_latent",
-    "torques": "07_action_prior",
+    "torques": "07_action_prior", "rounds": "10_explore",
 }  # fmt: skip
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
@@ -55,8 +57,10 @@ def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.Da
 
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
-    curve = rows["planner"] == "policy"
-    what = {name: rows[name].astype(str).mask(curve, "") for name in ("metric", "iteration", "subset", "steps_ahead")}
+    curve, more = rows["planner"] == "policy", ("metric", "iteration", "subset", "steps_ahead")
+    what = {name: rows[name].astype(str).mask(curve, "") for name in more}
+    if "configuration" in rows:
+        what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps")}
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
@@ -111,7 +115,7 @@ def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: li
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies"))
-    parser.add_argument("--envs", nargs="+", required=True, choices=ENV_IDS, metavar="ENV")
+    parser.add_argument("--envs", nargs="+", default=[], choices=ENV_IDS, metavar="ENV")
     parser.add_argument("--models", nargs="+", default=[], choices=zoo.words(), metavar="MODEL")
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
@@ -123,6 +127,8 @@ def main() -> None:
     given = parser.parse_args()
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
+    if not given.envs and given.part != "rounds":
+        parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "predict":
@@ -132,6 +138,10 @@ def main() -> None:
         publish(notebook, study.score_rows(run, pairs))
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
+    elif given.part == "rounds":
+        sizes = rounds.SIZES[run.scale]
+        loops = list(product(given.models, (False, True)))
+        publish(notebook, [row for word, random in loops for row in rounds.loop(run, word, sizes, random=random)])
     elif given.part == "gradients":
         starts = [study.load_task(env).take(2) for env in given.envs]
         publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])

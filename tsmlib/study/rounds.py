@@ -72,6 +72,13 @@ class Sizes:
         )  # fmt: skip
 
 
+SIZES = {  # by scale
+    "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
+    "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
+    "paper": Sizes(6, 4, 4, 120, 8, 24, 5, 2),
+}
+
+
 def upright(states: Tensor, actions: Tensor) -> Tensor:
     """Height of the pendulum, from -1 to 1, less what its speed costs."""
     return states[..., 0] - 0.01 * states[..., 2].square()
