@@ -15,7 +15,8 @@ and those of the prior, and the signal of gradients at the first 50 starts (07_a
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.
 
-rounds: of exploration on the pendulum, by own plans and as many random episodes (10_explore); --envs is not asked.
+rounds: of exploration on the pendulum, by own plans and as many random episodes; adaptation: shipped models adapted to
+the arm with 70 % of the torque, in every way, from --episodes (10_explore). Neither asks for --envs.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
@@ -30,10 +31,11 @@ from pathlib import Path
 import pandas as pd
 
 from tsmlib import study
+from tsmlib.envs import variant
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import notebooks, parameters, rounds, runs, zoo
+from tsmlib.study import adaptation, notebooks, parameters, rounds, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget
 from tsmlib.study.results import action_prior, planning
@@ -44,6 +46,7 @@ KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution",
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "latent": "04_latent",
     "torques": "07_action_prior", "rounds": "10_explore",
+    "adaptation": "10_explore",
 }  # fmt: skip
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
@@ -102,6 +105,16 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     return rows
 
 
+def adapted(run: runs.Run, models: list[str], episodes: list[int]) -> list[Row]:
+    """Rows of 10_explore.csv: of shipped models, adapted to a weaker arm; zero-shot whatever the episodes are."""
+    env, rows = variant("tsm/Reacher-v0", torque_gain=0.7), list[Row]()
+    for word in models:
+        for way in adaptation.ways(word):
+            for n in episodes[:1] if way == "zero-shot" else episodes:
+                rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
+    return rows
+
+
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
     """The table that a notebook leaves in the run's folder, for these environments and models."""
     asked = {"env": ",".join(envs), "models": ",".join(models)}
@@ -120,6 +133,7 @@ def main() -> None:
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
+    parser.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
     parser.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
     parser.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
@@ -127,7 +141,7 @@ def main() -> None:
     given = parser.parse_args()
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
-    if not given.envs and given.part != "rounds":
+    if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
@@ -142,6 +156,8 @@ def main() -> None:
         sizes = rounds.SIZES[run.scale]
         loops = list(product(given.models, (False, True)))
         publish(notebook, [row for word, random in loops for row in rounds.loop(run, word, sizes, random=random)])
+    elif given.part == "adaptation":
+        publish(notebook, adapted(run, given.models, given.episodes))
     elif given.part == "gradients":
         starts = [study.load_task(env).take(2) for env in given.envs]
         publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])
