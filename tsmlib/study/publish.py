@@ -37,7 +37,9 @@ README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
-ASKED = {"04_latent": {"env": f"tsm/ReacherObstacle-v0,{PUSH}"}}  # parameters for these cells; without the plain arm
+ASKED = {  # parameters for these cells: without the plain arm, and plans for few targets
+    "04_latent": {"env": f"tsm/ReacherObstacle-v0,{PUSH}"}, "07_action_prior": {"n_targets": "20"},
+}  # fmt: skip
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 README_MODELS = (PAPERS, OURS, "onestep", "lstm")
