@@ -415,13 +415,14 @@ def exploration_page(rows: pd.DataFrame) -> str:
     seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
     return f"""## Exploration and adaptation
 
-Written from the rows that `python -m tsmlib run explore --scale paper` made, training seed {seeds};
-`python -m tsmlib publish --table explore` copies them. Plans of the pendulum are made anew every ten steps, from n
+Written from the rows that `python -m tsmlib run explore --scale paper` or `python
+benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every ten steps, from n
 starts that no round trains on; steps count the random episodes before the first round.
 
 {exploration_results.rounds_table(rows)}
 
-The arm has lost 30 % of its torque; n test episodes, open loop after ten observed steps, in units of the standard arm:
+The arm has lost 30 % of its torque; n test episodes, open loop after ten observed steps, in units of the standard arm.
+Seeds are of the few episodes and of the updates on them: all begin from the one model that ships.
 
 {exploration_results.ways_table(rows)}
 
