@@ -384,7 +384,7 @@ def robots_page(rows: pd.DataFrame) -> str:
     if not len(rows):
         return ""
     seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
-    return f"""## Gymnasium's robots
+    return f"""## Robots of Gymnasium
 
 Written from the rows that `python -m tsmlib run your_own --scale paper` made, training seed {seeds};
 `python -m tsmlib publish --table your_own` copies them. Data are smooth random actions, collected by the package:
