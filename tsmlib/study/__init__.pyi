@@ -12,6 +12,7 @@ from .gradients import signal_rows as signal_rows
 from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
+from .models import load_prior as load_prior
 from .models import schedule as schedule
 from .models import train_all as train_all
 from .needed import needs as needs
@@ -40,7 +41,6 @@ from .tasks import FROZEN as FROZEN
 from .tasks import TASK_SEED as TASK_SEED
 from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
-from .torques import action_prior as action_prior
 from .torques import task_torques as task_torques
 from .zoo import BUDGET as BUDGET
 from .zoo import method as method

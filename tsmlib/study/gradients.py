@@ -8,18 +8,17 @@ from tsmlib.evaluation import gradients
 from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.study.models import load_or_train
+from tsmlib.study.models import load_or_train, load_prior
 from tsmlib.study.results import table
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
-from tsmlib.study.torques import action_prior
 from tsmlib.study.zoo import method
 
 
 def error_rows(run: Run, task: Task, models: Sequence[str]) -> list[Row]:
     """Rows of the largest relative error of the gradients of the return of ``models``, of all that it is a function of,
     from the starts of a task."""
-    prior, rows = action_prior(run, task), list[Row]()
+    prior, rows = load_prior(run, task.env), list[Row]()
     about = dict(env=task.env, metric="gradient_error", unit="ratio", horizon=task.horizon, n=len(task))
     for model in models:
         net = load_or_train(run, task.env, model).model
@@ -32,7 +31,7 @@ def error_rows(run: Run, task: Task, models: Sequence[str]) -> list[Row]:
 def signal_rows(run: Run, task: Task, models: Sequence[str], *, samples: int) -> list[Row]:
     """Rows with a ``target``: signal-to-noise of the gradients of the return of ``models``, in both search spaces, over
     so many samples, at the starts of a task."""
-    prior = action_prior(run, task)
+    prior = load_prior(run, task.env)
     spaces: dict[str, SearchSpace] = {
         "latent": LatentActions(prior, task.horizon),
         "direct": DirectActions(task.horizon),

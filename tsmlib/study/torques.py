@@ -3,27 +3,19 @@
 import torch
 
 from tsmlib.evaluation import actions
-from tsmlib.models.action_prior import ActionPrior
 from tsmlib.planning.tasks import Task
 from tsmlib.study.data import dataset
-from tsmlib.study.models import load_or_train
+from tsmlib.study.models import load_prior
 from tsmlib.study.results.action_prior import Torques
 from tsmlib.study.runs import Run
 
 TRAINED_ON = 500  # training episodes that others are measured against
 
 
-def action_prior(run: Run, task: Task) -> ActionPrior:
-    """The prior of a task's arm."""
-    prior = load_or_train(run, task.env, "prior").model
-    assert isinstance(prior, ActionPrior)
-    return prior
-
-
 def task_torques(run: Run, task: Task) -> Torques:
     """Held-out torques, samples of the prior, and the former reconstructed by it, each as long as the task."""
     train, held_out = (torch.from_numpy(dataset(run, task.env, split).actions) for split in ("train", "test"))
-    prior, draw = action_prior(run, task), torch.Generator().manual_seed(run.seed)
+    prior, draw = load_prior(run, task.env), torch.Generator().manual_seed(run.seed)
     data = held_out[: len(held_out) // 2, : task.horizon]
     made = {
         "data": data,

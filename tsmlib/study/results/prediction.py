@@ -263,12 +263,9 @@ def over_the_best(
         wide = part.pivot(index="steps_ahead", columns="model", values="value")
         others = wide.drop(columns=subject, errors="ignore")
         if subject in wide and others.shape[1]:
-            cells = (
-                (
-                    f"at {h} steps",
-                    f"{wide[subject][h] / others.loc[h].min():.2f} ({zoo.look(str(others.loc[h].idxmin())).name})",
-                )
-                for h in steps_ahead
-            )
-            lines.append({"seed": seed, **dict(cells)})
+            line = {"seed": seed}
+            for h in steps_ahead:
+                best = str(others.loc[h].idxmin())
+                line[f"at {h} steps"] = f"{wide[subject][h] / others[best][h]:.2f} ({zoo.look(best).name})"
+            lines.append(line)
     return pd.DataFrame(lines)
