@@ -4,13 +4,14 @@
     python benchmarks/settings/rows.py control --scale paper --envs tsm/ReacherPush-v1 --models rtsm lstm --closed rtsm
     python benchmarks/settings/rows.py latent --scale paper --envs tsm/ReacherPush-v1 --models tsm rtsm
 
-predict: open loop and on segments (03_predict). control: plans by each planner in both search spaces, open loop, and by
-the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes, no torque and
-random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in both search
-spaces, of the others direct alone, as in 05_control, by --copies and --iterations; name all models in one call, since
-how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are those of the
-run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques
-and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior).
+predict: open loop and on segments (03_predict); ablations: the same as rows of 03_ablation, where variants of TSM are
+compared on pushing with it and with the one-step model. control: plans by each planner in both search spaces, open
+loop, and by the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes,
+no torque and random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in
+both search spaces, of the others direct alone, as in 05_control, by --copies and --iterations; name all models in one
+call, since how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are
+those of the run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-
+out torques and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior).
 
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.
@@ -44,9 +45,8 @@ from tsmlib.study.runs import RESULTS
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
-    "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "latent": "04_latent",
-    "torques": "07_action_prior", "rounds": "10_explore",
-    "adaptation": "10_explore",
+    "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
+    "latent": "04_latent", "torques": "07_action_prior", "rounds": "10_explore", "adaptation": "10_explore",
 }  # fmt: skip
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
@@ -145,11 +145,11 @@ def main() -> None:
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
-    if given.part == "predict":
+    if given.part in ("predict", "ablations"):
         pairs = list(product(given.envs, given.models))
         wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
         study.precompute(run, wanted)
-        publish(notebook, study.score_rows(run, pairs))
+        publish("03_ablation" if given.part == "ablations" else notebook, study.score_rows(run, pairs))
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":

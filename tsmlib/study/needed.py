@@ -56,7 +56,7 @@ def ablations(run: Run) -> list[tuple[str, str]]:
     envs, words = chosen(run)
     if run.scale == "laptop" or run.seed or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
         return []
-    choices = run.pick(smoke=["tsm+plain"], laptop=[], paper=["tsm+full", "tsm+plain"])
+    choices = run.pick(smoke=["tsm+plain"], laptop=[], paper=list(zoo.words("choice")))
     return [(PUSH, word) for word in (*APART, "onestep", *choices)]
 
 

@@ -145,6 +145,11 @@ def _muon(stage: Stage) -> Stage:
     return replace(stage, muon=0.02, lr=2e-3)
 
 
+def _slower(*stages: Stage) -> tuple[Stage, ...]:
+    """TSM's stages for pushing and those of its variants: with Muon at a lower rate, since they diverge at 0.02."""
+    return tuple(replace(stage, muon=0.006) for stage in stages)
+
+
 TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
 LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10)
 RECURRENT = (  # the mode first, since a sample costs less than two; at last over longer windows
@@ -168,7 +173,15 @@ def _skip(env: EnvSpec) -> dict[str, Json]:
 def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
     """One of the paper's choices, changed; as many updates as TSM."""
     look = Look(f"TSM, {name}", colour)
-    return ModelSpec(word, look, "tsmlib.models.tsm:TSM", PAPER, lambda env: _wide(env) | arguments, "choice")
+    return ModelSpec(
+        word,
+        look,
+        "tsmlib.models.tsm:TSM",
+        PAPER,
+        lambda env: _wide(env) | arguments,
+        "choice",
+        pushing=_slower(*PAPER),
+    )
 
 
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any colour vision --------
@@ -183,7 +196,7 @@ _TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
 _MODELS = (
     ModelSpec(
         "tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True,
-        pushing=tuple(replace(stage, muon=0.006) for stage in PAPER),  # diverges at 0.02
+        pushing=_slower(*PAPER),
     ),
     ModelSpec(
         "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT,
@@ -192,18 +205,19 @@ _MODELS = (
     ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy", Look("TSM + energy", "#56B4E9", "D"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
-        "ablation",
+        "ablation", pushing=_slower(TEACHER, _free("energy_loss", (11, 6.9))),
     ),
     ModelSpec(  # the same with the state skip, and more teacher forcing
         "tsm+energy+direct", Look("TSM + energy + skip", "#4F7FBF", ">"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
-        _skip, "ablation",
+        _skip, "ablation", pushing=_slower(LONGER, _free("energy_loss", 8, 0.6)),
     ),
     ModelSpec(
         "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "p"), _TSM, (replace(TEACHER, share=1.0),), _wide,
-        "ablation",
+        "ablation", pushing=_slower(replace(TEACHER, share=1.0)),
     ),
     ModelSpec(  # the state skip with the paper's loss
         "tsm+direct", Look("TSM + skip", "#7BA7D9", "h"), _TSM, (LONGER, _free("loss", 11, 0.6)), _skip, "ablation",
+        pushing=_slower(LONGER, _free("loss", 11, 0.6)),
     ),
     ModelSpec(
         "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (Stage("loss", 36),), planned=True,
@@ -237,6 +251,7 @@ _MODELS = (
     replace(
         _choice("tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)),  # receptive field 2 H
         stages=(replace(TEACHER, future_len=20), PAPER[1]),
+        pushing=_slower(replace(TEACHER, future_len=20), PAPER[1]),
     ),
 )  # fmt: skip
 ZOO = {spec.word: spec for spec in _MODELS}
