@@ -146,7 +146,7 @@ def _muon(stage: Stage) -> Stage:
 
 
 def _slower(*stages: Stage) -> tuple[Stage, ...]:
-    """TSM's stages for pushing and those of its variants: with Muon at a lower rate, since they diverge at 0.02."""
+    """TSM's stages for pushing and those of its variants: with Muon at a lower rate, since TSM diverges at 0.02."""
     return tuple(replace(stage, muon=0.006) for stage in stages)
 
 
