@@ -21,7 +21,7 @@ WEAK = tsmlib.envs.variant("tsm/Reacher-v0", torque_gain=0.7)
 
 
 def test_every_way_of_a_model_has_a_budget_and_a_look() -> None:
-    assert set(results.WAYS) == set(adaptation.WAYS)
+    assert set(results.WAYS) == {*adaptation.WAYS, adaptation.REFERENCE}
     assert adaptation.ways("rtsm") == adaptation.WAYS
     assert "codes" not in adaptation.ways("lstm")
 
@@ -63,11 +63,13 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     common = dict(env=WEAK, model="rtsm", planner="none", execution="open loop", n=9, seed=0, scale="smoke")
     rows = tables.frame([
         common | dict(configuration=way, env_steps=steps, metric=metric, steps_ahead=80, value=value)
-        for way, steps, value in (("zero-shot", 0, 2.0), ("all", 2000, 0.5)) for metric in results.SCORES
+        for way, steps, value in (("zero-shot", 0, 2.0), ("all", 2000, 0.5), ("reference", 50_000, 0.4))
+        for metric in results.SCORES
     ])  # fmt: skip
-    assert "is left by all weights (20) 25%" in results.sentences(rows)
+    assert "is left by all weights (20) 25%, trained in full (500) 20%" in results.sentences(rows)
+    assert "of what training in full takes off it, all weights (20) 94% is taken off" in results.sentences(rows)
     panels = results.way_panels(rows, 80, 20)
-    assert [float(row[0]) for row in panels["recurrent TSM"]["torque gain 0.7"].values()] == [2.0, 0.5]
+    assert [float(row[0]) for row in panels["recurrent TSM"]["torque gain 0.7"].values()] == [2.0, 0.5, 0.4]
 
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:

@@ -17,7 +17,8 @@ gradients: their errors (02_train). collect and latent execute 01_collect and 04
 and --models, as far as these ask for them, and publish what their tables then say.
 
 rounds: of exploration on the pendulum, by own plans and as many random episodes; adaptation: shipped models adapted to
-the arm with 70 % of the torque, in every way, from --episodes (10_explore). Neither asks for --envs.
+the arm with 70 % of the torque, in every way, from --episodes, and one trained on it in full (10_explore). Neither asks
+for --envs.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
@@ -109,8 +110,8 @@ def adapted(run: runs.Run, models: list[str], episodes: list[int]) -> list[Row]:
     """Rows of 10_explore.csv: of shipped models, adapted to a weaker arm; zero-shot whatever the episodes are."""
     env, rows = variant("tsm/Reacher-v0", torque_gain=0.7), list[Row]()
     for word in models:
-        for way in adaptation.ways(word):
-            for n in episodes[:1] if way == "zero-shot" else episodes:
+        for way in (*adaptation.ways(word), adaptation.REFERENCE):
+            for n in episodes[:1] if way in ("zero-shot", adaptation.REFERENCE) else episodes:
                 rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
     return rows
 

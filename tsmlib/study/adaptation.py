@@ -3,6 +3,9 @@
 A way is what is done with ``n`` episodes of the changed arm: ``zero-shot`` nothing, ``all``, ``head`` and ``codes``
 fine-tuning of that part, ``scratch`` a new model trained on them. A fifth of the episodes, at least one, is held out to
 choose among validations. The numbers of updates of a model are the same whatever the arm and the episodes.
+
+What they are held against is the ``reference``: a model trained on the changed arm as the shipped one was on its own,
+by as many episodes and updates.
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ from tsmlib.models.base import DynamicsModel
 from tsmlib.models.features import Features
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.study import zoo
-from tsmlib.study.data import HELD_OUT_SEED, random_data
-from tsmlib.study.models import TrainedModel, load_pretrained
+from tsmlib.study.data import HELD_OUT_SEED, random_data, sizes
+from tsmlib.study.models import TrainedModel, load_or_train, load_pretrained
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
@@ -28,6 +31,8 @@ from tsmlib.trajectory import Trajectories
 
 Way = Literal["zero-shot", "all", "head", "codes", "scratch"]
 WAYS: tuple[Way, ...] = ("zero-shot", "all", "head", "codes", "scratch")
+Reference = Literal["reference"]
+REFERENCE: Reference = results.REFERENCE
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
 FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen
@@ -114,10 +119,14 @@ def units_of(env: str) -> Features:
 
 
 def rows(
-    run: Run, word: str, env: str, *, way: Way, episodes: int, n_test: int, share: float = 1.0
+    run: Run, word: str, env: str, *, way: Way | Reference, episodes: int, n_test: int, share: float = 1.0
 ) -> tuple[TrainedModel, list[Row]]:
-    """A model of ``env`` by a way, and the rows of its scores."""
-    net, seconds = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
+    """A model of ``env`` by a way, and the rows of its scores. A reference has the scale's episodes and updates."""
+    if way == REFERENCE:
+        found, n = load_or_train(run, env, word), sizes(run, env)["train"]
+        net, seconds = found.model, cast(float, found.header["seconds"])
+    else:
+        net, seconds = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
+        n = 0 if way == "zero-shot" else episodes
     scores = scored(net, env, held_out(env, n_test), seed=run.seed)
-    n = 0 if way == "zero-shot" else episodes
     return net, results.adapted_rows(run, env, word, way, scores, episodes=n, ahead=AHEAD, seconds=seconds)

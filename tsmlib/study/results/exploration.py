@@ -8,6 +8,7 @@ of the changed arm that they know, and ``configuration`` is the way (``study.ada
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -23,6 +24,7 @@ from tsmlib.study.runs import Run
 
 PENDULUM, HORIZON = "Pendulum-v1", 100
 PLANNED, RANDOM = "own plans", "random episodes"
+REFERENCE: Final = "reference"
 ROUNDS = {"return_true": "executed return", "gap_absolute": "size of the gap", "success": "share upright",
           "highest": "highest by random codes"}  # fmt: skip
 SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
@@ -30,6 +32,7 @@ WAYS = {
     "zero-shot": Look("zero-shot", "#7A7A7A", "o"), "all": Look("all weights", "#003C8F", "*"),
     "head": Look("head", "#56B4E9", "s"), "codes": Look("codes", "#CC79A7", "D"),
     "scratch": Look("from scratch", "#E69F00", "^"),
+    "reference": Look("trained in full", "#111111", "P"),
 }  # fmt: skip
 
 
@@ -89,11 +92,13 @@ def round_panels(rows: pd.DataFrame, titles: Sequence[str]) -> dict[str, dict[Me
 
 
 def way_panels(rows: pd.DataFrame, steps_ahead: int, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
-    """Model -> arm -> way -> energy score, one value per seed, for ``figures.figure5``."""
+    """Model -> arm -> way -> energy score, one value per seed, for ``figures.figure5``.
+
+    episodes: of the ways that take some. The reference has those of its training.
+    """
     found: dict[str, dict[str, dict[Method, np.ndarray]]] = {}
-    here = table.select(
-        rows, execution=OPEN, metric="energy_score_noise", steps_ahead=steps_ahead, env_steps=[0, 100 * episodes]
-    )
+    here = table.select(rows, execution=OPEN, metric="energy_score_noise", steps_ahead=steps_ahead)
+    here = here[here["env_steps"].isin([0, 100 * episodes]) | (here["configuration"] == REFERENCE)]
     for (word, env), own in table.groups(here, ["model", "env"]):
         values = table.values(own, "configuration")
         named = {Method(way, look=WAYS[way]): values[way] for way in WAYS if way in values}
@@ -137,7 +142,8 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 @table.told
 def sentences(rows: pd.DataFrame) -> Iterator[str]:
-    """What the rounds changed, learner by learner; how much of the zero-shot error fine-tuning leaves."""
+    """What the rounds changed, learner by learner; how much of the zero-shot error each way leaves, and how much of
+    what the reference takes off it."""
     for (word, data), own in table.groups(table.select(rows, execution=CLOSED), ["model", "configuration"]):
         first, last = own["iteration"].min(), own["iteration"].max()
         means = own.groupby(["metric", "iteration"])["value"].mean()
@@ -155,3 +161,10 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
             said = [f"{WAYS[way].name} ({steps // 100}) {value / zero:.0%}" for (way, steps), value in left.items()]
             ahead = own["steps_ahead"].max()
             yield f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left by {', '.join(said)}."
+            lost = zero - next((value for (way, _), value in left.items() if way == REFERENCE), zero)
+            if lost > 0:
+                said = [
+                    f"{WAYS[way].name} ({steps // 100}) {(zero - value) / lost:.0%}"
+                    for (way, steps), value in left.items() if way != REFERENCE
+                ]  # fmt: skip
+                yield f"`{env}`, `{word}`: of what training in full takes off it, {', '.join(said)} is taken off."
