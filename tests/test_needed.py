@@ -46,7 +46,9 @@ def test_a_change_of_a_schedule_changes_the_settings_of_its_model_alone(tmp_path
     assert changed == {"model", "scores"}
 
 
-def test_policies_of_the_papers_model_are_learned_where_robustness_needs_them(tmp_path: Path) -> None:
-    for seed, found in ((0, {needed.REACH}), (1, set[str]())):
+def test_policies_of_the_papers_model_are_those_of_seed_0_and_on_pushing_all_learn_as_long(tmp_path: Path) -> None:
+    for seed, found in ((0, {needed.REACH, needed.PUSH}), (1, set[str]())):
         run = resolve("05_control", scale="paper", seed=seed, run_dir=str(tmp_path))
-        assert {env for env, way, _ in needed.control(run).policies if way.model == "tsm"} == found
+        asked = needed.control(run).policies
+        assert {env for env, way, _ in asked if way.model == "tsm"} == found
+        assert {budget for env, _, budget in asked if env == needed.PUSH} == {needed.ON_IMPERFECT}

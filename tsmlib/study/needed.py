@@ -102,14 +102,14 @@ def control(run: Run) -> Control:
 
 
 def _policies(run: Run) -> list[tuple[str, Method, Budget]]:
-    """Environment, method and budget; those of the paper's model, which take half an hour each, only where
-    06_robustness learns them too or the run has them."""
+    """Environment, method and budget; those of the paper's model, which take half an hour each, only of seed 0 or where
+    the run has them. On pushing all have the smaller budget."""
     inside = [*methods((PAPERS, OURS), "policy"), *methods(BASELINES, "policy", ["direct"])]
     found: list[tuple[str, Method, Budget]] = []
     for env, way in product((REACH, PUSH), run.pick(smoke=inside[:1], laptop=[], paper=inside)):
         budget, kept = run.pick(smoke=Budget(), laptop=Budget(), paper=WHOLE), stored_budget(run, env, way)
-        if run.scale == "paper" and way.model == PAPERS:
-            if kept is None and (env, run.seed) != (REACH, 0):
+        if run.scale == "paper" and (way.model == PAPERS or env == PUSH):
+            if way.model == PAPERS and kept is None and run.seed:
                 continue
             budget = ON_IMPERFECT
         found.append((env, way, kept or budget))
