@@ -74,8 +74,10 @@ class Page:
     def script(self, text: str) -> Any:
         return self.ask("/execute/sync", script=text, args=[])
 
-    def picture(self) -> bytes:
-        with urllib.request.urlopen(self.session + "/screenshot", timeout=300) as answer:
+    def picture(self, selector: str) -> bytes:
+        """What one element looks like."""
+        (element,) = self.script(f"return document.querySelector('{selector}')").values()
+        with urllib.request.urlopen(f"{self.session}/element/{element}/screenshot", timeout=300) as answer:
             return base64.b64decode(json.load(answer)["value"])
 
 
@@ -111,5 +113,6 @@ def test_a_film_moves_in_a_notebook_that_is_not_trusted(tmp_path: Path) -> None:
         wait_for(lambda: page.script(f"return {area}.querySelector('video') !== null"))
         source = page.script(f"return {area}.querySelector('video source')?.getAttribute('src') ?? ''")
         assert source == ""  # the notebook is not trusted
-        assert wait_for(lambda: page.picture() != page.picture(), seconds=30)
+        shown = ".jp-OutputArea img"
+        assert wait_for(lambda: page.picture(shown) != page.picture(shown), seconds=30)
         urllib.request.urlopen(urllib.request.Request(page.session, method="DELETE"), timeout=60)

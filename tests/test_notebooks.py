@@ -80,6 +80,9 @@ def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monke
         rows = tables.records(tables.load(tmp_path / "smoke" / "seed0" / "metrics" / f"{path.stem}.csv"))
         assert rows
         assert {row["scale"] for row in rows} == {"smoke"}
+        if notebook.name != "claims":  # it reads all others, which at this scale say nothing
+            executed = (tmp_path / "smoke" / "seed0" / path.name).read_text()
+            assert "yours: scale smoke, seed 0, n " in executed, path.stem  # below a table
     status = manifest.statuses(tmp_path / "smoke" / "seed0")
     assert {name: entry["state"] for name, entry in status.items()} == {path.stem: "complete" for path in NOTEBOOKS}
     manifest.verify(tmp_path)

@@ -23,6 +23,7 @@ from tsmlib.study.zoo import OURS, PAPERS, method, methods
 
 ZERO, RANDOM = method("zero"), method("random")
 WHOLE, ON_IMPERFECT = Budget(copies=3), Budget(copies=3, iterations=880)  # of policies at scale paper
+BEGUN = Budget(iterations=20)  # at scale laptop, half a minute
 
 
 def needs(run: Run) -> list[Job]:
@@ -103,11 +104,12 @@ def control(run: Run) -> Control:
 
 def _policies(run: Run) -> list[tuple[str, Method, Budget]]:
     """Environment, method and budget; those of the paper's model, which take half an hour each, only of seed 0 or where
-    the run has them. On pushing all have the smaller budget."""
+    the run has them. On pushing all have the smaller budget. At scale laptop one begins to learn to reach."""
     inside = [*methods((PAPERS, OURS), "policy"), *methods(BASELINES, "policy", ["direct"])]
     found: list[tuple[str, Method, Budget]] = []
-    for env, way in product((REACH, PUSH), run.pick(smoke=inside[:1], laptop=[], paper=inside)):
-        budget, kept = run.pick(smoke=Budget(), laptop=Budget(), paper=WHOLE), stored_budget(run, env, way)
+    envs = run.pick(smoke=(REACH, PUSH), laptop=(REACH,), paper=(REACH, PUSH))
+    for env, way in product(envs, run.pick(smoke=inside[:1], laptop=[method(OURS, "latent", "policy")], paper=inside)):
+        budget, kept = run.pick(smoke=Budget(), laptop=BEGUN, paper=WHOLE), stored_budget(run, env, way)
         if run.scale == "paper" and (way.model == PAPERS or env == PUSH):
             if way.model == PAPERS and kept is None and run.seed:
                 continue
