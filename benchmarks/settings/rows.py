@@ -8,8 +8,8 @@ predict: open loop and on segments (03_predict); ablations: the same as rows of 
 compared on pushing with it and with the one-step model. control: plans by each planner in both search spaces, open
 loop, and by the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes,
 no torque and random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in
-both search spaces, of the others direct alone, as in 05_control, by --copies and --iterations; name all models in one
-call, since how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are
+both search spaces, of the others direct alone, as in 05_control, by --copies and --iterations where the run has none;
+name all models in one call, since how soon a policy learns is told by the plateau of the best of them. Models, scores, plans and policies are
 those of the run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-
 out torques and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior).
 
@@ -39,7 +39,7 @@ from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, notebooks, parameters, rounds, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
-from tsmlib.study.policies import Budget
+from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, planning
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import RESULTS
@@ -167,7 +167,8 @@ def main() -> None:
     elif given.part == "policies":
         budget, codes = Budget(given.copies, given.iterations), set(zoo.words(cls=zoo.CODED))
         policies = [
-            (study.load_task(env), way, budget) for env in given.envs for way in zoo.methods(given.models, "policy")
+            (study.load_task(env), way, stored_budget(run, env, way) or budget)
+            for env in given.envs for way in zoo.methods(given.models, "policy")
             if way.search_space == "direct" or way.model in codes
         ]  # fmt: skip
         study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in policies])
