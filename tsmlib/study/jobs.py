@@ -16,7 +16,7 @@ from tsmlib.figures.method import Method
 from tsmlib.storage.files import Json
 from tsmlib.study import models, plans, policies, predictions, zoo
 from tsmlib.study.data import dataset, sizes
-from tsmlib.study.plans import AGAIN, CANDIDATES, ITERATIONS, TORQUES
+from tsmlib.study.plans import CANDIDATES, TORQUES
 from tsmlib.study.policies import USUAL, Budget
 from tsmlib.study.runs import Run
 from tsmlib.study.tasks import load_task
@@ -152,8 +152,7 @@ class Plan:
         return plans.plan(run, task, self.method, iterations=self.iterations, every=self.every)
 
     def settings(self, run: Run) -> Json:
-        own = (AGAIN if self.every else ITERATIONS)[self.method.planner.partition("+")[0].replace("mppi", "cem")]
-        iterations = self.iterations or own[run.scale]
+        iterations = self.iterations or plans.usual_iterations(run, self.method, again=bool(self.every))
         return {"version": plans.VERSION, "n": self.n, "candidates": CANDIDATES[run.scale], "iterations": iterations}
 
     def seconds(self, run: Run) -> float:

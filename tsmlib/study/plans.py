@@ -67,6 +67,12 @@ def trials(
     }
 
 
+def usual_iterations(run: Run, method: Method, *, again: bool = False) -> int:
+    """A planner's iterations at a run's scale; again: of a later plan of a closed loop."""
+    by_slope = method.planner in ("adam", "adam+starts")
+    return (AGAIN if again else ITERATIONS)["adam" if by_slope else "cem"][run.scale]
+
+
 def plan(run: Run, task: Task, method: Method, *, iterations: int = 0, every: int = 0) -> Plan:
     """The plan alone; see ``trial``. ``predicted_return`` comes from 32 model samples that the planner did not see.
 
@@ -151,7 +157,7 @@ class _Problem:
         """With its models, trained where they are missing, and the scale's budget."""
         prior = load_prior(run, task.env) if method.search_space == "latent" else None
         model = None if method.model == "oracle" else load_or_train(run, task.env, method.model).model
-        usual = (AGAIN if every else ITERATIONS)["adam" if method.planner.startswith("adam") else "cem"][run.scale]
+        usual = usual_iterations(run, method, again=bool(every))
         return _Problem(run, task, method, model, prior, CANDIDATES[run.scale], iterations or usual, every)
 
     def made_from(self) -> dict[str, Json]:
