@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import tsmlib as tsm
 from tsmlib.evaluation.prediction import sample_states
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import as_dynamics, rollout, stepper
@@ -318,3 +319,15 @@ def test_held_out_windows_never_cross_an_end(ragged: Trajectories) -> None:
     predicted = Linear(H).predict_segment(found.past, found.future.actions)
     assert found.future.states.shape == (27, H, 3)
     torch.testing.assert_close(predicted, found.future.states, rtol=1e-4, atol=1e-5)
+
+
+def test_what_a_person_prints_is_a_line() -> None:
+    data = tsm.collect_random("tsm/Reacher-v0", 3, horizon=20, seed=0)
+    task = tsm.load_task("tsm/Reacher-v0").take(2)
+    trial = tsm.execute(task, torch.zeros(2, task.horizon, 2))
+    plan = tsm.Plan(trial.actions, trial.actions, trial.states[None], trial.executed_return, trial.executed_return, 1.0)
+    assert repr(data) == "Trajectories('tsm/Reacher-v0', 3 episodes, 20 steps, 6 states)"
+    assert repr(task) == f"Task('reach', 'tsm/Reacher-v0', 2 starts, {task.horizon} steps)"
+    for shown, kind in ((trial, "executed"), (plan, "predicted")):
+        assert f"mean {kind} return {float(trial.executed_return.mean()):.4g}" in repr(shown)
+        assert f"{task.horizon} steps" in repr(shown) and len(repr(shown)) < 100

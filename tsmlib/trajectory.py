@@ -51,7 +51,7 @@ class TrajectoryError(ValueError):
     """Data that cannot be a set of trajectories; the message names the array, episode, step and field."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectories:
     """Episodes of one environment.
 
@@ -73,6 +73,10 @@ class Trajectories:
     angles: tuple[int, ...] = ()
     lengths: tuple[int, ...] = ()
     terminated: tuple[bool, ...] = ()
+
+    def __repr__(self) -> str:
+        n, steps = self.actions.shape[:2]
+        return f"Trajectories({self.env!r}, {n} episodes, {steps} steps, {len(self.names)} states)"
 
     def __post_init__(self) -> None:
         states, actions = self.states, self.actions

@@ -43,7 +43,7 @@ class SearchSpace(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plan:
     """The best actions found for each of B targets.
 
@@ -59,6 +59,10 @@ class Plan:
     curve: Tensor
     seconds: float
     trace: Tensor | None = None
+
+    def __repr__(self) -> str:
+        n, steps = self.actions.shape[:2]
+        return f"Plan({n} targets, {steps} steps, mean predicted return {float(self.predicted_return.mean()):.4g})"
 
 
 class Planner(Protocol):

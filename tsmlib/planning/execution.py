@@ -26,7 +26,7 @@ from tsmlib.trajectory import Segment, Trajectories, real_steps
 SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be repeated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trial:
     """Actions executed in the true simulator.
 
@@ -49,6 +49,10 @@ class Trial:
     lengths: tuple[int, ...] = ()
     own_return: Tensor | None = None
     seen: Trajectories | None = None
+
+    def __repr__(self) -> str:
+        found = f"{len(self.actions)} episodes, {max(self.steps)} steps"
+        return f"Trial({found}, mean executed return {float(self.executed_return.mean()):.4g})"
 
     @property
     def steps(self) -> tuple[int, ...]:

@@ -24,7 +24,7 @@ TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it
 Success = Callable[[Tensor], Tensor]  # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Task:
     """B instances of one task in one environment. start (B, dx), horizon in steps.
 
@@ -48,6 +48,9 @@ class Task:
     seeds: tuple[int, ...] = ()
     success: Success | None = None
     action_dim: int = 2
+
+    def __repr__(self) -> str:
+        return f"Task({self.name!r}, {self.env!r}, {len(self.start)} starts, {self.horizon} steps)"
 
     @classmethod
     def from_env(
