@@ -68,8 +68,12 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     ])  # fmt: skip
     assert "is left by all weights (20) 25%, trained in full (500) 20%" in results.sentences(rows)
     assert "of what training in full takes off it, all weights (20) 94% is taken off" in results.sentences(rows)
-    panels = results.way_panels(rows, 80, 20)
-    assert [float(row[0]) for row in panels["recurrent TSM"]["torque gain 0.7"].values()] == [2.0, 0.5, 0.4]
+    (curves,) = results.way_curves(rows, 80).values()
+    assert [(way.model, *map(float, at), float(values[0, 0])) for way, (at, values) in curves.items()] == [
+        ("zero-shot", 0, 2.0), ("all", 20, 0.5), ("reference", 500, 0.4),
+    ]  # fmt: skip
+    (ax,) = figures.adapted({"model": curves}, "score", yours={"model": curves}).axes
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["0", "20", "500"]
 
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:

@@ -330,4 +330,5 @@ def test_what_a_person_prints_is_a_line() -> None:
     assert repr(task) == f"Task('reach', 'tsm/Reacher-v0', 2 starts, {task.horizon} steps)"
     for shown, kind in ((trial, "executed"), (plan, "predicted")):
         assert f"mean {kind} return {float(trial.executed_return.mean()):.4g}" in repr(shown)
-        assert f"{task.horizon} steps" in repr(shown) and len(repr(shown)) < 100
+        assert f"{task.horizon} steps" in repr(shown)
+        assert len(repr(shown)) < 100

@@ -11,6 +11,7 @@ from .data import workspace_coverage as workspace_coverage
 from .diagrams import figure1 as figure1
 from .diagrams import figure2 as figure2
 from .diagrams import figure3 as figure3
+from .exploration import adapted as adapted
 from .exploration import rounds as rounds
 from .exploration import visited as visited
 from .latent import around_touch as around_touch

@@ -54,6 +54,38 @@ def rounds(curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None
     return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 3 if len(curves) > 1 else 2)
 
 
+@styled
+def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
+    """Errors of adapted models against the episodes that they know of the changed robot, on logarithmic axes.
+
+    curves: title -> way -> episodes (R,) and errors (k, R), all above 0; yours: as curves, drawn over them as hollow
+    diamonds. Mean over seeds, bars for the 95 % t interval.
+    """
+    own, look_of = yours or {}, axes.looks(curves, yours or {})
+    figure, grid = panels(len(curves), len(curves), 2.1, head=0, sharex=True, sharey=True)
+    every = [found for rows in (*curves.values(), *own.values()) for found in rows.values()]
+    points, ticks = np.concatenate([np.ravel(y) for _, y in every]), sorted({float(x) for at, _ in every for x in at})
+    for ax, (title, rows) in zip(grid, curves.items(), strict=True):
+        axes.log_axis(ax, *axes.limits(points, points, log=True))
+        ax.set_xscale("symlog", linthresh=5)
+        ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.minorticks_off()
+        for way, given in rows.items():
+            at, found = _checked(f"{title}, {way.label}", *given)
+            mean, half = axes.band(found)
+            low = np.minimum(half, 0.9 * mean)  # the axis is logarithmic
+            ax.errorbar(at, mean, (low, half), **look_of[way] | {"ms": 5}, elinewidth=1, capsize=2)
+        for way, given in own.get(title, {}).items():
+            at, found = _checked(f"{title}, {way.label}, yours", *given)
+            axes.diamonds(ax, "y", at, found.mean(0), way)
+        ax.grid(axis="y", color=GRID, lw=0.6)
+        ax.set(title=title, xlabel="episodes of the changed arm")
+    grid[0].set_ylabel(ylabel)
+    bars = [entry("95 % interval over seeds", color=DARK, lw=1, marker="|", ms=8)] * any(len(y) > 1 for _, y in every)
+    handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
+    return axes.finish(figure, [grid], handles, 4)
+
+
 def _checked(word: str, at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     steps = finite(f"{word}, steps", at, "R")
     return steps, finite(word, values, f"k {len(steps)}")

@@ -35,6 +35,7 @@ Reference = Literal["reference"]
 REFERENCE: Reference = results.REFERENCE
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
+EPISODES = (5, 20, 80)  # of the changed arm
 FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen
 
 

@@ -91,21 +91,18 @@ def round_panels(rows: pd.DataFrame, titles: Sequence[str]) -> dict[str, dict[Me
     return found
 
 
-def way_panels(rows: pd.DataFrame, steps_ahead: int, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
-    """Model -> arm -> way -> energy score, one value per seed, for ``figures.figure5``.
-
-    episodes: of the ways that take some. The reference has those of its training.
-    """
-    found: dict[str, dict[str, dict[Method, np.ndarray]]] = {}
+def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
+    """Model -> way -> episodes of the changed arm (R,) and energy score (k, R), for ``figures.adapted``."""
+    found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     here = table.select(rows, execution=OPEN, metric="energy_score_noise", steps_ahead=steps_ahead)
-    here = here[here["env_steps"].isin([0, 100 * episodes]) | (here["configuration"] == REFERENCE)]
-    for (word, env), own in table.groups(here, ["model", "env"]):
-        values = table.values(own, "configuration")
-        named = {Method(way, look=WAYS[way]): values[way] for way in WAYS if way in values}
-        changed = EnvSpec.parse(env).physics.changed.items()
-        arm = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in changed)
-        found.setdefault(zoo.look(word).name, {})[arm] = named
-    return found
+    for (word, way), own in table.groups(here, ["model", "configuration"]):
+        wide = own.pivot(index="seed", columns="env_steps", values="value").dropna()
+        looked = Method(way, look=WAYS[way])
+        found.setdefault(zoo.look(word).name, {})[looked] = wide.columns.to_numpy(float) / 100, wide.to_numpy(float)
+    return {
+        model: dict(sorted(ways.items(), key=lambda item: [*WAYS].index(item[0].model)))
+        for model, ways in found.items()
+    }
 
 
 # Tables and sentences ------------------------------------------------------------------------------------------------
