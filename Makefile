@@ -49,7 +49,7 @@ explorer: $(READY)
 	$(PY) explorer/export.py explorer/dist
 	node explorer/build.mjs
 
-# RUN=runs/laptop/seed0 shows the notebooks as that run executed them.
+# Notebooks are shown as runs/laptop/seed0 executed them, or another: make docs RUN=runs/paper/seed0
 docs: $(READY)
 	$(PY) -c 'import myst_nb, furo, sphinx_copybutton, math_core' 2>/dev/null || $(PY) -m pip install -qq -r docs/requirements.lock
 	TSM_DOCS_RUN=$(RUN) OMP_NUM_THREADS=1 $(PY) -m sphinx -b html -n -W --keep-going docs docs/_build/html

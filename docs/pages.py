@@ -86,17 +86,36 @@ def write_modules() -> None:
 
 
 def copy_notebooks() -> None:
-    """docs/notebooks/ anew: the stored notebooks, or those that the run of $TSM_DOCS_RUN executed where it has them."""
-    target, executed = HERE / "notebooks", os.environ.get("TSM_DOCS_RUN", "")
+    """docs/notebooks/ anew: as the run of $TSM_DOCS_RUN executed them, or as they are stored, and which of both."""
+    target, run = HERE / "notebooks", os.environ.get("TSM_DOCS_RUN") or "runs/laptop/seed0"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
     for path in sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb")):
-        own = ROOT / executed / path.name
-        notebook = nbformat.read(own if executed and own.exists() else path, 4)
-        for cell in notebook.cells:
-            if cell.cell_type == "markdown":
-                cell.source = linked(cell.source.replace("](../docs/", "](../"))
-        nbformat.write(notebook, target / path.name)
+        nbformat.write(page_of(path, ROOT / run / path.name), target / path.name)
+
+
+def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
+    """A notebook with the outputs of ``executed`` where that was made from the notebook as it is stored now."""
+    notebook, said = nbformat.read(stored, 4), "Not executed for this page"
+    if executed.exists():
+        own = nbformat.read(executed, 4)
+        if code(own) == code(notebook):
+            notebook, said = own, f"As executed in `{os.path.relpath(executed.parent, ROOT)}`"
+        else:
+            said += f": `{os.path.relpath(executed, ROOT)}` is of another version of it"
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            cell.source = linked(cell.source.replace("](../docs/", "](../"))
+    command = f"`python -m tsmlib run {stored.stem.partition('_')[2]}`, then `make docs`"
+    notebook.cells.insert(1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*"))
+    return notebook
+
+
+def code(notebook: nbformat.NotebookNode) -> list[str]:
+    """Cells of code but for the parameters, which a run has its own of."""
+    cells = (cell for cell in notebook.cells if cell.cell_type == "code")
+    given = {"parameters", "injected-parameters"}
+    return [cell.source for cell in cells if not given & set(cell.metadata.get("tags", []))]
 
 
 def inline_formula(page: HTML5Translator, node: nodes.math) -> NoReturn:

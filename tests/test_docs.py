@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import pytest
 import yaml
 
@@ -100,3 +101,26 @@ def test_templates_and_workflow_are_yaml() -> None:
 def test_every_public_name_has_an_entry_in_the_reference() -> None:
     listed = set(re.findall(r"^   (\w+)$", (DOCS / "api" / "index.md").read_text(), re.MULTILINE))
     assert listed == {name for name in tsmlib.__all__ if not name.startswith("_")}
+
+
+def test_a_notebook_is_shown_as_it_was_executed_unless_it_has_changed_since(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("math_core")
+    monkeypatch.syspath_prepend(DOCS)
+    from pages import page_of
+
+    stored, executed = ROOT / "notebooks" / "08_claims.ipynb", tmp_path / "08_claims.ipynb"
+    assert "Not executed for this page" in page_of(stored, executed).cells[1].source
+    own = nbformat.read(stored, 4)
+    cells = [cell for cell in own.cells if cell.cell_type == "code"]
+    cells[1].outputs = [nbformat.v4.new_output("stream", text="what came out")]
+    nbformat.write(own, executed)
+    shown = page_of(stored, executed)
+    assert "As executed in" in shown.cells[1].source
+    assert "what came out" in str(shown)
+    cells[1].source += "\nmore"
+    nbformat.write(own, executed)
+    shown = page_of(stored, executed)
+    assert "is of another version" in shown.cells[1].source
+    assert "what came out" not in str(shown)
