@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import warnings
 from io import BytesIO
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from IPython.core.formatters import DisplayFormatter
+from matplotlib import font_manager
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
@@ -96,6 +98,18 @@ EVERY = {
 def test_every_figure_is_returned_and_none_is_left_open(name: str) -> None:
     assert isinstance(EVERY[name](), Figure)
     assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_figure_finds_its_fonts_and_glyphs(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    for family in ("DejaVu Sans", "STIXGeneral", "STIXNonUnicode"):
+        font_manager.findfont(family, fallback_to_default=False)  # refused where matplotlib's list of fonts is stale
+    figure = EVERY[name]()
+    figure.set_dpi(97)  # formulas are kept by resolution, and a missing glyph is only told of once
+    with caplog.at_level("WARNING", logger="matplotlib"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure.draw_without_rendering()
+    assert not [record.getMessage() for record in caplog.records]
 
 
 @pytest.mark.parametrize("name", ["figure2", "figure6"])
