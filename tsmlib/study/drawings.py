@@ -85,7 +85,7 @@ def calibration(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
 
 def code_use(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
     """KL of the codes and spread of samples, of single segments."""
-    units = {"KL per segment": "nats", "spread of samples": "share of the data's deviation"}
+    units = {"KL per segment": "nats", "spread of samples": "data's s.d."}
     thresholds = {"KL per segment": {"Reacher": 0.1}, "spread of samples": {"Reacher": 0.01}}
     rows = table.select(found, env=envs, execution="segments", metric=("kl", "spread"))
     published, yours = table.pair(rows, partial(latent.use_panels, envs=envs))
