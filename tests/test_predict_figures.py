@@ -296,5 +296,5 @@ def test_a_forest_plot_says_what_filled_and_open_marks_and_small_dots_are() -> N
     def legend(values: dict[figures.Method, np.ndarray]) -> list[str]:
         return [text.get_text() for text in figures.differences({"": values}, "", TSM).legends[0].get_texts()]
 
-    assert legend(scores(LSTM)) == ["mean, 95 % interval without 0", "interval with 0, or a single seed", "each seed"]
+    assert legend(scores(LSTM)) == ["mean, 95 % interval without 0", "interval with 0, or a single seed", "one seed"]
     assert legend({LSTM: np.array([1.0])}) == ["a single seed"]

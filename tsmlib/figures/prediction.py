@@ -64,6 +64,7 @@ def figure5(
         axes.foot(ax, "", notes, width / len(checked) - 0.5)
     handles = axes.entries(look_of, ls="", ms=4.2)
     if several:
+        handles.append(entry("95 % interval over seeds", color=DARK, ls="", marker="|", ms=7, mew=1.1))
         handles.append(entry("one seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
     handles += axes.yours_entry(*own.values())
     return axes.finish(figure, [grid], handles, 5 if len(checked) > 1 else 3)
@@ -219,5 +220,5 @@ def differences(
     handles = [entry("mean, 95 % interval without 0", **point, lw=1.1)] if several else []
     handles.append(entry(f"{'interval with 0, or ' * several}a single seed", **point, lw=0, mfc="white"))
     if several:
-        handles.append(entry("each seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
+        handles.append(entry("one seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
     return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 5)
