@@ -23,7 +23,7 @@ LOOKS: dict[str, dict[str, Any]] = {  # a colour for each; black is the true sim
 UNCLEAR = 0.5  # spread of exponents over rounds from which on none is printed
 UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
 WORDS = {
-    "train": "training update", "imagine": "imagining", "plan": "planning iteration", "score": "scoring",
+    "train": "training update", "imagine": "predicting", "plan": "planning iteration", "score": "scoring",
     "learn": "policy update", "simulate": "MuJoCo",
 }  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Learning a policy inside the model: one at the paper's schedule, and ten copies against one.
 
-A few updates are timed, in turn for one copy, for many, and for imagining as many steps without a gradient; the time of
-the paper's 2,200 is extrapolated from them: every update does the same work.
+A few updates are timed, in turn for one copy, for many, and for predicting as many steps without a gradient; the time
+of the paper's 2,200 is extrapolated from them: every update does the same work.
 
     python benchmarks/policy.py        or        python -m tsmlib bench policy
 """
@@ -81,7 +81,7 @@ def main() -> None:
         whole = SCHEDULE * np.median(seconds[one]) / n
         print(f"one policy, {space}, extrapolated to {SCHEDULE} updates: {whole / 60:.1f} min")
         for what, way, reference, other in (
-            (f"one policy, {space}, an update: seconds", one, "imagining its steps, no gradient", "imagine"),
+            (f"one policy, {space}, an update: seconds", one, "predicting its steps, no gradient", "imagine"),
             (f"{copies} policies, {space}, an update: seconds", many, "one policy", one),
         ):
             rows.append(

@@ -115,14 +115,14 @@ def test_at_scale_paper_figures_draw_the_run_alone_and_tables_both(published: Pa
     evidence = study.evidence(run(published, "paper", 0), means)
     assert set(table.drawn(evidence)["source"]) == {"yours"}
     assert table.beside(evidence).empty
-    assert table.stamp(evidence, figure=True) == "scale paper, seed 0, n = 100"
+    assert table.stamp(evidence, figure=True) == "scale paper, seed 0, n = 100; no rows of recurrent TSM"
     assert {line[2].split(",")[0] for line in lines(planning.plans_table(evidence))} == {"published", "**yours"}
 
 
 def test_a_figure_that_will_be_published_does_not_say_that_nothing_is(published: Path) -> None:
     means, _ = plans(100, env=PUSH, seed=0, scale="paper")
     evidence = study.evidence(run(published, "paper", 0), means)
-    assert table.stamp(evidence, figure=True) == "scale paper, seed 0, n = 100"
+    assert table.stamp(evidence, figure=True) == "scale paper, seed 0, n = 100; no rows of recurrent TSM"
 
 
 def test_what_is_written_says_nothing_of_sources(published: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import warnings
 from io import BytesIO
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from IPython.core.formatters import DisplayFormatter
+from matplotlib import font_manager
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
@@ -98,6 +100,18 @@ def test_every_figure_is_returned_and_none_is_left_open(name: str) -> None:
     assert plt.get_fignums() == []
 
 
+@pytest.mark.parametrize("name", EVERY)
+def test_every_figure_finds_its_fonts_and_glyphs(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    for family in ("DejaVu Sans", "STIXGeneral", "STIXNonUnicode"):
+        font_manager.findfont(family, fallback_to_default=False)  # refused where matplotlib's list of fonts is stale
+    figure = EVERY[name]()
+    figure.set_dpi(97)  # formulas are kept by resolution, and a missing glyph is only told of once
+    with caplog.at_level("WARNING", logger="matplotlib"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure.draw_without_rendering()
+    assert not [record.getMessage() for record in caplog.records]
+
+
 @pytest.mark.parametrize("name", ["figure2", "figure6"])
 def test_the_same_figure_gives_the_same_bytes(name: str, tmp_path) -> None:
     first = [path.read_bytes() for path in figures.save(EVERY[name](), tmp_path / "a" / "one")]
@@ -124,6 +138,32 @@ def test_figure6_shows_costs_beside_the_latent_oracle_s_and_gaps() -> None:
     assert points == {round(rows[m]["true"].mean() / rows[ORACLES[0]]["true"].mean(), 6) for m in methods}
     assert [float(bar.lines[0].get_xdata()[0]) for bar in gap.containers] == pytest.approx([0.1, 1.5, 3.5])
     assert float(cost.lines[0].get_xdata()[0]) == 1
+
+
+def test_figure6_names_the_oracle_that_costs_are_divided_by() -> None:
+    def legend(rows: dict[figures.Method, dict[str, np.ndarray | None]]) -> list[str]:
+        return [text.get_text() for text in figures.figure6({"reach": rows}).legends[0].get_texts()]
+
+    rows = returns()["reach"]
+    assert "oracle, latent (= 1)" in legend(rows)
+    assert not any("oracle" in word for word in legend({PLANNED: rows[PLANNED]}))
+
+
+def test_lengths_are_drawn_in_centimetres_and_say_so() -> None:
+    states = figures.state_histograms(noise(4, 20, 6), NAMES, UNITS).axes
+    assert [ax.get_xlabel()[-4:] for ax in states[-2:]] == ["(cm)", "(cm)"]
+    edges = [patch.get_x() for patch in states[4].patches]
+    assert min(edges) == pytest.approx(100 * noise(4, 20, 6)[..., 4].min())
+    (way, *_), path = figures.plan_paths(noise(1, 9, 2), noise(1, 10, 2), TSM).axes, noise(1, 9, 2)[0]
+    np.testing.assert_allclose(way.lines[0].get_xydata(), 100 * path)
+    places = figures.workspace_coverage(0.2 * noise(500, 2), 0.21).axes[0]
+    assert (places.get_xlabel(), places.get_xlim()[1]) == ("fingertip x (cm)", pytest.approx(1.08 * 21))
+
+
+def test_time_stands_below_the_lowest_panels_of_torques_and_not_beside_the_stamp() -> None:
+    figure = figures.torque_gallery(noise(8, 20, 2), 0.02)
+    assert [ax.get_xlabel() for ax in figure.axes] == [""] * 4 + ["time (s)"] * 4
+    assert not figure.get_supxlabel()
 
 
 def test_figure6_names_the_marks_it_draws() -> None:
@@ -154,9 +194,9 @@ def test_the_gap_along_the_way_is_the_last_one() -> None:
 def test_a_share_of_targets_reached_is_a_count() -> None:
     (ax,) = figures.final_distances({"push": {TSM: {"closed": np.array([0.02, 0.01, 0.2, 0.04])}}}, 0.03).axes
     line = ax.lines[0]
-    np.testing.assert_allclose(line.get_xdata(), [0, 10, 20, 40, 200])
+    np.testing.assert_allclose(line.get_xdata(), [0, 1, 2, 4, 20])  # cm
     np.testing.assert_allclose(line.get_ydata(), [0, 25, 50, 75, 100])
-    assert ax.lines[1].get_xdata()[0] == 30
+    assert ax.lines[1].get_xdata()[0] == 3
 
 
 def test_whatever_is_drawn_beside_a_path_has_an_entry_in_the_legend() -> None:

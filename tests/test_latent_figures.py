@@ -110,6 +110,21 @@ def test_a_row_has_the_mean_over_seeds_of_each_model() -> None:
     assert marks(left, OURS) == [(2.0, 1)]
 
 
+def test_a_panel_of_codes_names_the_models_without_values_in_it() -> None:
+    values = {"KL": {"Push": {TSM: np.array([1.0])}}, "spread": {"Push": dict.fromkeys(METHODS, np.array([1.0]))}}
+    left, right = figures.code_use(values, {"KL": "nats", "spread": "share"}, {}).axes
+    assert left.get_xlabel() == f"nats\nno values of {', '.join(m.label for m in METHODS if m != TSM)}"
+    assert right.get_xlabel() == "share"
+
+
+def test_a_walk_shows_in_centimetres_how_far_the_ends_lie_from_the_first_one() -> None:
+    ways = fan(9)
+    _, ends, jumps = figures.walk(DRAW, START, ways, {9: 0.02, 17: 0.01}).axes
+    for line, values in zip(ends.lines, 100 * (ways[:, -1] - ways[0, -1]).T, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), values)
+    assert jumps.lines[0].get_ydata().tolist() == [2.0, 1.0]
+
+
 def diamonds(ax: Axes) -> list[tuple[float, float]]:
     """Where the reader's own hollow diamonds stand."""
     return [(float(x), float(y)) for line in ax.lines if line.get_marker() == "D"

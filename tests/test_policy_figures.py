@@ -27,13 +27,18 @@ FLOORS = {"reach": {method("oracle", "latent", "cem"): -4.2, method("oracle", "d
 def learned(k: int = 3, end: float = -4.5, samples: float = 50_000) -> dict[str, np.ndarray]:
     """Curves from -12 to ``end`` over 11 records; the model predicts 0.5 m more."""
     true = end + (-12 - end) * np.exp(-np.arange(11.0)) + 0.1 * np.random.default_rng(0).normal(size=(k, 11))
-    return {"return_true": true, "return_predicted": true + 0.5, "iterations": 220.0 * np.arange(11),
+    return {"return_true": true, "return_predicted": true + 0.5, "steps": 220_000.0 * np.arange(11),
             "samples": np.full(11, samples), "seconds": 400 + 100.0 * np.arange(11)}  # fmt: skip
 
 
 def model_free(k: int = 3) -> dict[str, np.ndarray]:
     true = np.linspace(-12, -5, 26) + 0.1 * np.random.default_rng(1).normal(size=(k, 26))
-    return {"return_true": true, "samples": np.linspace(0, 3e5, 26), "seconds": np.linspace(1e-5, 90, 26)}
+    return {
+        "return_true": true,
+        "steps": np.linspace(0, 3e5, 26),
+        "samples": np.linspace(0, 3e5, 26),
+        "seconds": np.linspace(1e-5, 90, 26),
+    }
 
 
 def both_tasks() -> dict[str, dict[Method, dict[str, np.ndarray]]]:
@@ -55,7 +60,7 @@ def legend(figure: Figure) -> list[str]:
 
 EVERY: dict[str, Callable[[], Figure]] = {
     "two tasks": lambda: figure7(both_tasks(), FLOORS),
-    "one task, iterations": lambda: figure7({"reach": {LATENT: learned()}}, against=["iterations"]),
+    "one task, steps": lambda: figure7({"reach": {LATENT: learned()}}, against=["steps"]),
     "one copy": lambda: figure7({"reach": {LATENT: learned(k=1)}}, FLOORS),
     "only model-free": lambda: figure7({"push": {TRPO: model_free()}}, against=["samples", "seconds"]),
 }
@@ -75,13 +80,13 @@ def test_a_line_is_the_mean_and_its_band_the_interval_over_copies() -> None:
     ax = figure7({"reach": {RIVAL: given}}).axes[0]
     true, predicted = lines(ax, RIVAL)
     np.testing.assert_allclose(true.get_ydata(), given["return_true"].mean(0))
-    np.testing.assert_array_equal(true.get_xdata(), given["iterations"])
+    np.testing.assert_array_equal(true.get_xdata(), given["steps"])
     np.testing.assert_allclose(predicted.get_ydata(), given["return_predicted"].mean(0))
     assert predicted.is_dashed()
     assert not true.is_dashed()
     vertices = ax.collections[0].get_paths()[0].vertices
     mean, half = interval(given["return_true"][:, 4])
-    assert sorted(set(np.round(vertices[vertices[:, 0] == given["iterations"][4], 1], 9))) == pytest.approx(
+    assert sorted(set(np.round(vertices[vertices[:, 0] == given["steps"][4], 1], 9))) == pytest.approx(
         [mean - half, mean + half]
     )
 
@@ -92,24 +97,33 @@ def test_tasks_stand_side_by_side_and_share_the_scale_of_their_column() -> None:
     assert [reach.get_title(loc="left"), push.get_title(loc="left")] == ["Reach", "Push"]
     for column in (figure.axes[::2], figure.axes[1::2]):
         assert len({ax.get_ylim() for ax in column}) == 1
-        assert [ax.get_xlabel().split("\n")[0] for ax in column] == list(AXES.values())
+        assert [ax.get_xlabel().split("\n")[0].split(";")[0] for ax in column] == list(AXES.values())
 
 
 def test_a_model_s_data_set_is_a_point_and_a_model_free_run_a_line_against_samples() -> None:
     given = learned(samples=50_000)
     ax = figure7({"reach": {LATENT: given, PPO: model_free()}}, against=["samples"]).axes[0]
     level, point = lines(ax, LATENT)[:2]
-    assert point.get_xdata().tolist() == [50_000]
     assert point.get_ydata()[0] == pytest.approx(given["return_true"][:, -1].mean())
-    assert level.get_xdata().tolist() == [50_000, 300_000]
+    assert level.get_xdata().tolist() == [*point.get_xdata(), 300_000]
+    (note,) = ax.texts
+    assert (note.get_text(), note.xy[0]) == ("data of the models: 50k", 50_000)
+    assert 50_000 < point.get_xdata()[0] < 60_000  # beside the line that stands at all of them
     (curve,) = lines(ax, PPO)
     assert len(curve.get_xdata()) == 26
 
 
-def test_a_model_free_run_has_no_place_among_iterations_of_an_optimiser() -> None:
+def test_a_model_free_run_is_drawn_against_steps_of_the_environment_which_the_axis_says() -> None:
     figure = figure7({"reach": {LATENT: learned(), PPO: model_free()}})
-    assert [bool(lines(ax, PPO)) for ax in figure.axes] == [False, True, True]
-    assert {"PPO", "TSM, latent", "predicted return", "95 % interval"} == set(legend(figure))
+    assert [bool(lines(ax, PPO)) for ax in figure.axes] == [True, True, True]
+    assert "without a model, in the environment" in figure.axes[0].get_xlabel()
+    assert "without a model" not in figure7({"reach": {LATENT: learned()}}).axes[0].get_xlabel()
+
+
+def test_the_legend_names_each_model_once_and_what_filled_and_open_mean() -> None:
+    figure = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-5), PPO: model_free()}})
+    words = ["TSM", "PPO", "latent policy", "direct policy", "predicted return", "95 % interval"]
+    assert legend(figure) == words
 
 
 def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> None:
@@ -123,13 +137,13 @@ def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> No
 
 
 def test_a_policy_through_the_prior_is_filled_and_one_of_torques_open() -> None:
-    ax = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-6)}}, against=["iterations"]).axes[0]
+    ax = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-6)}}, against=["steps"]).axes[0]
     curves = [line for line in lines(ax, LATENT) if not line.is_dashed()]
     assert [to_hex(line.get_markerfacecolor()).upper() for line in curves] == [LATENT.look.colour, "#FFFFFF"]
 
 
 def test_references_are_lines_and_of_several_oracles_the_one_that_tables_divide_by() -> None:
-    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["iterations"])
+    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["steps"])
     flat = {line.get_ydata()[0] for line in figure.axes[0].lines if len(set(line.get_ydata())) == 1}
     assert flat == {-4.2, -12.0}
     assert "oracle" in legend(figure)
@@ -138,16 +152,22 @@ def test_references_are_lines_and_of_several_oracles_the_one_that_tables_divide_
 
 def test_a_policy_that_fails_far_off_does_not_squeeze_the_others_and_is_told_in_words() -> None:
     rows = {policy: learned() for policy in METHODS} | {method("multistep", "direct"): learned(end=-900.0)}
-    figure = figure7({"reach": rows}, against=["iterations"])
+    figure = figure7({"reach": rows}, against=["steps"])
     assert figure.axes[0].get_ylim()[0] > -50
     assert "multi-step, direct to −900" in below(figure)
 
 
 def test_where_curves_begin_is_said_and_the_axis_shows_their_ends() -> None:
-    figure = figure7({"reach": {LATENT: learned(), RIVAL: learned(end=-5)}}, FLOORS, against=["iterations"])
+    figure = figure7({"reach": {LATENT: learned(), RIVAL: learned(end=-5)}}, FLOORS, against=["steps"])
     low, high = figure.axes[0].get_ylim()
     assert -7 < low < -5 < -4.2 < high
     assert re.search("outside: curves begin at −1[12].*, zero torque −12", below(figure))
+
+
+def test_the_references_of_one_task_do_not_stretch_the_scale_of_another() -> None:
+    rows = {"reach": {LATENT: learned()}, "push": {LATENT: learned(end=-9)}}
+    alone = figure7({"reach": rows["reach"]}, {"reach": FLOORS["reach"]}).axes[0].get_ylim()
+    assert figure7(rows, FLOORS | {"push": {ZERO: -40.0}}).axes[0].get_ylim() == alone
 
 
 def test_environment_steps_are_told_in_thousands() -> None:
@@ -158,7 +178,7 @@ def test_environment_steps_are_told_in_thousands() -> None:
 
 def test_policies_of_yours_are_diamonds() -> None:
     mine = learned(k=1, end=-4.6)
-    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["iterations"], yours={"reach": {LATENT: mine}})
+    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["steps"], yours={"reach": {LATENT: mine}})
     (own,) = (line for line in figure.axes[0].lines if line.get_marker() == "D")
     assert own.get_ydata()[-1] == pytest.approx(mine["return_true"][0, -1])
     assert "yours" in legend(figure)
@@ -174,7 +194,7 @@ def wrong(**changed: Any) -> dict[str, Any]:
         (lambda: figure7({}), "nothing to draw"),
         (lambda: figure7(wrong(return_true=np.full((3, 11), np.nan))), "reach, TSM, latent, return_true: 33 of 33"),
         (lambda: figure7(wrong(return_predicted=np.zeros((2, 11)))), r"expected \(3, 11\)"),
-        (lambda: figure7(wrong(iterations=np.arange(10))), r"expected \(11\)"),
+        (lambda: figure7(wrong(steps=np.arange(10))), r"expected \(11\)"),
         (lambda: figure7(wrong(seconds=-np.arange(11))), "seconds go backwards"),
         (lambda: figure7(wrong(), against=["energy"]), "energy"),
         (lambda: figure7(wrong(), {"push": {ZERO: -8.6}}), "push"),

@@ -284,3 +284,17 @@ def test_a_wrong_input_is_named(wrong: Callable[[], Figure], message: str) -> No
     with pytest.raises(ValueError, match=message):
         wrong()
     assert plt.get_fignums() == []
+
+
+def test_markers_of_a_line_stand_at_steps_that_were_measured() -> None:
+    (ax,) = figures.against_horizon({"": curves(*MODELS)}, "", measured=(1, 2, 5, 10, 20, 30)).axes
+    found = [line.get_xdata()[line.get_markevery()].tolist() for line in ax.lines[:4]]
+    assert found == [[1, 10], [2, 20], [5, 30], [1, 10]]
+
+
+def test_a_forest_plot_says_what_filled_and_open_marks_and_small_dots_are() -> None:
+    def legend(values: dict[figures.Method, np.ndarray]) -> list[str]:
+        return [text.get_text() for text in figures.differences({"": values}, "", TSM).legends[0].get_texts()]
+
+    assert legend(scores(LSTM)) == ["mean, 95 % interval without 0", "interval with 0, or a single seed", "one seed"]
+    assert legend({LSTM: np.array([1.0])}) == ["a single seed"]

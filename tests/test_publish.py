@@ -83,6 +83,15 @@ def test_a_stamp_names_the_arms_of_which_there_are_fewer_seeds() -> None:
     assert table.stamp(rows, figure=True) == "scale paper, seeds 0, 1, 2 (ReacherPush: 0), n = 100"
 
 
+@pytest.mark.parametrize(("models", "said"), [(["tsm"], True), (["tsm", "rtsm"], False), (["onestep"], False)])
+def test_a_stamp_says_where_our_model_has_no_rows_beside_others_with_codes(models: list[str], said: bool) -> None:
+    rows = tables_storage.frame(
+        [dict(env="tsm/Reacher-v0", model=model, seed=0, scale="paper", n=1) for model in models]
+    )
+    stamp = table.stamp(rows.assign(source=table.YOURS), figure=True)
+    assert stamp.endswith("; no rows of recurrent TSM") is said
+
+
 @pytest.mark.parametrize("path", [each.path for each in runs.notebooks().values()], ids=lambda path: path.stem)
 def test_cells_that_run_on_what_ships_use_no_name_of_another_cell(path: Path) -> None:
     known = set(dir(builtins))

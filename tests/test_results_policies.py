@@ -59,6 +59,7 @@ def test_rows_become_curves_again_with_copies_and_seeds_as_lines() -> None:
     curves = curves_of([*rows(), *rows(seed=1), {"execution": "open loop", "iteration": 1}])["reach"][TSM]
     assert curves["return_true"].tolist() == [[0, -1, -2], [-1, -2, -3], [-1, -2, -3], [-2, -3, -4]]
     assert curves["iterations"].tolist() == [0, 220, 440]
+    assert curves["steps"].tolist() == [0, 220_000, 440_000]  # 20 episodes of 50 steps each
     assert curves["seconds"].tolist() == [100, 150, 200]  # training of the model comes first
     assert curves["samples"].tolist() == [50_000] * 3
     figure7({"reach": {TSM: curves}})

@@ -27,7 +27,7 @@ draw = np.random.default_rng(0)
 
 def learned(end: float, k: int = 3, records: int = 5) -> dict[str, np.ndarray]:
     true = end + (-12 - end) * np.exp(-np.arange(records)) + 0.1 * draw.normal(size=(k, records))
-    return {"return_true": true, "iterations": 220.0 * np.arange(records)}
+    return {"return_true": true, "steps": 220_000.0 * np.arange(records)}
 
 
 CURVES = {
@@ -120,7 +120,7 @@ def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in
     for ax, (_, rows) in zip(figure8(CURVES, FLOOR).axes, CURVES.items(), strict=True):
         (lstm,) = lines(ax, LSTM)
         np.testing.assert_allclose(lstm.get_ydata(), rows[RIVAL]["return_true"].mean(0))
-        np.testing.assert_array_equal(lstm.get_xdata(), rows[RIVAL]["iterations"])
+        np.testing.assert_array_equal(lstm.get_xdata(), rows[RIVAL]["steps"])
         codes, actions = lines(ax, TSM)
         np.testing.assert_allclose(codes.get_ydata(), rows[LATENT]["return_true"].mean(0))
         np.testing.assert_allclose(actions.get_ydata(), rows[DIRECT]["return_true"].mean(0))
@@ -128,7 +128,7 @@ def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in
         assert flat == set(FLOOR.values())
         mean, half = interval(rows[LATENT]["return_true"][:, 3])
         at_record = [part.get_paths()[0].vertices for part in ax.collections]
-        at_record = [np.round(v[v[:, 0] == 660.0, 1], 9) for v in at_record]
+        at_record = [np.round(v[v[:, 0] == 660_000.0, 1], 9) for v in at_record]
         assert any(sorted(set(v)) == pytest.approx([mean - half, mean + half]) for v in at_record)
 
 
@@ -217,7 +217,7 @@ def test_every_cell_says_its_number_and_yours_in_brackets() -> None:
     ("call", "message"),
     [
         (lambda: figure8({}), "nothing to draw"),
-        (lambda: figure8({"noise": {LATENT: learned(-4) | {"iterations": np.arange(4)}}}), r"expected \(5\)"),
+        (lambda: figure8({"noise": {LATENT: learned(-4) | {"steps": np.arange(4)}}}), r"expected \(5\)"),
         (lambda: figure8({"noise": {LATENT: learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}),
          "noise, TSM, latent, return_true: 15 of 15"),
         (lambda: episode(titles=TITLES[:2]), r"clean has shape \(21, 3\), expected \(T, 2\)"),

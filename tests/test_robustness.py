@@ -406,8 +406,9 @@ def learned(
 ) -> list[dict[str, Any]]:
     """World -> copies -> records, one every 220 iterations."""
     return [
-        dict(env=REACHER, model=method.model, search_space=method.search_space, planner="policy", execution="policy",
-             metric=metric, seed=0, copy=copy, iteration=first + 220 * record, value=value, **WORLDS[world])
+        dict(env=REACHER, task="reach", scale="paper", model=method.model, search_space=method.search_space,
+             planner="policy", execution="policy", metric=metric, seed=0, copy=copy,
+             iteration=first + 220 * record, value=value, **WORLDS[world])
         for world, copies in values.items()
         for copy, records in enumerate(copies)
         for record, value in enumerate(records)
@@ -447,7 +448,7 @@ def test_learning_curves_are_a_line_for_each_copy() -> None:
     curves = robustness_results.learning_curves(LEARNED, last=500)
     drawn = {"clean": [OURS], "noise": [OURS, THEIRS], "delay": [OURS]}
     assert {world: list(own) for world, own in curves.items()} == drawn
-    assert curves["clean"][OURS]["iterations"].tolist() == [0, 220, 440]
+    assert curves["clean"][OURS]["steps"].tolist() == [0, 220_000, 440_000]  # 20 episodes of 50 steps each
     assert curves["clean"][OURS]["return_true"].tolist() == [[-12, -5, -3], [-12, -5, -5]]
     assert curves["noise"][THEIRS]["return_true"].tolist() == [[-12, -9, -8], [-12, -9, -6]]
     figures.figure8(curves, {zoo.method("random"): -14.0})

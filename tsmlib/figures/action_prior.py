@@ -51,7 +51,7 @@ def spectra(curves: Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]
         for method, (frequency, power) in rows.items():
             word = f"{title}, {method.label}"
             ax.plot(finite(word, frequency, "F"), finite(word, power, "F"), **_line(method))
-        ax.set(yscale="log", title=title, xlabel="frequency (Hz)")
+        ax.set(yscale="log", title=title.capitalize(), xlabel="frequency (Hz)")
     axes[0].set_ylabel("power of the torques (1/Hz)")
     drawn = dict.fromkeys(method for rows in curves.values() for method in rows)
     legend(figure, [entry(method.label, **_line(method)) for method in drawn], columns=4)

@@ -57,12 +57,13 @@ def torque_gallery(actions: np.ndarray, dt: float) -> Figure:
 
 @styled
 def state_histograms(states: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
-    """Distribution of the data: one histogram per state dimension of ``states`` (..., dx)."""
+    """Distribution of the data: one histogram per state dimension of ``states`` (..., dx), lengths in cm."""
     flat = shaped("states", np.asarray(states, float).reshape(-1, np.shape(states)[-1]), f"n {len(names)}")
     if len(units) != len(names):
         raise ValueError(f"{len(names)} names and {len(units)} units, expected one of each per state dimension")
     figure, axes = panels(len(names), 5 if len(names) > 6 else 3, 1.05)
     for ax, values, word, unit in zip(axes, flat.T, names, units, strict=True):
+        values, unit = (100 * values, "cm") if unit == "m" else (values, unit)
         ax.hist(values, bins=int(np.clip(len(values) ** 0.5, 10, 60)), color=DARK, alpha=0.75, linewidth=0)
         ax.set(xlabel=f"{dimension(word)} ({unit})", yticks=(), ylim=(0, None))
         style.rows_only(ax)
@@ -72,17 +73,18 @@ def state_histograms(states: np.ndarray, names: Sequence[str], units: Sequence[s
 
 @styled
 def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
-    """Visits of the fingertip: ``tip`` (..., 2) in m, with the circle of radius ``reach`` (m) that it cannot leave."""
-    flat = shaped("tip", np.asarray(tip, float).reshape(-1, np.shape(tip)[-1]), "n 2")
+    """Visits of the fingertip: ``tip`` (..., 2) in m, with the circle of radius ``reach`` (m) that it cannot leave;
+    drawn in cm."""
+    flat = 100 * shaped("tip", np.asarray(tip, float).reshape(-1, np.shape(tip)[-1]), "n 2")
     figure, ax = plt.subplots(figsize=(3.3, 2.8))
-    edge = 1.08 * (reach or np.abs(flat).max())
+    edge = 1.08 * (100 * reach if reach else np.abs(flat).max())
     shades = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.18, 1, 256)))  # one visit is not white
     bins = ax.hexbin(*flat.T, gridsize=60, mincnt=1, norm=LogNorm(), cmap=shades, linewidths=0.1, edgecolors="face",
                      extent=(-edge, edge, -edge, edge))  # fmt: skip
     if reach:
-        ax.add_patch(Circle((0, 0), reach, fill=False, ec=DARK, lw=0.7, ls="--"))
+        ax.add_patch(Circle((0, 0), 100 * reach, fill=False, ec=DARK, lw=0.7, ls="--"))
     ax.plot(0, 0, "+", color="black", ms=5, mew=0.8)
-    ax.set(xlabel="fingertip x (m)", ylabel="fingertip y (m)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
+    ax.set(xlabel="fingertip x (cm)", ylabel="fingertip y (cm)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
     bar = figure.colorbar(bins, ax=ax, label="states per cell", shrink=0.8, aspect=25)
     bar.outline.set_visible(False)
     return figure

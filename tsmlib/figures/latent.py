@@ -38,6 +38,7 @@ def code_use(
 
     values: title -> row -> method -> (k,), one value per seed, above zero; xlabels: title -> text; thresholds: title ->
     row -> a bound that was set beforehand, drawn as a tick; yours: as values, drawn below them as hollow diamonds.
+    A model without values in a panel is named below it.
     """
     own = yours or {}
     rows = list(dict.fromkeys(row for part in (values, own) for panel in part.values() for row in panel))
@@ -58,12 +59,18 @@ def code_use(
                 ax.plot(seeds.mean(), y + 0.25, **YOURS, color=method.look.colour, zorder=3.5, clip_on=False)
             if bound := thresholds.get(title, {}).get(row):
                 ax.plot((bound, bound), (y - 0.36, y + 0.36), color="#222222", lw=1.2, zorder=2.5)
-        ax.set(xscale="log", xlabel=xlabels[title], title=title)
+        seen = {method for part in (panel, own.get(title, {})) for methods in part.values() for method in methods}
+        none = ", ".join(method.label for method in look_of if method not in seen)
+        label = xlabels[title] + (f"\nno values of {none}" if none else "")
+        ax.margins(x=0.05)  # a threshold may be the least of all
+        ax.set(xscale="log", xlabel=label, title=title)
         log_axis(ax, *ax.get_xlim(), along="x")
         style.rows_only(ax)
     axes[0].set_yticks(range(len(rows)), rows)
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
     handles = [*entries(look_of, ls="", ms=4.5), *yours_entry(*own.values())]
+    if any(len(seeds) > 1 for panel in values.values() for row in panel.values() for seeds in row.values()):
+        handles.append(entry("95 % interval over seeds", color=style.DARK, lw=1))
     if any(thresholds.values()):
         handles.append(entry("threshold set beforehand", color="#222222", ls="", marker="|", ms=7, mew=1.2))
     legend(figure, handles)
@@ -84,7 +91,7 @@ def around_touch(curves: Mapping[Method, Sequence[np.ndarray]], touch: int) -> F
     ax.axvline(0, color="#999999", lw=0.7, zorder=0)
     ax.annotate("first touch", (0, 1), (2, -1), xycoords=("data", "axes fraction"), textcoords="offset points",
                 fontsize=6.5, va="top", color=style.NOTE)  # fmt: skip
-    ax.set(xlabel="steps since the first touch", ylabel="share of the data's deviation", ylim=(0, None))
+    ax.set(xlabel="steps since the first touch", ylabel="data's s.d.", ylim=(0, None))
     handles = [entry(method.label, color=method.look.colour) for method in curves]
     handles.append(entry("spread of samples", color=style.NOTE, **kinds["spread"]))
     legend(figure, [*handles, entry("error of their mean", color=style.NOTE, **kinds["error"])], columns=2)
@@ -107,8 +114,9 @@ def spread_against_error(curves: Mapping[str, Mapping[Method, tuple[np.ndarray, 
         for method, pair in panel.items():
             spread, error = (finite(f"{title}, {method.label}", part, str(len(pair[0]))) for part in pair)
             ax.plot(spread, error, **{**look_of[method], "ms": 3.5})
-        ax.set(xscale="log", yscale="log", xlim=limits, ylim=limits, aspect="equal", title=title, xlabel="spread")
-    axes[0].set_ylabel("error of the mean")
+        ax.set(xscale="log", yscale="log", xlim=limits, ylim=limits, aspect="equal", title=title,
+               xlabel="spread of the samples (data's s.d.)")  # fmt: skip
+    axes[0].set_ylabel("error of their mean (data's s.d.)")
     legend(figure, entries(look_of, ms=3.5))
     return figure
 
@@ -223,7 +231,8 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     """The object's ways under codes on a walk from one code (dark) to another (light).
 
     start (dx,): the last observed state; paths (n, T, 2): the object's ways; jumps: number of codes on the same walk ->
-    the largest distance in m between the ends of two neighbours.
+    the largest distance in m between the ends of two neighbours. The middle panel shows the ends of the ways from that
+    of the first code's, since all of them together may differ little.
     """
     paths = finite("paths", paths, "n T 2")
     shades = WALK(np.linspace(0, 0.92, len(paths)))
@@ -232,12 +241,14 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     picture.add_collection(LineCollection(list(_from(start, paths)), colors=shades, linewidths=1, zorder=6))
     picture.scatter(paths[:, -1, 0], paths[:, -1, 1], c=shades, s=7, linewidths=0, zorder=6.2)
     style.scene(picture)
-    angle, way = np.linspace(0, 90, len(paths)), 100 * (paths[:, -1] - start[BLOCK])
-    for values, word, line in zip(way.T, "xy", ("-", style.DASHED), strict=True):
+    picture.set_title("ways of the object")
+    picture.set_xlabel("dark: first code, light: last", fontsize=6.5, color=style.NOTE)
+    angle, moved = np.linspace(0, 90, len(paths)), 100 * (paths[:, -1] - paths[0, -1])
+    for values, word, line in zip(moved.T, "xy", ("-", style.DASHED), strict=True):
         ends.plot(angle, values, color=style.NOTE, ls=line, lw=0.9, zorder=1, label=word)
         ends.scatter(angle, values, c=shades, s=9, linewidths=0, zorder=2)
-    ends.set(xlabel="angle between the codes (degrees)", ylabel="way of the object at the end (cm)",
-             xticks=(0, 30, 60, 90))  # fmt: skip
+    ends.set(xlabel="angle from the first code (degrees)", ylabel="distance (cm)", xticks=(0, 30, 60, 90),
+             title="end of a way, from the first one's")  # fmt: skip
     ends.legend(loc="best")
     counts = sorted(jumps)
     refined.plot(counts, [100 * jumps[n] for n in counts], color="#222222", marker="o", ms=3.5)
@@ -245,7 +256,7 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     refined.plot(
         counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="half as far with twice as many", zorder=1
     )
-    refined.set(xscale="log", xlabel="codes on the walk", ylabel="largest jump of the end (cm)")
+    refined.set(xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest jump of the end")
     log_axis(refined, 50 * min(jumps.values()), 200 * max(jumps.values()))
     refined.set_xticks(counts, [str(n) for n in counts])
     refined.minorticks_off()

@@ -93,16 +93,26 @@ def figure6(results: Results, yours: Results | None = None) -> Figure:
         cost.set(title=f"{task.capitalize()}: executed cost (lower is better)")
         gap.set(title=f"{task.capitalize()}: gap (0 is best)")
         gap.locator_params(axis="x", nbins=5)  # wide numbers
-    handles = [entry(method.look.name, **reference_look(method)) for method in used]
+    unit = " (= 1)" if any(part.divided for pair in pairs.values() for part in pair) else ""
+    handles = [entry(_reference_label(method, unit), **reference_look(method)) for method in used]
     planners = dict.fromkeys(method.planner for places in heights.values() for method in places)
     marker = MARKERS.get(next(iter(planners), ""), "o")
     for face, word in ((DARK, "latent"), ("white", "direct")):
         handles.append(entry(f"search space: {word}", color=DARK, ls="", marker=marker, ms=4.2, mfc=face, mew=0.9))
+    if any(half for pair in pairs.values() for part in pair for _, half in part.points.values()):
+        handles.append(entry("95 % interval over targets", color=DARK, lw=1.0))
     if len(planners) > 1:
         handles += [entry(PLANNERS.get(word, word), color=DARK, ls="", marker=MARKERS.get(word, "o"), ms=4.2)
                     for word in planners]  # fmt: skip
     legend(figure, [*handles, *yours_entry(own)])
     return figure
+
+
+def _reference_label(method: Method, unit: str) -> str:
+    """A reference in the legend; the oracle with its search space, and what its cost is where others are divided."""
+    if method.model != "oracle":
+        return method.look.name
+    return ", ".join(filter(None, (method.look.name, method.search_space))) + unit
 
 
 @dataclass(frozen=True)
@@ -219,11 +229,11 @@ def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
             ax.plot(mine, told, **YOURS, color=DARK, zorder=4)
             _title(ax, method)
             gaps = {"mean gap": predicted - true, "yours": told - mine}
-            words = [f"{word} {gap.mean():+.2f}" for word, gap in gaps.items() if len(gap)]
+            words = [f"{word} {gap.mean():+.2f} m" for word, gap in gaps.items() if len(gap)]
             style.note(ax, "\n".join(words).replace("-", "−"), 0.97, 0.05)
             ax.set(xlim=limits, ylim=limits, aspect="equal",
-                   xlabel="executed return" if i + columns >= len(rows) else "",
-                   ylabel="" if i % columns else f"{task.capitalize()}: predicted return")  # fmt: skip
+                   xlabel="executed return (m)" if i + columns >= len(rows) else "",
+                   ylabel="" if i % columns else f"{task.capitalize()}: predicted return (m)")  # fmt: skip
             ax.locator_params(nbins=5)
     if any(own.values()):
         legend(figure, yours_entry(own))
@@ -292,14 +302,14 @@ def final_distances(
                 share = np.arange(len(end) + 1) / len(end)
                 own = {**YOURS, "lw": 0.6, "markevery": (1, max(1, len(end) // 8))} if mine else {}
                 look = {**looks[way], **own, "ls": looks[way]["ls"]}
-                ax.step(1000 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **look)
-        ax.axvline(1000 * tolerance, color="#999999", lw=0.6, zorder=1)
-        ax.set(title=task.capitalize(), xlabel="final distance (mm)", xlim=(0, 250), ylim=(0, 102))
+                ax.step(100 * np.append(0, end), 100 * share, where="post", color=method.look.colour, **look)
+        ax.axvline(100 * tolerance, color="#999999", lw=0.6, zorder=1)
+        ax.set(title=task.capitalize(), xlabel="final distance (cm)", xlim=(0, 25), ylim=(0, 102))
     axes[0].set_ylabel("targets within that distance (%)")
     drawn = dict.fromkeys(method for part in (distances, yours) for rows in part.values() for method in rows)
     handles = [entry(method.label, color=method.look.colour) for method in drawn]
     handles += [entry(f"{way} loop", color=DARK, **looks[way]) for way in looks]
-    handles.append(entry(f"success, {1000 * tolerance:.0f} mm", color="#999999", lw=0.6))
+    handles.append(entry(f"success, {100 * tolerance:g} cm", color="#999999", lw=0.6))
     handles += yours_entry(*yours.values())
     legend(figure, handles, columns=2 * len(distances))
     return figure
@@ -315,7 +325,8 @@ def plan_paths(
     zone: tuple[float, float, float] | None = None,
     reach: float | None = None,
 ) -> Figure:
-    """Paths in the plane, one panel per episode: the predicted rollout and the executed plan, (n, T, 2) each, in m.
+    """Paths in the plane, drawn in cm, one panel per episode: the predicted rollout and the executed plan, (n, T, 2)
+    each, in m.
 
     method: of the prediction. wanted (k, 2) or (n, k, 2): the line to follow, or one point to end at. zone: x, y and
     radius of a disc to keep away from. reach: radius of the circle that the fingertip cannot leave.
@@ -333,16 +344,16 @@ def plan_paths(
         goal = goal if wanted.shape[1] > 1 else {"color": DARK, "ls": "", "marker": "+", "ms": 7, "mew": 1.2}
     for i, ax in enumerate(axes):
         if zone is not None:
-            ax.add_patch(Circle(zone[:2], zone[2], fc=tint(style.RED, 0.25), ec="none"))
+            ax.add_patch(Circle((100 * zone[0], 100 * zone[1]), 100 * zone[2], fc=tint(style.RED, 0.25), ec="none"))
         if reach is not None:
-            ax.add_patch(Circle((0, 0), reach, fill=False, ec=style.PALE, lw=0.6))
+            ax.add_patch(Circle((0, 0), 100 * reach, fill=False, ec=style.PALE, lw=0.6))
         if wanted is not None:
-            ax.plot(*wanted[i].T, **goal)
+            ax.plot(*(100 * wanted[i].T), **goal)
         for path, look in zip((predicted[i], executed[i]), looks, strict=True):
-            ax.plot(*path.T, **look)
-        ax.set(aspect="equal", xlabel="x (m)")
+            ax.plot(*(100 * path.T), **look)
+        ax.set(aspect="equal", xlabel="x (cm)")
         ax.locator_params(nbins=4)
-    axes[0].set_ylabel("y (m)")
+    axes[0].set_ylabel("y (cm)")
     handles = [entry(f"predicted rollout, {method.label}", **looks[0]), entry("executed plan", **looks[1])]
     if wanted is not None:
         handles.append(entry("path to follow" if wanted.shape[1] > 1 else "target", **goal))

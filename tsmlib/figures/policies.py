@@ -15,14 +15,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from tsmlib.figures import axes
 from tsmlib.figures.checks import finite, known
-from tsmlib.figures.method import Method
-from tsmlib.figures.style import DASHED, GRID, WIDTH, Props, entry, styled
+from tsmlib.figures.method import SEARCH_SPACES, Method
+from tsmlib.figures.style import DARK, DASHED, GRID, NOTE, WIDTH, Props, entry, styled
 
 Curves = dict[str, np.ndarray]
 LearningCurves = Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]]  # task -> method -> Curves
 References = Mapping[str, Mapping[Method, float]]  # task -> method -> return
-AXES = {"iterations": "optimiser iterations", "samples": "environment steps, the data set's counted",
-        "seconds": "seconds, training of the model counted"}  # fmt: skip
+AXES = {"steps": "steps in the model", "samples": "environment steps, the model's data included",
+        "seconds": "seconds, training of the model included"}  # fmt: skip
+FREE = "; without a model, in the environment"  # more on the first of AXES
 PREDICTED: Props = {"ls": DASHED, "lw": 0.7}
 
 
@@ -33,16 +34,18 @@ def figure7(
 ) -> Figure:  # fmt: skip
     """Learning curves of policies (paper, figure 7): a column for each task, a row for each quantity of ``against``.
 
-    curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets, and of
-    {"iterations", "samples", "seconds": (R,)} what is known of it, "return_predicted": (k, R) of the model. A method is
-    drawn in the rows that it has numbers for. references: task -> oracle, zero or random torques -> return, drawn as
-    lines.
+    curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets in m, and of
+    {"steps", "samples", "seconds": (R,)} what is known of it, "return_predicted": (k, R) of the model. steps: in the
+    model that a policy learns in, or else in the environment; samples: in the environment, those of the model's data
+    included. A method is drawn in the rows that it has numbers for. references: task -> oracle, zero or random torques
+    -> return, drawn as lines.
 
-    Lines are means, bands their 95 % t intervals over the k. Against iterations, dashes show the predicted return. A
-    policy whose samples are a data set that never grows is a point there, at its end, and a faint line to the right of
-    it; such points stand side by side. Seconds are on a logarithmic axis from 1 s. The range of returns is that of the
-    ends and what lies near them; where curves begin, and references outside, stand in words below. yours: as curves,
-    drawn over them as hollow diamonds.
+    A model has one colour and marker; latent policies are filled and thick, direct ones open. Lines are means, bands
+    their 95 % t intervals over the k. Against steps, dashes show the predicted return. A policy whose samples are a
+    data set that never grows is a point there, at its end, and a faint line to the right of it; such points stand side
+    by side, right of a line that says how many they all are. Seconds are on a logarithmic axis from 1 s. The range of
+    returns is that of the ends and what lies near them; where curves begin, and references outside, stand in words
+    below. yours: as curves, drawn over them as hollow diamonds.
     """
     return _draw(curves, references or {}, against, yours=yours)
 
@@ -53,12 +56,12 @@ def figure8(
 ) -> Figure:
     """Learning curves of policies with noise and with delay beside the clean arm (paper, figure 8), one scale for all.
 
-    curves: condition -> method -> {"return_true": (k, R), "iterations": (R,)}; references: zero or random torques ->
-    return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals. yours: as curves, drawn over
-    them as hollow diamonds.
+    curves: condition -> method -> {"return_true": (k, R), "steps": (R,)}, steps in the model; references: zero or
+    random torques -> return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals. yours: as
+    curves, drawn over them as hollow diamonds.
     """
     every = dict.fromkeys({**curves, **(yours or {})}, references or {})
-    return _draw(curves, every, ("iterations",), sharey=True, yours=yours)
+    return _draw(curves, every, ("steps",), sharey=True, yours=yours)
 
 
 def _draw(
@@ -82,7 +85,7 @@ def _draw(
     for column, (task, rows) in zip(grid.T, checked.items(), strict=True):
         mine = own.get(task, {})
         shown = {name: part or own.get(name, {}) for name, part in (checked if sharey else {task: rows}).items()}
-        column[0].set_ylim(_limits(shown, levels, floored=sharey))
+        column[0].set_ylim(_limits(shown, {name: levels[name] for name in shown}, floored=sharey))
         column[0].set_title(task.capitalize())
         for ax, word in zip(column, against, strict=True):
             for method, level in levels[task].items():
@@ -90,24 +93,30 @@ def _draw(
             drawn, over = ({method: part[method] for method in look_of if word in part.get(method, {})}
                            for part in (rows, mine))  # fmt: skip
             below = [] if sharey else _below(ax, levels[task], [*drawn.values(), *over.values()], word)
-            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.5, over, below)
+            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.3, over, below)
     for row in grid:
-        row[0].set_ylabel("executed return")
+        row[0].set_ylabel("executed return (m)")
     every = [row for part in (checked, own) for rows in part.values() for row in rows.values()]
     lowest = {task: column[0].get_ylim()[0] for column, task in zip(grid.T, checked, strict=True)}
     used = dict.fromkeys(method for task, own in levels.items() for method in own if own[method] >= lowest[task])
-    handles = axes.entries(look_of)
+    models = {method.model: method for method in sorted(look_of, key=lambda method: not method.search_space)}
+    handles = [entry(method.look.name, **{**look_of[method], "mfc": method.look.colour, "lw": 1.1})
+               for method in models.values()]  # fmt: skip
+    spaces = [word for word in SEARCH_SPACES if any(method.search_space == word for method in look_of)]
+    handles += [entry(f"{word} policy", color=DARK, marker="o", ms=3.2, mfc="white" if word == "direct" else DARK,
+                      lw=0.9 if word == "direct" else 1.3) for word in spaces]  # fmt: skip
     handles += [entry(method.look.name, **axes.reference_look(method)) for method in used]
-    if "iterations" in against and any({"return_predicted", "iterations"} <= row.keys() for row in every):
+    if "steps" in against and any({"return_predicted", "steps"} <= row.keys() for row in every):
         handles.append(entry("predicted return", color="#777777", **PREDICTED))
     if any(len(row["return_true"]) > 1 for row in every):
         handles.append(entry("95 % interval", color="#DDDDDD", lw=5, solid_capstyle="butt"))
     handles += axes.yours_entry(*own.values())
-    return axes.finish(figure, grid, handles, 4 if len(checked) > 1 else 2)
+    return axes.finish(figure, grid, handles, 5 if len(checked) > 1 else 2)
 
 
 def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, floored: bool) -> tuple[float, float]:
-    """The range of returns of some tasks: of the ends of curves, and somewhat more than as far again below them.
+    """The range of returns of some tasks: of the ends of curves, and below them as far as curves begin, or somewhat
+    more than as far again.
 
     floored: of everything, but what falls far below doing nothing may lie outside.
     """
@@ -116,7 +125,8 @@ def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, 
     if not floored:
         ends = np.array([*(mean[-1] for mean in means), *(max(own.values()) for own in levels.values() if own)])
         low, high = axes.limits(ends, ends)
-        return low - 1.2 * (high - low), high + 0.1 * (high - low)
+        start = min(low, *(mean[0] for mean in means)) - 0.1 * (high - low)
+        return max(low - 1.2 * (high - low), start), high + 0.1 * (high - low)
     every = np.concatenate(means)
     low, high = axes.limits(every, every, also=floors)
     return max(low, min(floors) - 0.35 * (high - min(floors))) if floors else low, high
@@ -144,13 +154,19 @@ def _panel(
         if word == "seconds":
             at, mean, half = (part[at >= 1] for part in (at, mean, half))
         if method in points:
-            at, mean, half = at[-1:] + 0.022 * far * points.index(method), mean[-1:], half[-1:]
+            if method is points[0]:
+                late = at[-1] > far / 2
+                ax.axvline(at[-1], color="#CCCCCC", lw=0.6, zorder=1)
+                ax.annotate(f"data of the models: {_spelled(at[-1], far)}", (at[-1], 0), (-2 if late else 2, 2),
+                            xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=6.5, color=NOTE,
+                            ha="right" if late else "left", va="bottom")  # fmt: skip
+            at, mean, half = at[-1:] + 0.018 * far * (1 + points.index(method)), mean[-1:], half[-1:]
             ax.plot([at[0], far], [mean[0]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
             ax.vlines(at, mean - half, mean + half, color=look["color"], lw=0.7, alpha=0.5, zorder=3)
             ax.plot(at, mean, **{**look, "ls": ""}, zorder=4)
         else:
             axes.curve(ax, at, mean, half, look, shift=i / len(drawn))
-        if word == "iterations" and "return_predicted" in row:
+        if word == "steps" and "return_predicted" in row:
             ax.plot(at, row["return_predicted"].mean(0), color=look["color"], **PREDICTED, zorder=2.5)
         notes += axes.outside(ax, at[-1:], mean[-1:], method) if below else axes.outside(ax, at, mean, method)
     for method, row in over.items():
@@ -162,7 +178,8 @@ def _panel(
             some = some[-1:]
         notes += axes.diamonds(ax, "y", at[some], mean[some], method)
     ax.grid(axis="y", color=GRID, lw=0.6)
-    axes.foot(ax, AXES[word], notes, inches)
+    free = word == "steps" and any(not method.search_space for method in (*drawn, *over))
+    axes.foot(ax, AXES[word] + FREE * free, notes, inches)
 
 
 def _checked(field: str, given: Mapping[str, np.ndarray]) -> Curves:
@@ -196,7 +213,12 @@ def _scale(ax: Axes, word: str, at: Sequence[np.ndarray]) -> float:
     else:
         ax.set_xlim(-0.015 * far, 1.06 * far)
         ax.xaxis.set_major_locator(MaxNLocator(5))
-    thousands = word == "samples" and far >= 10_000
-    unit, suffix = (1000, "k") if thousands else (1, "")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / unit:,g}{suffix if value else ''}"))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}" if word == "seconds" else
+                                               _spelled(value, far)))  # fmt: skip
     return far
+
+
+def _spelled(steps: float, far: float) -> str:
+    """A number of steps on an axis that ends at ``far``: 300k, 1.5M."""
+    unit, suffix = (1e6, "M") if far >= 1e6 else (1e3, "k") if far >= 1e4 else (1, "")
+    return f"{steps / unit:,g}{suffix if steps else ''}"

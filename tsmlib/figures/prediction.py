@@ -7,7 +7,7 @@ Letters in shapes: k seeds, T steps, L levels.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from tsmlib.figures import axes
 from tsmlib.figures.checks import Panels, finite, finite_panels, known, per_panel
 from tsmlib.figures.method import Method
-from tsmlib.figures.style import DASHED, GRID, WIDTH, above, entry, note, panels, rows_only, styled, tint
+from tsmlib.figures.style import DARK, DASHED, GRID, WIDTH, Props, above, entry, note, panels, rows_only, styled, tint
 from tsmlib.statistics import interval
 
 BAND = {"color": "#DDDDDD", "lw": 5, "solid_capstyle": "butt"}
@@ -24,7 +24,7 @@ BAND = {"color": "#DDDDDD", "lw": 5, "solid_capstyle": "butt"}
 @styled
 def figure5(
     values: Mapping[str, Panels],
-    ylabel: str | Mapping[str, str] = "log-likelihood per step",
+    ylabel: str | Mapping[str, str] = "log-likelihood (nats per step)",
     yours: Mapping[str, Panels] | None = None,
 ) -> Figure:
     """Prediction quality by environment (paper, figure 5): mean over seeds, 95 % t interval, each seed a small dot.
@@ -64,6 +64,7 @@ def figure5(
         axes.foot(ax, "", notes, width / len(checked) - 0.5)
     handles = axes.entries(look_of, ls="", ms=4.2)
     if several:
+        handles.append(entry("95 % interval over seeds", color=DARK, ls="", marker="|", ms=7, mew=1.1))
         handles.append(entry("one seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
     handles += axes.yours_entry(*own.values())
     return axes.finish(figure, [grid], handles, 5 if len(checked) > 1 else 3)
@@ -73,13 +74,15 @@ def figure5(
 def against_horizon(
     curves: Panels, ylabel: str | Mapping[str, str], *, log: Collection[str] = (),
     reference: Mapping[str, float] | None = None, columns: int = 3, yours: Panels | None = None,
+    measured: Sequence[int] = (),
 ) -> Figure:  # fmt: skip
     """Scores at every step ahead, one panel each: mean over seeds, and a band for its 95 % t interval.
 
     curves: title -> method -> (k, T); ylabel: one for all, or title -> text; log: the titles with a logarithmic axis;
     reference: title -> a value to draw a dashed line at, such as the nominal coverage; yours: as curves, drawn over
-    them as hollow diamonds. The axis is that of the medians over seeds: one seed that goes astray does not squeeze the
-    others. A band may run out of its panel; of a curve that does, the furthest value stands below.
+    them as hollow diamonds; measured: the steps ahead of which scores are known, for markers to stand only there, each
+    line's at every third, so that they part. The axis is that of the medians over seeds: one seed that goes astray does
+    not squeeze the others. A band may run out of its panel; of a curve that does, the furthest value stands below.
     """
     reference, own = reference or {}, finite_panels(yours or {}, "k T")
     checked = finite_panels(curves, "k T")
@@ -98,7 +101,8 @@ def against_horizon(
         notes = []
         for j, (method, (mean, half)) in enumerate(lines.items()):
             steps = np.arange(1, len(mean) + 1)
-            axes.curve(ax, steps, mean, half, look_of[method], shift=j / len(lines))
+            marks = [step - 1 for step in list(measured)[j % 3 :: 3] if step <= len(mean)]
+            axes.curve(ax, steps, mean, half, look_of[method], j / len(lines), marks)
             notes += axes.outside(ax, steps, mean, method)
             banded |= bool(half.any())
         for method, rows in mine.items():
@@ -175,7 +179,7 @@ def differences(
     values: title -> the other method -> (k,) differences; xlabel: one for all, or title -> text;
     lower_is_better: the titles in which a negative difference favours ``subject``. A mark is filled and its row tinted
     where the interval excludes zero; it is open where it does not, and for a single seed, which has no interval.
-    yours: as values, drawn below them as hollow diamonds at their means.
+    yours: as values, drawn below them as hollow diamonds at their means. The legend says as much.
     """
     checked, own = finite_panels(values, "k"), finite_panels(yours or {}, "k")
     known("lower_is_better", lower_is_better, values)
@@ -211,4 +215,10 @@ def differences(
     grid[0].annotate(f"{subject.label} minus", (0, 1), (-5, 1), xycoords="axes fraction", textcoords="offset points",
                      fontsize=7, ha="right", va="bottom", weight="bold", color=subject.look.colour)  # fmt: skip
     grid[0].set_ylim(len(look_of) - 0.5, -0.5)
-    return axes.finish(figure, [grid], axes.yours_entry(*own.values()))
+    point: Props = {"color": DARK, "marker": "o", "ms": 4.2, "mew": 0.7}
+    several = any(len(seeds) > 1 for rows in checked.values() for seeds in rows.values())
+    handles = [entry("mean, 95 % interval without 0", **point, lw=1.1)] if several else []
+    handles.append(entry(f"{'interval with 0, or ' * several}a single seed", **point, lw=0, mfc="white"))
+    if several:
+        handles.append(entry("one seed", color="#777777", ls="", marker="o", ms=1.8, mew=0))
+    return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 5)

@@ -140,6 +140,8 @@ def torques(ax: Axes, actions: np.ndarray, dt: float, main: str, limit: float = 
 
 
 def torque_labels(figure: Figure) -> None:
-    """The axes that all panels of torques share."""
-    figure.supxlabel("time (s)", fontsize=7)
+    """The axes that all panels of torques share; time below each of the lowest, not where the stamp stands."""
+    for ax in figure.axes:
+        if (place := ax.get_subplotspec()) and place.is_last_row():
+            ax.set_xlabel("time (s)")
     figure.supylabel("torque (share of full)", fontsize=7)

@@ -52,10 +52,12 @@ def horizon(found: pd.DataFrame, envs: Sequence[str]) -> Iterator[Drawing]:
     titles = {"ll_paper": "log-likelihood", "energy_score_noise": "energy score", "nrmse": "error"}
     few = table.select(_whole(found, envs), model=FEW)
     published, yours = table.pair(few, partial(prediction.horizon_panels, titles=titles, envs=envs))
-    ylabels = {title: title.partition(": ")[2].replace("error", "error / data's s.d.") for title in published}
+    units = {"log-likelihood": "nats per step", "energy score": "data's s.d.", "error": "data's s.d."}
+    ylabels = {title: units[title.partition(": ")[2]] for title in published}
     log = [title for title in published if not title.endswith("likelihood")]
     if published:
-        figure = figures.against_horizon(published, ylabels, log=log, columns=len(titles), yours=yours)
+        figure = figures.against_horizon(published, ylabels, log=log, columns=len(titles), yours=yours,
+                                         measured=prediction.HORIZONS)  # fmt: skip
         yield Drawing(figure, "03_horizon", few)
 
 
@@ -65,8 +67,8 @@ def differences(found: pd.DataFrame, envs: Sequence[str], subject: str) -> Itera
         published, yours = table.pair(found, partial(prediction.paired_panels, subject=subject, titles=SCORES, env=env))
         if published:
             lower = [SCORES["energy_score_noise"]] if SCORES["energy_score_noise"] in published else []
-            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "nats per step")
-            xlabels |= dict.fromkeys(lower, "energy score, lower is better")
+            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "log-likelihood (nats per step)")
+            xlabels |= dict.fromkeys(lower, "energy score (data's s.d.)")
             figure = figures.differences(published, xlabels, ours, lower_is_better=lower, yours=yours)
             yield Drawing(figure, f"03_differences_{EnvSpec.parse(env).name}", _whole(found, [env]))
 
@@ -83,7 +85,7 @@ def calibration(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
 
 def code_use(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
     """KL of the codes and spread of samples, of single segments."""
-    units = {"KL per segment": "nats", "spread of samples": "share of the data's deviation"}
+    units = {"KL per segment": "nats", "spread of samples": "data's s.d."}
     thresholds = {"KL per segment": {"Reacher": 0.1}, "spread of samples": {"Reacher": 0.01}}
     rows = table.select(found, env=envs, execution="segments", metric=("kl", "spread"))
     published, yours = table.pair(rows, partial(latent.use_panels, envs=envs))

@@ -18,6 +18,7 @@ from tsmlib.study import models, plans, policies, predictions, zoo
 from tsmlib.study.data import dataset, sizes
 from tsmlib.study.plans import CANDIDATES, TORQUES
 from tsmlib.study.policies import USUAL, Budget
+from tsmlib.study.results.policies import EPISODES
 from tsmlib.study.runs import Run
 from tsmlib.study.tasks import load_task
 
@@ -182,7 +183,7 @@ class Policy:
         return policies.learn(run, load_task(self.env).take(self.n), self.method, self.budget)
 
     def settings(self, run: Run) -> Json:
-        return {**asdict(policies.complete(run, self.budget)), "episodes": policies.EPISODES[run.scale]}
+        return {**asdict(policies.complete(run, self.budget)), "episodes": EPISODES[run.scale]}
 
     def seconds(self, run: Run) -> float:
         return policies.complete(run, self.budget).iterations * run.pick(smoke=0.5, laptop=1.0, paper=1.0)

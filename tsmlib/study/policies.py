@@ -24,12 +24,10 @@ from tsmlib.storage import artifacts, tables
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior
 from tsmlib.study.predictions import table
-from tsmlib.study.results.policies import finished, learning_curves, learning_rows, plateau_rows
+from tsmlib.study.results.policies import EPISODES, finished, learning_curves, learning_rows, plateau_rows
 from tsmlib.study.results.table import Row, of_task
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
-
-EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration (A.3)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,12 @@ import numpy as np
 import pandas as pd
 
 from tsmlib.figures.method import Method
+from tsmlib.planning.tasks import HORIZON
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import ARRIVED
 from tsmlib.study.results.table import Row
 
+EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration of learning (A.3)
 UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
          "success": "share"}  # fmt: skip
 SOONEST = {"samples_to_90": "steps of model or environment", "env_samples_to_90": "steps of the environment",
@@ -152,10 +154,17 @@ def _curves(own: pd.DataFrame) -> Curves:
     curves = {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
     curves["seconds"] = curves.pop(clock).mean(0)
     if not own["search_space"].iloc[0]:
-        return curves | {"samples": at}
+        return curves | {"steps": at, "samples": at}
     samples, before = (own[own["metric"] == metric]["value"].mean() for metric in ("samples", "train_seconds"))
-    return curves | {"iterations": at, "samples": np.full(len(at), samples), "seconds": curves["seconds"] + before,
+    task, scale = own[["task", "scale"]].iloc[0]
+    curves |= {"iterations": at, "steps": at * model_steps(task, scale)}
+    return curves | {"samples": np.full(len(at), samples), "seconds": curves["seconds"] + before,
                      "within_data": own[own["metric"] == "within_data"]["value"].to_numpy()[:, None]}  # fmt: skip
+
+
+def model_steps(task: str, scale: str) -> int:
+    """Steps of its model that a policy of a task takes per iteration of learning, each copy."""
+    return HORIZON[task] * EPISODES[scale]
 
 
 def finished(found: pd.DataFrame) -> pd.DataFrame:

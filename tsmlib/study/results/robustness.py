@@ -19,6 +19,7 @@ from tsmlib.evaluation.filtering import PARTS, rmse
 from tsmlib.figures.method import Method
 from tsmlib.study import zoo
 from tsmlib.study.results import table
+from tsmlib.study.results.policies import model_steps
 from tsmlib.study.results.prediction import paired, select, values
 from tsmlib.study.results.table import Row
 
@@ -174,12 +175,13 @@ def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float
 
 
 def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Method, dict[str, np.ndarray]]]:
-    """The input of ``figures.figure8``: world -> method -> curves, a line per copy, of up to ``last`` iterations."""
+    """The input of ``figures.figure8``: world -> method -> curves against steps in the model, a line per copy, of up to
+    ``last`` iterations."""
     curves: dict[str, dict[Method, dict[str, np.ndarray]]] = {}
     for (arm, method), own in table.groups(_policies(found, last, "return_true"), ["world", "method"]):
         wide = own.pivot(index=["seed", "copy"], columns="iteration", values="value")
-        lines = {"iterations": wide.columns.to_numpy(dtype=float), "return_true": wide.to_numpy()}
-        curves.setdefault(arm, {})[method] = lines
+        steps = wide.columns.to_numpy(dtype=float) * model_steps(*own[["task", "scale"]].iloc[0])
+        curves.setdefault(arm, {})[method] = {"steps": steps, "return_true": wide.to_numpy()}
     return curves
 
 

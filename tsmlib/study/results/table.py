@@ -14,6 +14,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.tasks import Task
 from tsmlib.statistics import interval
 from tsmlib.storage import tables
+from tsmlib.study import zoo
 from tsmlib.study.runs import Run
 from tsmlib.study.zoo import LOOKS, ZOO, method
 
@@ -178,7 +179,8 @@ def pair(
 def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
     """Where rows are from, in one line: scale, seeds and n of the published ones and of the reader's own.
 
-    Arms of which nothing is published are named. figure: only of what a figure shows, which says less at scale paper.
+    Arms of which nothing is published are named. figure: only of what a figure shows, which says less at scale paper;
+    there it is said if other models with codes have rows and OURS has none.
     """
     shown = pd.concat([drawn(found), beside(found)]) if figure else found
     said = []
@@ -190,6 +192,9 @@ def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
         known |= set(found["env"])
     if missing := [env for env in found["env"].unique() if env and env not in known]:
         said.append(f"of {', '.join(map(_env_name, missing))} nothing is published")
+    models = set(found["model"]) if figure and "model" in found else set()
+    if zoo.OURS not in models and models & set(zoo.words(cls=zoo.CODED)):
+        said.append(f"no rows of {method(zoo.OURS).label}")
     return "; ".join(said)
 
 
