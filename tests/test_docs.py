@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 import tsmlib
+from tsmlib.storage import tables
 from tsmlib.study import publish
 from tsmlib.study.runs import ROOT
 
@@ -124,3 +125,18 @@ def test_a_notebook_is_shown_as_it_was_executed_unless_it_has_changed_since(
     shown = page_of(stored, executed)
     assert "is of another version" in shown.cells[1].source
     assert "what came out" not in str(shown)
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "explanation").glob("*.md")), ids=lambda page: page.stem)
+def test_the_equation_that_a_piece_of_code_is_stands_above_it(page: Path) -> None:
+    above = re.split(r"^```\{literalinclude\}[^`]*^```\n", page.read_text(), flags=re.MULTILINE)[:-1]
+    for text in above:
+        assert "$$" in text.rpartition("\n## ")[2] or not text.strip(), text  # or it shares the one before
+
+
+def test_gradients_over_codes_leave_smaller_gaps_and_return_less_as_the_page_on_the_prior_says() -> None:
+    rows = tables.load(ROOT / "data" / "results" / "05_control.csv")
+    rows = rows[(rows["planner"] == "adam") & (rows["execution"] == "open loop") & rows["iteration"].isna()]
+    found = rows.pivot_table(index=["env", "model"], columns=["metric", "search_space"], values="value")
+    assert (found["gap_absolute"]["latent"] < found["gap_absolute"]["direct"]).all()
+    assert (found["return_true"]["latent"] < found["return_true"]["direct"]).all()
