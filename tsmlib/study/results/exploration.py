@@ -155,13 +155,23 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
         keyed = table.groups(own, ["configuration", "env_steps"])
         left = {(str(way), int(steps)): float(part["value"].mean()) for (way, steps), part in keyed}
         if (zero := left.pop(("zero-shot", 0), None)) is not None:
-            said = [f"{WAYS[way].name} ({steps // 100}) {value / zero:.0%}" for (way, steps), value in left.items()]
             ahead = own["steps_ahead"].max()
-            yield f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left by {', '.join(said)}."
+            shares = {key: value / zero for key, value in left.items()}
+            yield (
+                f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left, after so many episodes, by "
+                f"{_by_way(shares)}."
+            )
             lost = zero - next((value for (way, _), value in left.items() if way == REFERENCE), zero)
             if lost > 0:
-                said = [
-                    f"{WAYS[way].name} ({steps // 100}) {(zero - value) / lost:.0%}"
-                    for (way, steps), value in left.items() if way != REFERENCE
-                ]  # fmt: skip
-                yield f"`{env}`, `{word}`: of what training in full takes off it, {', '.join(said)} is taken off."
+                shares = {key: (zero - value) / lost for key, value in left.items() if key[0] != REFERENCE}
+                yield f"`{env}`, `{word}`: of what training in full takes off it is taken off by {_by_way(shares)}."
+
+
+def _by_way(shares: Mapping[tuple[str, int], float]) -> str:
+    """Shares in words, way by way; keys: way and steps."""
+    said = []
+    for way, look in WAYS.items():
+        own = sorted((steps, share) for (which, steps), share in shares.items() if which == way)
+        if own:
+            said.append(f"{look.name} {', '.join(f'{share:.0%} ({steps // 100})' for steps, share in own)}")
+    return "; ".join(said)
