@@ -66,9 +66,7 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
         for way, steps, value in (("zero-shot", 0, 2.0), ("all", 2000, 0.5), ("reference", 50_000, 0.4))
         for metric in results.SCORES
     ])  # fmt: skip
-    assert "is left, after so many episodes, by all weights 25% (20); trained in full 20% (500)" in results.sentences(
-        rows
-    )
+    assert "is left, with n episodes, by all weights 25% (20); trained in full 20% (500)" in results.sentences(rows)
     assert "of what training in full takes off it is taken off by all weights 94% (20)" in results.sentences(rows)
     (curves,) = results.way_curves(rows, 80).values()
     assert [(way.model, *map(float, at), float(values[0, 0])) for way, (at, values) in curves.items()] == [

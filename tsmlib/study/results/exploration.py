@@ -158,7 +158,7 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
             ahead = own["steps_ahead"].max()
             shares = {key: value / zero for key, value in left.items()}
             yield (
-                f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left, after so many episodes, by "
+                f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left, with n episodes, by "
                 f"{_by_way(shares)}."
             )
             lost = zero - next((value for (way, _), value in left.items() if way == REFERENCE), zero)
