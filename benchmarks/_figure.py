@@ -59,7 +59,7 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
             ax.errorbar(sizes, middle, bars, **LOOKS[word], ms=3, lw=1, elinewidth=0.7, zorder=3)
             found = exponents(sizes, seconds)
             spread = f"{np.median(found):.2f} ({found.min():.2f} to {found.max():.2f})"
-            told = f"exponent {spread}" if np.ptp(found) < UNCLEAR else "rounds differ too much"
+            told = f"slope {spread}" if np.ptp(found) < UNCLEAR else "rounds differ too much"
             notes.append((told, LOOKS[word]["color"]))
         unit = f" ({UNITS[title]})" if title in UNITS else ""
         ax.set(xscale="log", yscale="log", title=title.capitalize() + unit)

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import _rounds
+import _table
 import numpy as np
 import pytest
 import torch
@@ -16,11 +18,6 @@ from tsmlib.__main__ import _benchmarks, main
 from tsmlib.models.layers import CausalDecoder, Encoder
 from tsmlib.storage import tables
 from tsmlib.study import runs
-
-sys.path.insert(0, str(runs.ROOT / "benchmarks"))
-
-import _rounds
-import _table
 
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],

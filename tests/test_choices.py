@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any
 
+import as_published
+import decoders
+import judge
 import numpy as np
 import pandas as pd
 import pytest
+import rows
+import spent
 import torch
 from scripts import run_script
 from untrained import in_units
@@ -22,14 +26,6 @@ from tsmlib.planning.tasks import zero_torques
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
 from tsmlib.trajectory import initial_past
-
-sys.path.insert(0, str(runs.ROOT / "benchmarks" / "settings"))
-
-import as_published
-import decoders
-import judge
-import rows
-import spent
 
 ARM = ["--env", "tsm/Reacher-v0"]
 TRIES = [("half the batch",), ("twice the batch, half the updates",)]

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import pytest
 import torch
+from _plain import PlainDecoder, PlainPrior, PlainTSM
 from torch import Tensor
 
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import predict_segment
 from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.tsm import TSM
-from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment, Window
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-from _plain import PlainDecoder, PlainPrior, PlainTSM
 
 B, H, DX, DU = 5, 10, 6, 2
 HEADS: dict[str, dict[str, int]] = {"basic": {}, "contacts": {"head_channels": 12}, "state skip": {"state_skip": 12}}

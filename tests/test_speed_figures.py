@@ -18,7 +18,7 @@ def test_each_panel_names_its_exponents() -> None:
     flat = np.stack([np.ones(4), np.ones(4)])
     figure = growth({"batch": {"train": (SIZES, flat * SIZES)}, "threads": {"simulate": (SIZES, flat / SIZES)}})
     notes = [text.get_text() for ax in figure.axes for text in ax.texts]
-    assert notes == ["exponent 1.00 (1.00 to 1.00)", "exponent −1.00 (−1.00 to −1.00)"]
+    assert notes == ["slope 1.00 (1.00 to 1.00)", "slope −1.00 (−1.00 to −1.00)"]
 
 
 def test_an_exponent_that_differs_from_round_to_round_is_not_printed() -> None:
