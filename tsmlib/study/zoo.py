@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 580.0,
-    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 120.0,
+    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 580.0,
 }  # fmt: skip
 
 
