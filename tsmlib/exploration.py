@@ -152,10 +152,10 @@ def explore(
             stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
             place = None if folder is None else _Round(folder / f"round-{k:03d}", identity)
-            if episodes is None:
-                new, record = _collected(k, model, prior, train, tasks, options, seed, place)
-            else:
-                new, record = episodes(k), {}
+            new, record = (
+                _collected(k, model, prior, train, tasks, options, seed, place)
+                if episodes is None else (episodes(k), dict[str, float]())
+            )  # fmt: skip
             before = found.records[-1]["env_steps"] if found.records else 0
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))

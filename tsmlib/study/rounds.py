@@ -276,7 +276,7 @@ def loop(
         return here.random(sizes.episodes, _seed(seed, k)) if data == RANDOM else None
 
     zero = _once(None if own is None else own / "round-0.json", {"sizes": asdict(sizes), "seed": seed},
-                 lambda: measured(model, prior))  # fmt: skip
+                 lambda: dict(measured(model, prior)))  # fmt: skip
     found = explore(
         model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
         options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
