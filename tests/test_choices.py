@@ -158,6 +158,13 @@ def test_rows_of_a_metric_leave_those_of_another_and_a_learning_curve_is_replace
     assert found == [("cost", ""), ("gradient_snr", ""), ("return_true", 88), ("return_true", 176)]
 
 
+def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_has_some() -> None:
+    row = dict(env="e", model="tsm", metric="cost", value=1.0, n=2, seed=0, scale="paper")
+    published = tables.frame([row, dict(row, configuration="codes")])
+    found = tables.records(rows.merged(published, [dict(row, value=2.0)]))
+    assert [(line["configuration"], line["value"]) for line in found] == [("codes", 1.0), ("", 2.0)]
+
+
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:
     about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0"}
     lines = pd.DataFrame([

@@ -65,6 +65,10 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
             f"search space is {method.search_space!r}, iterations {budget.iterations}, copies {budget.copies}; "
             f"expected {' or '.join(SEARCH_SPACES)}, 0 (the scale's default) or more iterations, and at least one copy"
         )
+    if not task.is_standard:  # a file of a policy is known by the name of its task
+        raise ValueError(
+            f"task {task.name!r} has a reward of its own; expected the paper's. Learn for it with tsmlib.learn_policy"
+        )
     net = load_or_train(run, task.env, method.model).model
     prior = load_prior(run, task.env) if method.search_space == "latent" else None
     weights = {"model": artifacts.digest(net.state_dict())}
@@ -177,7 +181,7 @@ def file_name(method: Method) -> str:
 def execute_policy(task: Task, policy: Policy) -> Trial:
     """Every copy of a policy on every target, one copy after the other."""
     many = task.times(policy.copies)
-    return execute(many, controller(policy, many.target))
+    return execute(many, controller(policy, many.target), past_len=policy.past_len)
 
 
 @torch.no_grad()
@@ -198,6 +202,6 @@ def assess(policy: Policy, model: DynamicsModel, task: Task, *, seed: int) -> di
     found = {
         "return_true": done.executed_return, "return_predicted": many.reward(*seen).sum(-1),
         "final_distance": done.final_distance,
-        "success": (done.final_distance <= task.tolerance).float(),
+        "success": cast("Tensor", done.success).float(),
     }  # fmt: skip
     return {name: values.unflatten(0, (policy.copies, -1)).mean(1) for name, values in found.items()}

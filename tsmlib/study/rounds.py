@@ -7,6 +7,7 @@ on as many random episodes, trained as often.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
@@ -109,14 +110,12 @@ def divided(data: Trajectories) -> tuple[Trajectories, Trajectories]:
 
 def walks(prior: ActionPrior, n: int, *, seed: int = 0) -> Trajectories:
     """What random codes of a prior do, an episode of each, from the environment's own starts."""
-    simulation = make_simulation(PENDULUM, n)
     segments = HORIZON // prior.segment_len
     codes = torch.randn(n, segments, prior.latent_dim, generator=torch.Generator().manual_seed(seed))
     with torch.no_grad():
         actions = LatentActions(prior, HORIZON).decode(codes[None])[0]
-    data = collect(simulation, open_loop(actions), horizon=HORIZON, seed=seed)
-    simulation.close()
-    return data
+    with closing(make_simulation(PENDULUM, n)) as simulation:
+        return collect(simulation, open_loop(actions), horizon=HORIZON, seed=seed)
 
 
 def plane(data: Trajectories) -> np.ndarray:
