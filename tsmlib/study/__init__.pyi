@@ -13,8 +13,10 @@ from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
 from .models import load_prior as load_prior
+from .models import parts as parts
 from .models import schedule as schedule
 from .models import train_all as train_all
+from .models import training_data as training_data
 from .needed import needs as needs
 from .parallel import precompute as precompute
 from .plans import along_the_way as along_the_way

@@ -136,13 +136,11 @@ def _load(path: Path, env: str, model: str) -> TrainedModel:
 def train(run: Run, env: str, model: str, path: Path) -> Trained:
     """Train a model by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
     print(f"{env}: no trained {model} at scale {run.scale}; training it now, {_duration(run, env, model)}")
-    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
-    if (symmetries := _symmetries(env, model)) > 1:
-        data = symmetric(data)
+    data, held_out = training_data(run, env, model)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves, checkpoints = schedule(run, env, model), {}, []
     fewer = {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
-    for (k, part), (key, stage) in product(enumerate(_parts(net)), zip(zoo.keys(stages), stages, strict=True)):
+    for (k, part), (key, stage) in product(enumerate(parts(net)), zip(zoo.keys(stages), stages, strict=True)):
         key += f"@{k}" * bool(k)
         checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
@@ -153,7 +151,7 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
         curves[key] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "schedule": [stage.stated() for stage in stages], "symmetries": symmetries,
+        "schedule": [stage.stated() for stage in stages], "symmetries": _symmetries(env, model),
         "bf16": [key for key, curve in curves.items() if any(curve["bf16"])],  # as the processor had it
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"),
@@ -166,7 +164,13 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     return Trained(net, artifacts.read_header(path))
 
 
-def _parts(net: TrainedModel) -> list[TrainedModel]:
+def training_data(run: Run, env: str, model: str) -> tuple[Trajectories, Trajectories]:
+    """What a model is trained on, with the symmetric copies where there are some; and the validation data."""
+    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
+    return symmetric(data) if _symmetries(env, model) > 1 else data, held_out
+
+
+def parts(net: TrainedModel) -> list[TrainedModel]:
     """What is trained by itself, one after another: the decoders of a recurrent model, else the model."""
     return [net.alone(k) for k in range(net.members)] if isinstance(net, RecurrentTSM) and net.members > 1 else [net]
 
