@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, cast
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, TypedDict, cast
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from tsmlib.models.base import DynamicsModel
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
-from tsmlib.storage.files import StoreError
+from tsmlib.storage.files import Json, StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
@@ -32,7 +32,36 @@ if TYPE_CHECKING:
     import pandas as pd  # of the extra "study", which a pretrained model does not need
 
 PRETRAINED = ROOT / "data" / "pretrained"
-Header = Mapping[str, Any]  # JSON: what a file says of itself
+
+
+class TrainedCurve(TypedDict):
+    """A ``TrainingHistory`` as JSON."""
+
+    step: list[int]
+    seconds: list[float]
+    train: list[float]
+    validation: list[float]
+    bf16: list[bool]
+    resumed: list[str]
+
+
+class Header(TypedDict, total=False):
+    """What the file of a trained model says of itself. curves, bf16: by the keys of its stages (``zoo.keys``)."""
+
+    fingerprint: dict[str, Json]
+    model: str
+    seed: int
+    scale: str
+    curves: dict[str, TrainedCurve]
+    schedule: list[dict[str, Json]]
+    symmetries: int
+    bf16: list[str]
+    torch: str
+    threads: int
+    device: str
+    finished: str
+    seconds: float
+    inputs: dict[str, str]
 
 
 class TrainedModel(DynamicsModel, Protocol):
@@ -66,8 +95,8 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     own = run.folder(f"models/{folder}") / file
     for path in [own, run.shipped / folder / file] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            header = artifacts.read_header(path)
-            trained_at = replace(run, scale=str(header.get("scale", run.scale)))
+            header = cast(Header, artifacts.read_header(path))
+            trained_at = replace(run, scale=header.get("scale", run.scale))
             planned = [stage.stated() for stage in schedule(trained_at, env, model)]
             if header.get("model") != model:
                 raise StoreError(f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it")
@@ -161,7 +190,7 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     artifacts.save_model(path, net, header)
     for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)
-    return Trained(net, artifacts.read_header(path))
+    return Trained(net, cast(Header, artifacts.read_header(path)))
 
 
 def training_data(run: Run, env: str, model: str) -> tuple[Trajectories, Trajectories]:

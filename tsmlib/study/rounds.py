@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from tsmlib.planning.execution import mpc
 from tsmlib.planning.planners import cem
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
+from tsmlib.storage.files import Json
 from tsmlib.study import zoo
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results.exploration import HORIZON, PENDULUM
@@ -35,7 +36,7 @@ from tsmlib.study.runs import Run
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
-LEARNERS: Mapping[str, Mapping[str, Any]] = {  # arguments of the model, beyond the defaults
+LEARNERS: Mapping[str, Mapping[str, Json]] = {  # arguments of the model, beyond the defaults
     "rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 64},
 }  # fmt: skip
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans

@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -182,7 +182,7 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
 
 def return_panels(
     found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem", methods: Sequence[Method] = ()
-) -> dict[str, Any]:
+) -> dict[str, dict[Method, dict[str, np.ndarray | None]]]:
     """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
     every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
     return {task: {m: rows[m] for m in methods or _ordered(rows) if m in rows} for task, rows in every.items()}
@@ -194,7 +194,7 @@ def _ordered(rows: Iterable[Method]) -> list[Method]:
     return sorted(rows, key=lambda method: order.index(method.model))
 
 
-def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, Any]:
+def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, dict[Method, dict[str, np.ndarray]]]:
     """The input of ``figures.final_distances``."""
     return {task.name: final_distances(found, task.env)}
 
