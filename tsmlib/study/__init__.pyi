@@ -36,8 +36,8 @@ from .predictions import score_all as score_all
 from .predictions import score_rows as score_rows
 from .predictions import scores as scores
 from .predictions import table as table
-from .robots import beside_the_oracle as beside_the_oracle
-from .robots import scoreboard as scoreboard
+from .robots import model_rows as model_rows
+from .robots import reference_rows as reference_rows
 from .runs import RESULTS as RESULTS
 from .tasks import FROZEN as FROZEN
 from .tasks import TASK_SEED as TASK_SEED

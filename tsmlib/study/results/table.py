@@ -186,7 +186,7 @@ def drawn(found: pd.DataFrame) -> pd.DataFrame:
     return own if "paper" in set(own["scale"]) else select(found, source=PUBLISHED)
 
 
-def beside(found: pd.DataFrame) -> pd.DataFrame:
+def own_rows(found: pd.DataFrame) -> pd.DataFrame:
     """The reader's own rows, where ``drawn`` gives those of others."""
     if "source" not in found:
         return found.iloc[:0]
@@ -201,7 +201,7 @@ def pair(
 
     Panels for which neither has rows are left out.
     """
-    first, second = read(drawn(found)), read(beside(found))
+    first, second = read(drawn(found)), read(own_rows(found))
     titles = [title for title in {**first, **second} if first.get(title) or second.get(title)]
     return {title: first.get(title, {}) for title in titles}, {
         title: second[title] for title in titles if second.get(title)
@@ -214,13 +214,13 @@ def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
     Arms of which nothing is published are named. figure: only of what a figure shows, which says less at scale paper;
     there it is said if other models with codes have rows and OURS has none.
     """
-    shown = pd.concat([drawn(found), beside(found)]) if figure else found
+    shown = pd.concat([drawn(found), own_rows(found)]) if figure else found
     said = []
     for source, part in groups(shown, "source"):
-        title = "" if figure and len(beside(found)) == 0 and source == YOURS else f"{source}: "
+        title = "" if figure and len(own_rows(found)) == 0 and source == YOURS else f"{source}: "
         said.append(f"{title}{_origin(part)}")
     known = set(select(found, source=PUBLISHED)["env"])
-    if figure and beside(found).empty:  # at scale paper it is what will be published
+    if figure and own_rows(found).empty:  # at scale paper it is what will be published
         known |= set(found["env"])
     if missing := [env for env in found["env"].unique() if env and env not in known]:
         said.append(f"of {', '.join(map(_env_name, missing))} nothing is published")
