@@ -105,7 +105,7 @@ def main() -> None:
         "latent, CEM plain": lambda: few_cem(plain, space=latent(plain_prior)),
         "simulate": lambda: simulate(start, torques, simulated),
     }
-    words = ("latent, Adam", "direct, Adam", "latent, CEM")
+    words = {"latent, Adam": ("latent", "adam"), "direct, Adam": ("direct", "adam"), "latent, CEM": ("latent", "cem")}
     products = {f"{word} sgemm": Products.of(ways[word]).alone() for word in words}
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     taken = interleaved(ways | products, arguments.rounds, warm=False)
@@ -113,8 +113,7 @@ def main() -> None:
 
     common = dict(env=ENV, sim="mujoco", task="push", model="tsm", horizon=horizon)
     rows, threads = [], min(os.cpu_count() or 1, 8)  # as the environment takes them
-    for word in words:
-        search_space, planner = word.lower().split(", ")
+    for word, (search_space, planner) in words.items():
         done = few if planner == "adam" else 1
         way = dict(common, planner=planner, search_space=search_space)
         rows.append(

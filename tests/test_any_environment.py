@@ -297,6 +297,44 @@ def test_an_environment_that_cannot_be_saved_has_no_oracle_but_is_collected_from
         np.testing.assert_array_equal(data.states[i], seen.astype(np.float32))
 
 
+class Fragile(gymnasium.Env):
+    """Breaks at a step once it is told to; knows how many of it are open."""
+
+    observation_space, action_space = Box(-1, 1, (2,)), Box(-1, 1, (1,))
+    open, broken = 0, False
+
+    def __init__(self, observations: Any = None) -> None:
+        Fragile.open += 1
+        self.observation_space = observations or Fragile.observation_space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if Fragile.broken:
+            raise RuntimeError("broken")
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+    def close(self) -> None:
+        Fragile.open -= 1
+
+
+def test_environments_are_closed_where_collecting_or_executing_raises(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env_id = made(Fragile)
+    task = Task.from_env(env_id, n=3, horizon=2, reward=still)
+    assert Fragile.open == 0
+    monkeypatch.setattr(Fragile, "broken", True)
+    for attempt in (lambda: tsmlib.collect_random(env_id, 3), lambda: tsmlib.execute(task, torch.zeros(3, 2, 1))):
+        with pytest.raises(RuntimeError, match="broken"):
+            attempt()
+        assert Fragile.open == 0
+    with pytest.raises(UnsupportedEnvironment):
+        make_simulation(made(lambda: Fragile(Dict(x=Box(-1, 1, (2,))))), 2)
+    assert Fragile.open == 0
+
+
 # Tasks ---------------------------------------------------------------------------------------------------------------
 
 

@@ -26,6 +26,8 @@ from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import zero_torques
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
+from tsmlib.training import fit as fit_module
+from tsmlib.training.fit import TrainingHistory
 from tsmlib.trajectory import initial_past
 
 ARM = ["--env", "tsm/Reacher-v0"]
@@ -53,6 +55,28 @@ def test_the_measurement_behind_a_setting_leaves_a_row_for_each_try(
     rows = tables.records(tables.load(table))
     assert sorted({tuple(row[column] for column in columns) for row in rows}) == tries
     assert len({row["metric"] for row in rows}) * len(tries) == len(rows)
+
+
+def test_tries_are_trained_on_the_data_that_the_study_trains_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    seen = list[tuple[int, int]]()
+
+    def episodes(model: Any, loss: Any, data: Any, held_out: Any, options: Any, **more: Any) -> Any:
+        seen.append((model.config().get("members", 1), len(data)))
+        return TrainingHistory(seconds=[0.0], step=[1], train=[0.0], validation=[0.0])
+
+    monkeypatch.setattr(fit_module, "fit", episodes)
+    for name, options in (("budget", ["--model", "rtsm", "--stages", "3"]), ("learning_rates", ["--models", "rtsm"])):
+        script = runs.ROOT / "benchmarks" / "settings" / f"{name}.py"
+        run_script(
+            script, "--scale", "smoke", "--env", "tsm/ReacherPush-v1", "--out", str(tmp_path / "t.csv"), *options
+        )
+    run = runs.resolve("02_train", scale="smoke")
+    assert len(study.dataset(run, "tsm/ReacherPush-v1", "train")) == 20
+    assert seen == [(1, 8 * 20)] * (2 * 3 + 3 * 3)
+    assert len(study.training_data(run, "tsm/ReacherObstacle-v0", "prior")[0]) == 20
 
 
 def table(path: Path, *values: tuple[int, float], **columns: Any) -> as_published.Found:
@@ -86,22 +110,30 @@ def test_returns_are_those_of_plans_and_of_policies_when_they_are_learned(tmp_pa
     assert [list(seeds.values()) for seeds in as_published.read(path).values()] == [[-3.0]]
 
 
-def test_what_was_made_is_told_from_the_name_of_its_file() -> None:
-    said = {
-        "models/Reacher/tsm+energy.safetensors": "models, Reacher",
-        "models/Reacher-delay5/lstm.safetensors": "models, Reacher-delay5",
-        "models/Reacher/policy-ensemble+mse-latent.safetensors": "policies, ensemble+mse-latent",
-        "plans/Reacher-oracle-latent-cem-every10.safetensors": "plans, oracle",
-        "plans/Reacher-ensemble+mse-latent-cem-every10.safetensors": "plans, cem-every10",
-    }
-    assert {name: spent.kind(Path(name)) for name in said} == said
+def test_what_a_run_has_spent_is_told_by_headers_and_a_closed_loop_counts_its_own_seconds(tmp_path: Path) -> None:
+    def kept(file: str, seconds: float, **header: Any) -> None:
+        path = tmp_path / f"{file}.safetensors"
+        artifacts.save(path, {"x": np.zeros(1, np.float32)}, kind="any", header={"seconds": seconds, **header})
 
-
-def test_the_plan_that_a_closed_loop_begins_with_is_counted_once(tmp_path: Path) -> None:
-    for name, seconds in (("e-tsm-latent-cem", 3.0), ("e-tsm-latent-cem-every10", 10.0)):
-        path = tmp_path / f"{name}.safetensors"
-        artifacts.save(path, {"actions": np.zeros(1, np.float32)}, kind="plan", header={"seconds": seconds})
-    assert spent.took(path) == 7.0
+    arm = {"env": "tsm/Reacher-delay5-v0"}
+    kept("models/Reacher-delay5/lstm", 1.0, fingerprint=arm, model="lstm")
+    kept("models/Reacher-delay5/policy-ensemble+mse-latent", 2.0, fingerprint=arm, model="ensemble+mse",
+         search_space="latent")  # fmt: skip
+    for file, seconds, posed in (
+        ("Reacher-delay5-oracle-latent-cem", 3.0, dict(every=0, iterations=10)),
+        ("Reacher-delay5-ensemble+mse-latent-adam+starts", 4.0, dict(every=0, iterations=100)),
+        ("Reacher-delay5-ensemble+mse-latent-adam+starts-every10", 10.0, dict(every=10, iterations=20)),
+        ("Reacher-delay5-tsm-latent-adam-500", 5.0, dict(every=0, iterations=500)),
+    ):
+        kept(f"plans/{file}", seconds, made_from=arm | posed)
+    assert sorted(spent.costs(tmp_path)) == [
+        ("models", "Reacher-delay5", 1.0),
+        ("plans", "adam", 5.0),
+        ("plans", "adam+starts", 4.0),
+        ("plans", "adam+starts, every 10 steps", 6.0),
+        ("plans", "oracle", 3.0),
+        ("policies", "ensemble+mse, latent", 2.0),
+    ]
 
 
 def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path: Path) -> None:
@@ -157,6 +189,13 @@ def test_rows_of_a_metric_leave_those_of_another_and_a_learning_curve_is_replace
     new = [dict(plan, metric="gradient_snr"), *(dict(policy, iteration=i) for i in (88, 176))]
     found = [(line["metric"], line["iteration"]) for line in tables.records(rows.merged(published, new))]
     assert found == [("cost", ""), ("gradient_snr", ""), ("return_true", 88), ("return_true", 176)]
+
+
+def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_has_some() -> None:
+    row = dict(env="e", model="tsm", metric="cost", value=1.0, n=2, seed=0, scale="paper")
+    published = tables.frame([row, dict(row, configuration="codes")])
+    found = tables.records(rows.merged(published, [dict(row, value=2.0)]))
+    assert [(line["configuration"], line["value"]) for line in found] == [("codes", 1.0), ("", 2.0)]
 
 
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:

@@ -57,7 +57,7 @@ def claim(rule: Callable[[Query], Checks], **about: Any) -> Claim:
     return Claim("X1", "here", FIGURE5, "it", **about)(rule)
 
 
-def ahead(*rivals: Model, of: float = 0.0) -> Claim:
+def superiority(*rivals: Model, of: float = 0.0) -> Claim:
     """TSM has a higher likelihood than each rival."""
 
     def rule(q: Query) -> Checks:
@@ -108,7 +108,7 @@ def share(rule: Claim, word: str, effect: float, *, n: int = 10, noise: str = "n
 
 
 def test_planted_effects_are_found() -> None:
-    better = ahead(LSTM)
+    better = superiority(LSTM)
     assert share(better, REPLICATED, 2.0) >= 0.95
     assert share(better, FAILED, -2.0) >= 0.95
 
@@ -116,7 +116,7 @@ def test_planted_effects_are_found() -> None:
 @pytest.mark.parametrize("noise", ["normal", "uniform"])
 @pytest.mark.parametrize("n", [3, 10])
 def test_planted_nulls_are_not_replicated(noise: str, n: int) -> None:
-    better = ahead(LSTM, of=1.0)
+    better = superiority(LSTM, of=1.0)
     assert share(better, REPLICATED, 1.0, n=n, noise=noise) <= 0.05
     alike = claim(lambda q: between(-1, q.ll(TSM, REACHER) - q.ll(LSTM, REACHER), 1))
     assert share(alike, REPLICATED, 1.0, n=n, noise=noise) <= 0.07  # its level is 5 %
@@ -127,7 +127,7 @@ def test_many_checks_do_not_make_a_failure_likely_by_chance() -> None:
     rng, failed = np.random.default_rng(0), {1: 0, 8: 0}
     for n_checks in failed:
         rivals = [Model(f"rival{i}") for i in range(n_checks)]
-        level = ahead(*rivals)
+        level = superiority(*rivals)
         for _ in range(300):
             rows = Planted(tsm=np.zeros(10), **{rival.word: rng.standard_normal(10) for rival in rivals})
             failed[n_checks] += evaluate.judge(level, rows).word == FAILED
@@ -135,7 +135,7 @@ def test_many_checks_do_not_make_a_failure_likely_by_chance() -> None:
 
 
 def test_better_than_each_means_each() -> None:
-    each = ahead(LSTM, ONE_STEP)
+    each = superiority(LSTM, ONE_STEP)
     rows = study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[3, 3.2, 3.1])
     verdict = evaluate.judge(each, rows)
     assert verdict.word == INCONCLUSIVE
@@ -173,18 +173,18 @@ def test_what_holds_by_definition_is_not_counted() -> None:
     rule = claim(lambda _: iter([constant(2.0) > 1]), definition="It is arithmetic.")
     verdict = evaluate.judge(rule, study(tsm=[1]))
     assert (verdict.word, verdict.why, verdict.key.n) == (DEFINITIONAL, "It is arithmetic.", "exact")
-    other = evaluate.judge(ahead(LSTM), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1]))
+    other = evaluate.judge(superiority(LSTM), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1]))
     assert report.counts([verdict, other]).startswith("of 1 claims 1 replicated, 0 reading-dependent")
 
 
 def test_a_claim_holds_only_if_those_that_it_depends_on_do() -> None:
-    rests = Claim("X2", "here", FIGURE5, "it", depends_on=(ahead(LSTM), ahead(ONE_STEP)))
+    rests = Claim("X2", "here", FIGURE5, "it", depends_on=(superiority(LSTM), superiority(ONE_STEP)))
     assert evaluate.judge(rests, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[1, 1.2, 1.1])).word == REPLICATED
     assert evaluate.judge(rests, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[5, 5.2, 5.1])).word == FAILED
 
 
 def test_one_seed_has_no_interval() -> None:
-    verdict = evaluate.judge(ahead(LSTM), study(tsm=[9], lstm=[1]))
+    verdict = evaluate.judge(superiority(LSTM), study(tsm=[9], lstm=[1]))
     assert (verdict.word, verdict.key.n, verdict.key.low) == (INCONCLUSIVE, "1 seed", None)
 
 
@@ -268,7 +268,7 @@ def test_a_check_is_read_as_it_was_written() -> None:
     ids=["missing", "of fewer seeds", "doubled", "not a number"],
 )
 def test_rows_are_refused_by_claim_file_and_remedy(change: Any, said: str) -> None:
-    rule = ahead(LSTM)
+    rule = superiority(LSTM)
     rows = [score(model, k, 1.0 + k) for model in ("tsm", "lstm") for k in range(3)]
     verdict = evaluate.judge(rule, frames(of_03_predict=change(rows)))
     assert verdict.word == UNTESTABLE
@@ -290,7 +290,7 @@ def test_trials_that_do_not_match_are_refused() -> None:
 
 
 def test_what_fails_fails_whatever_else_is_missing() -> None:
-    rule = ahead(LSTM, ONE_STEP)
+    rule = superiority(LSTM, ONE_STEP)
     assert evaluate.judge(rule, study(tsm=[1, 1.1, 1.2], lstm=[3, 3.2, 3.1])).word == FAILED
     assert evaluate.judge(rule, study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1])).word == UNTESTABLE
 
@@ -299,13 +299,13 @@ def test_what_fails_fails_whatever_else_is_missing() -> None:
 
 
 def test_a_changed_rule_makes_older_verdicts_void() -> None:
-    rule = ahead(LSTM)
+    rule = superiority(LSTM)
     changes = [
-        ahead(LSTM, of=0.1),  # a margin
-        ahead(ONE_STEP),  # what is compared
+        superiority(LSTM, of=0.1),  # a margin
+        superiority(ONE_STEP),  # what is compared
         claim(rule.rule, readings=LIKELIHOODS),
         claim(rule.rule, definition="It is so."),
-        claim(rule.rule, depends_on=[ahead(ONE_STEP)]),
+        claim(rule.rule, depends_on=[superiority(ONE_STEP)]),
         returns(lambda q: q.ll(TSM, REACHER) - q.ll(LSTM, REACHER) > 0),  # the source
     ]
     assert all(other.sha256 != rule.sha256 for other in changes)
@@ -430,13 +430,15 @@ def test_a_reading_says_which_claims_it_turns() -> None:
 
 
 def test_the_figure_has_a_row_for_every_claim_with_rows() -> None:
-    verdict = evaluate.judge(ahead(LSTM, ONE_STEP), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[1, 1.2, 1.1]))
+    verdict = evaluate.judge(
+        superiority(LSTM, ONE_STEP), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1], onestep=[1, 1.2, 1.1])
+    )
     ax = figures.claim_margins(report.margins([verdict])).axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["X1"]
     marks = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
     assert len(marks) == 2
     assert all(0 < x < 1 for x in marks)
-    nothing = report.margins([evaluate.judge(ahead(LSTM), Tables({}))])
+    nothing = report.margins([evaluate.judge(superiority(LSTM), Tables({}))])
     with pytest.raises(ValueError, match="no claim has rows"):
         figures.claim_margins(nothing)
 

@@ -114,7 +114,7 @@ def test_at_scale_paper_figures_draw_the_run_alone_and_tables_both(published: Pa
     means, _ = plans(100, seed=0, scale="paper", level=-4.2)
     evidence = study.evidence(run(published, "paper", 0), means)
     assert set(table.drawn(evidence)["source"]) == {"yours"}
-    assert table.beside(evidence).empty
+    assert table.own_rows(evidence).empty
     assert table.stamp(evidence, figure=True) == "scale paper, seed 0, n = 100; no rows of recurrent TSM"
     assert {line[2].split(",")[0] for line in lines(planning.plans_table(evidence))} == {"published", "**yours"}
 

@@ -32,7 +32,7 @@ def test_every_job_comes_after_what_it_needs_and_says_what_decides_it(scale: str
 def test_parameters_of_a_notebook_say_what_it_needs(tmp_path: Path) -> None:
     env = "tsm/PymunkPush-v1"
     run = resolve("02_train", scale="smoke", run_dir=str(tmp_path), env=env, models="prior,tsm")
-    assert needed.chosen(run) == ([env], ["prior", "tsm"])
+    assert needed.choice(run) == ([env], ["prior", "tsm"])
     found = {job for job in study.needs(run) if job.kind == "model"}
     assert found == {jobs.Model(env, "prior"), jobs.Model(env, "tsm")}
     run = resolve("05_control", scale="paper", run_dir=str(tmp_path), n_targets=7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,7 @@ def policy(kind: str, state_dim: int = 4, *, copies: int = 1, seed: int = 0, **o
     options = dict(angles=(), target_std=1.0, copies=copies, seed=seed) | options
     if kind == "onestep":
         return OneStepPolicy(state_dim, DU, hidden=16, **options).double()
-    return SegmentPolicy(state_dim, prior(), channels=8, dilations=(1, 2), **options).double()
+    return SegmentPolicy(state_dim, prior(), **dict(channels=8, dilations=(1, 2)) | options).double()
 
 
 KINDS = pytest.mark.parametrize("kind", ["onestep", "segment"])
@@ -360,6 +361,20 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
         learn(anew, horizon=6, **settings)
 
 
+def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> None:
+    def attempt(starts: Tensor, radius: float) -> None:
+        options = LearningOptions(horizon=5, episodes=4, iterations=2, record_every=1)
+        draw = episodes_from(starts, radius=radius)
+        learn_policy(policy("onestep"), Sled(), arrive, draw, options, checkpoint=tmp_path / "policy")
+
+    starts = normal(50, 4)
+    attempt(starts, 0.2)
+    attempt(starts.clone(), 0.2)
+    for other in ((starts + 0.1, 0.2), (2 * starts, 0.2), (starts, 0.25)):
+        with pytest.raises(files.StoreError, match="another run: drawn is "):
+            attempt(*other)
+
+
 def test_a_callback_sees_every_record_of_learning_and_leaves_the_bits_alone() -> None:
     alone, watched, seen = policy("onestep", copies=2), policy("onestep", copies=2), list[Progress]()
     settings: dict[str, Any] = dict(measure=lambda _: {"asked": torch.tensor([1.0, 3.0])})
@@ -455,6 +470,27 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
         with pytest.raises(TypeError):
             study.learn(run, task, method, study.Budget(copies=2))
     assert [path.name for path in (run.models / "Reacher").glob("policy*")] == [f"policy-onestep-{space}.safetensors"]
+
+
+def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    task = study.load_task("tsm/Reacher-v0").take(2).with_reward("reach", lambda states, actions: -states[..., 0].abs())
+    with pytest.raises(ValueError, match=r"task 'reach' has a reward of its own; .* with tsmlib.learn_policy"):
+        study.learn(run, task, study.method("onestep", "direct", "policy"))
+
+
+def test_a_policy_is_assessed_by_the_tasks_own_measure_of_success() -> None:
+    task = study.load_task("tsm/Reacher-v0").take(3)
+    task = replace(task, success=lambda states: torch.tensor([True, False, True]))
+    found = study.assess(OneStepPolicy(6, DU), in_units(OneStep(6, DU, hidden=8)), task, seed=0)
+    assert found["success"].tolist() == pytest.approx([2 / 3])
+
+
+def test_a_policy_that_reads_a_long_past_acts_in_an_episode() -> None:
+    task = study.load_task("tsm/Reacher-v0").take(2)
+    far = policy("segment", 6, dilations=(1, 2, 4, 8)).float()
+    assert far.past_len == 16
+    assert study.execute_policy(task, far).states.shape == (2, 51, 6)
 
 
 @pytest.mark.parametrize("bad", [("", 0, 1), ("latent", -1, 1), ("latent", 0, 0)])

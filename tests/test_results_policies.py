@@ -113,7 +113,7 @@ def ended(*means: float, prior: bool = True) -> dict[str, np.ndarray]:
 def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all_come_to() -> None:
     curves = {TSM: ended(-12, -4, -3), PPO: ended(-13, -8, -2, prior=False)}
     curves |= {zoo.method("trpo"): ended(-13, -13, -9, prior=False)}
-    rows = policies_results.plateau_rows(curves, steps=50, env="tsm/Reacher-v0")  # from -12 to -3: 90 % is -3.9
+    rows = policies_results.plateau_rows(curves, {"env": "tsm/Reacher-v0"}, steps=50)  # from -12 to -3: 90 % is -3.9
     found = {(row["model"], row["metric"]): row["value"] for row in rows}
     assert found["tsm", "samples_to_90"] == pytest.approx(50 * 110)
     assert found["tsm", "env_samples_to_90"] == 5000
@@ -126,8 +126,8 @@ def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all
 
 
 def test_policies_that_gain_nothing_have_no_plateau() -> None:
-    assert policies_results.plateau_rows({TSM: ended(-4, -4.5), PPO: ended(-9, -2, prior=False)}, steps=50) == []
-    assert policies_results.plateau_rows({}, steps=50) == []
+    assert policies_results.plateau_rows({TSM: ended(-4, -4.5), PPO: ended(-9, -2, prior=False)}, {}, steps=50) == []
+    assert policies_results.plateau_rows({}, {}, steps=50) == []
     assert policies_results.plateaus_table(tables.frame([])) == ""
 
 

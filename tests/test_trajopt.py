@@ -195,6 +195,17 @@ def test_sampled_starts_are_the_best_of_the_candidates() -> None:
     torch.testing.assert_close(evaluate(predictor(), reward, space, drawn).topk(4, dim=0).values, returns)
 
 
+@pytest.mark.parametrize("spoilt", [float("nan"), float("inf")])
+def test_a_candidate_on_which_the_model_diverges_is_no_start(spoilt: float) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        return predictor()(actions).where(actions[None].amax((-2, -1), keepdim=True) < 0.4, spoilt)
+
+    space = DirectActions(T, 1, rms=0.5)
+    starts = sampled_starts(fragile, reward, space, B, candidates=100, keep=2)
+    assert starts.tanh().max() < 0.4
+    plan_by("adam", fragile, reward, 2, start=starts)
+
+
 def test_a_large_evaluation_is_that_of_its_parts() -> None:
     space, predict = DirectActions(T, 1), predictor(0.1, 2)
     parameters = torch.randn(11, B, T, 1, generator=torch.Generator().manual_seed(0))
@@ -570,6 +581,11 @@ def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float)
     follows = torch.from_numpy(env.rollout(actions[:, 20:].numpy())).float()
     states = simulator_predictor(env_id, observed)(actions[None, :, 20:])[0, 0]
     assert (states - follows)[..., 4:8].abs().max() < off  # metres
+
+
+def test_the_true_simulator_of_an_arm_predicts_from_a_start_alone() -> None:
+    with pytest.raises(ValueError, match=r"candidates in tsm/Reacher-v0 have no common start; give start \(B, dx\)"):
+        simulator_predictor("tsm/Reacher-v0")
 
 
 @pytest.mark.parametrize("make", [partial(DirectActions, 0), partial(DirectActions, -3)])

@@ -103,6 +103,15 @@ def test_a_change_of_a_schedule_reaches_what_was_made_with_it(monkeypatch: pytes
     }
 
 
+def test_what_ships_is_there_and_no_step_that_is_to_be_done_again(place: Path) -> None:
+    folder = place / "runs" / "laptop" / "workflow"
+    there = {name for name, step in table("laptop").items() if workflow._made(name, step, folder)}
+    assert {f"seed0/models/{arm}/rtsm" for arm in ("Reacher", "ReacherPush")} <= there
+    assert {f"seed{seed}/plans/ReacherPush-oracle-latent-cem" for seed in (0, 2)} <= there
+    assert not {name for name in there if "seed2/models" in name or "data/" in name or name.endswith("05_control")}
+    assert not any(step.ships for scale in ("smoke", "paper") for step in table(scale).values())
+
+
 # Refusals ------------------------------------------------------------------------------------------------------------
 
 

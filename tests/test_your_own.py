@@ -169,7 +169,7 @@ def test_the_oracle_is_the_same_planner_and_beats_doing_nothing() -> None:
     space = tsmlib.DirectActions(10, 1, rms=0.5)
     planner = partial(tsmlib.cem, candidates=12, elites=3, iterations=2)
     trial = tsmlib.execute(task, torch.zeros(3, 10, 1))
-    rows = tables.frame(robots.beside_the_oracle(RUN, task, "rtsm", trial, space, planner, every=5, n=2))
+    rows = tables.frame(robots.reference_rows(RUN, task, "rtsm", trial, space, planner, every=5, n=2))
     found = rows[rows["metric"] == "return_true"].set_index(["model", "planner"])
     assert set(found.index) == {("rtsm", "cem"), ("oracle", "cem"), ("none", "zero"), ("none", "random")}
     assert found["n"].tolist() == [3, 2, 3, 3]

@@ -4,6 +4,7 @@ Random data, a running planner and a policy under test are the same call with an
 """
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,14 +80,12 @@ def collect_random(
     time_constant: float | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
 ) -> Trajectories:
     """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone."""
-    run = make_simulation(env_id, episodes)
-    actions = smooth_torques(
-        episodes, horizon, generator=torch.Generator().manual_seed(seed), action_dim=run.action_dim, rms=rms,
-        time_constant=time_constant or 1.5 * run.dt, dt=run.dt,
-    )  # fmt: skip
-    data = collect(run, open_loop(actions), horizon=horizon, seed=seed)
-    run.close()
-    return data
+    with closing(make_simulation(env_id, episodes)) as run:
+        actions = smooth_torques(
+            episodes, horizon, generator=torch.Generator().manual_seed(seed), action_dim=run.action_dim, rms=rms,
+            time_constant=time_constant or 1.5 * run.dt, dt=run.dt,
+        )  # fmt: skip
+        return collect(run, open_loop(actions), horizon=horizon, seed=seed)
 
 
 def smooth_torques(

@@ -2,7 +2,8 @@
 
 Each try changes one of the two in every stage: twice the batch for half the updates, as many windows altogether; or
 half the batch for as many updates. What counts is the best validation loss of a stage, beside that in the header of
-the shipped model. The first stage decides little of the last, so read both.
+the shipped model. The first stage decides little of the last, so read both. Of a model with several decoders the first
+is trained.
 
     python benchmarks/settings/budget.py
 """
@@ -30,24 +31,22 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/02_budget.csv of the run)")
     arguments = parser.parse_args()
     run, model = runs.resolve("02_train", scale=arguments.scale), arguments.model
-    data, held_out = (study.dataset(run, arguments.env, split) for split in ("train", "validation"))
+    data, held_out = study.training_data(run, arguments.env, model)
     shipped = artifacts.read_header(run.shipped / EnvSpec.parse(arguments.env).name / f"{model}.safetensors")["curves"]
     path, rows = arguments.out or run.metrics / "02_budget.csv", []
     for condition, (batches, updates) in TRIES.items():
-        net = study.initialise(run, model, data)
-        for stage in study.schedule(run, arguments.env, model)[: arguments.stages]:
+        net, stages = study.parts(study.initialise(run, model, data))[0], study.schedule(run, arguments.env, model)
+        for key, stage in list(zip(zoo.keys(stages), stages, strict=True))[: arguments.stages]:
             curve = fit(
                 net, getattr(net, stage.loss), data, held_out,
                 stage.options(
                     net.past_len, steps=max(1, round(updates * stage.steps)), batch_size=round(batches * stage.batch),
                     patience=0,
                 ),
-                seed=run.seed, progress=f"{model}, {condition}: {stage.loss}",
+                seed=run.seed, progress=f"{model}, {condition}: {key}",
             )  # fmt: skip
-            best, known, seconds = min(curve.validation), min(shipped[stage.loss]["validation"]), curve.seconds[-1]
-            print(
-                f"{model} {stage.loss}, {condition}: {best:.4f} after {seconds:.0f} s, shipped {known:.4f}", flush=True
-            )
+            best, known, seconds = min(curve.validation), min(shipped[key]["validation"]), curve.seconds[-1]
+            print(f"{model} {key}, {condition}: {best:.4f} after {seconds:.0f} s, shipped {known:.4f}", flush=True)
             common = dict(
                 env=arguments.env,
                 sim=EnvSpec.parse(arguments.env).simulator,
@@ -55,7 +54,7 @@ def main() -> None:
                 planner="none",
                 seed=run.seed,
             )
-            common |= dict(scale=run.scale, configuration=condition, n=len(held_out), stage=stage.loss)
+            common |= dict(scale=run.scale, configuration=condition, n=len(held_out), stage=key)
             rows.append(dict(common, metric="validation_loss", value=best))
             rows.append(dict(common, metric="validation_loss_shipped", value=known))
             tables.save(path, rows, extra=["stage"])

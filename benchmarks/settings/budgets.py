@@ -18,10 +18,9 @@ import torch
 
 from tsmlib.envs import fingerprint
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.symmetry import copies, symmetric
+from tsmlib.envs.symmetry import copies
 from tsmlib.storage import artifacts
-from tsmlib.study import runs, zoo
-from tsmlib.study.data import dataset
+from tsmlib.study import models, runs, zoo
 from tsmlib.training.fit import fit
 
 
@@ -35,9 +34,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     run, spec, env = runs.resolve("02_train", scale="paper", seed=0), zoo.find(given.model), EnvSpec.parse(given.env)
-    data, held_out = dataset(run, given.env, "train"), dataset(run, given.env, "validation")
-    if (symmetries := copies(given.env)) > 1:
-        data = symmetric(data)
+    data, held_out = models.training_data(run, given.env, given.model)
     one = {"members": 1} if given.model == "rtsm" else {}
     net = spec.load().for_data(data, seed=given.seed, **{**spec.arguments(env), **one})
     stages = spec.schedule(env, given.times)
@@ -54,7 +51,7 @@ def main() -> None:
         print(f"{name} {key}: {stage.steps} updates, validation loss {min(curve.validation):.3g}", flush=True)
     artifacts.save_model(path, net, {
         "fingerprint": fingerprint(given.env), "model": given.model, "seed": given.seed, "curves": curves,
-        "schedule": [stage.stated() for stage in stages], "symmetries": symmetries, "scale": "paper",
+        "schedule": [stage.stated() for stage in stages], "symmetries": copies(given.env), "scale": "paper",
         "torch": torch.__version__, "finished": time.strftime("%Y-%m-%d"),
         "seconds": sum(curve["seconds"][-1] for curve in curves.values()),
     })  # fmt: skip

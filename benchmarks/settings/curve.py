@@ -36,6 +36,12 @@ def lines(path: Path) -> list[dict[str, str]]:
     return found
 
 
+def is_dynamics(path: Path) -> bool:
+    """Whether a file is of a dynamics model, as opposed to the prior and to policies."""
+    header = artifacts.read_header(path)
+    return "search_space" not in header and header.get("model") in zoo.words("dynamics", "ablation", "choice")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, help="of trained models")
@@ -44,7 +50,7 @@ def main() -> None:
     known = list(csv.DictReader(arguments.out.open(newline=""))) if arguments.out.exists() else []
     for folder in arguments.folders:
         for path in sorted(folder.glob("*.safetensors")):
-            if path.stem.partition("_")[0] in zoo.words("dynamics", "ablation", "choice"):  # budgets.py adds what it is
+            if is_dynamics(path):
                 known += [line for line in lines(path) if line not in known]
     with arguments.out.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

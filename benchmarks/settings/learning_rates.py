@@ -1,7 +1,8 @@
 """Learning rate of each model: half, once and twice that of its schedule, on validation data.
 
 Every model gets the same three tries at the same share of its budget (`study.BUDGET`); what counts is the best
-validation loss of its last stage. Losses of different models are not to be compared.
+validation loss of its last stage. Losses of different models are not to be compared. Data are those of the study, with
+their symmetric copies; of a model with several decoders the first is trained.
 
     python benchmarks/settings/learning_rates.py
 """
@@ -30,16 +31,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="table to write (default: metrics/02_learning_rates.csv of the run)")
     arguments = parser.parse_args()
     run = runs.resolve("02_train", scale=arguments.scale)
-    data, held_out = (study.dataset(run, arguments.env, split) for split in ("train", "validation"))
     path = arguments.out or run.metrics / "02_learning_rates.csv"
     common = dict(
         env=arguments.env, sim=EnvSpec.parse(arguments.env).simulator, planner="none",
-        metric="validation_loss", n=len(held_out), seed=run.seed, scale=run.scale,
+        metric="validation_loss", seed=run.seed, scale=run.scale,
     )  # fmt: skip
     rows = []
     for model in arguments.models:
+        data, held_out = study.training_data(run, arguments.env, model)
         for factor in FACTORS:
-            net = study.initialise(run, model, data)
+            net = study.parts(study.initialise(run, model, data))[0]
             for stage in study.schedule(run, arguments.env, model):
                 steps = max(1, round(stage.steps * arguments.share))
                 curve = fit(
@@ -51,7 +52,7 @@ def main() -> None:
                 )  # fmt: skip
             best = min(curve.validation)
             print(f"{model:20} last stage at {factor * stage.lr:.0e}: best validation loss {best:.4f}", flush=True)
-            rows.append(dict(common, model=model, value=best, rate=factor * stage.lr))
+            rows.append(dict(common, model=model, n=len(held_out), value=best, rate=factor * stage.lr))
             tables.save(path, rows, extra=["rate"])
     print(path)
 

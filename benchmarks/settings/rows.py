@@ -66,10 +66,10 @@ def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.Da
 
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
+    rows = rows if "configuration" in rows else rows.assign(configuration="")
     curve, more = rows["planner"] == "policy", ("metric", "iteration", "subset", "steps_ahead")
     what = {name: rows[name].astype(str).mask(curve, "") for name in more}
-    if "configuration" in rows:
-        what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps")}
+    what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps")}
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 

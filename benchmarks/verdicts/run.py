@@ -63,7 +63,7 @@ class World(evaluate.Tables):
         return pd.DataFrame(self.values[term.model])
 
 
-def ahead(n_checks: int, *, trials: bool) -> Claim:
+def superiority(n_checks: int, *, trials: bool) -> Claim:
     """The paper's model is ahead of each of so many rivals by more than the margin."""
 
     def rule(q: Query) -> Checks:
@@ -82,7 +82,7 @@ def worlds(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     for (kind, how), seeds, n_checks, effect in product(
         {"scores": SCORES, "plans": PLANS}.items(), (1, 3, 10), (1, 8), (1.0, 2.0)
     ):
-        asked, effects = ahead(n_checks, trials=how.targets > 1), np.full(n_checks, effect)
+        asked, effects = superiority(n_checks, trials=how.targets > 1), np.full(n_checks, effect)
         words = [evaluate.judge(asked, World(effects, seeds, how, rng)).word for _ in range(studies)]
         shares = {word.lower(): words.count(word) / studies for word in (REPLICATED, FAILED)}
         lines.append({"rows": kind, "seeds": seeds, "checks": n_checks, "effect": effect, **shares, "studies": studies})

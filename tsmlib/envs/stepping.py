@@ -87,12 +87,22 @@ def make_simulation(env_id: str, n: int, *, returns: bool = False) -> Simulation
         EnvSpec.parse(env_id)  # a variant of an arm is registered by this
     if gymnasium.spec(env_id).vector_entry_point is not None:
         return simulation(gymnasium.make_vec(env_id, num_envs=n))
-    first = make(env_id)
-    require_supported(env_id, first.observation_space, first.action_space)
+    first = make_supported(env_id)
     if abilities(first).restores:
         return Stepping([first], n, returns=returns)
     more = (make(env_id) for _ in range(n - 1))
     return Stepping([first, *more], returns=returns)
+
+
+def make_supported(env_id: str) -> gymnasium.Env:
+    """The environment of an id; UnsupportedEnvironment, with it closed, where its spaces are not supported."""
+    env = make(env_id)
+    try:
+        require_supported(env_id, env.observation_space, env.action_space)
+    except UnsupportedEnvironment:
+        env.close()
+        raise
+    return env
 
 
 def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
@@ -397,10 +407,10 @@ def continued(env_id: str, seeds: Sequence[int], actions: np.ndarray) -> Steppin
 
     UnsupportedEnvironment where its state cannot be set, so that it cannot be tried what would follow.
     """
-    one = make(env_id)
-    require_supported(env_id, one.observation_space, one.action_space)
+    one = make_supported(env_id)
     known = abilities(one)
     if not known.restores:
+        one.close()
         why = "its state cannot be saved and set" if known.repeats else "the same seed and actions do not repeat it"
         raise UnsupportedEnvironment(
             f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, tsmlib.model_predictor"

@@ -59,7 +59,7 @@ def filter_errors(estimate: KalmanFilter, noisy: Trajectories, clean: Trajectori
     actions, ahead = _segments(noisy.actions), []
     x = now
     for step in range(10):
-        x = estimate.ahead(x, actions[:, step])
+        x = estimate.predicted(x, actions[:, step])
         ahead.append(estimate.with_tip(x))
     return errors(estimate.with_tip(now), truth), errors(np.stack(ahead, 1), _segments(clean.states[:, 1:]))
 
@@ -115,7 +115,7 @@ class KalmanFilter:
         tried = [replace(self, weight=weight) for weight in (0.1, 0.3, 1.0, 3.0, 10.0)]
         return min(tried, key=lambda one: rmse(filter_errors(one, noisy, clean)[0]))
 
-    def ahead(self, x: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    def predicted(self, x: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The mean (N, 4) one step after x (N, 4) under actions (N, du)."""
         return np.concatenate([x, actions, np.ones((len(x), 1))], 1) @ self.transition
 
@@ -126,7 +126,7 @@ class KalmanFilter:
         found = [x]
         a = self.transition[:4].T
         for step in range(noisy.horizon):
-            x = self.ahead(x, noisy.actions[:, step])
+            x = self.predicted(x, noisy.actions[:, step])
             covariance = a @ covariance @ a.T + self.weight * self.process
             h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1)  # (N, 6, 4)
             seen = noisy.states[:, step + 1] - self.with_tip(x)

@@ -82,14 +82,13 @@ def training_time(
     figure, grid = panels(len(curves), 4, 1.6)
     look_of = axes.looks(curves)
     for ax, (title, lines) in zip(grid, curves.items(), strict=True):
-        every: list[float] = []
+        every, drawn = list[float](), list[float]()
         for method, (seconds, values) in lines.items():
             seconds = finite(f"seconds of {title}, {method.label}", seconds, "k")
             values = finite(f"values of {title}, {method.label}", values, f"{len(seconds)}")
             ax.plot(seconds, values, **look_of[method] | {"ms": 4}, zorder=3)
-            every += seconds.tolist()
-        low, high = min(line.get_ydata().min() for line in ax.lines), max(line.get_ydata().max() for line in ax.lines)
-        axes.log_axis(ax, low / 1.15, high * 1.15)
+            every, drawn = [*every, *seconds.tolist()], [*drawn, *values.tolist()]
+        axes.log_axis(ax, min(drawn) / 1.15, max(drawn) * 1.15)
         ax.set(title=title, xscale="log", xlim=(min(every) / 1.3, max(every) * 1.3))
         ax.set_xticks(sorted(set(every)), [axes.spell(value) for value in sorted(set(every))])
         ax.minorticks_off()

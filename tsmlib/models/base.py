@@ -158,7 +158,9 @@ def stepper(model: Model, past: Segment, *, generator: Noise | None = None) -> S
 
     The states are those of ``rollout`` under the actions that were taken: a code, or a member of an ensemble, is held
     for a segment of H steps, with activations and hidden states carried from step to step; then a new segment begins on
-    the last steps. Of a model that cannot step, see ``Adapted``, they are the same where H = 1.
+    the last steps. Of a model that cannot step, see ``Adapted``, they are the same where H = 1. A Gaussian ``Ensemble``
+    draws the noise of a segment at once, ``rollout`` for no more steps than there are, so that samples of it are the
+    same where a rollout is of whole segments; after that, they are others of the same distribution.
     """
     recent, adapted = [deque(part.unbind(1), maxlen=_past_len(model, past)) for part in past], as_dynamics(model)
     taken, running = 0, None

@@ -69,7 +69,8 @@ class Ensemble(Featured, Configured, EnsembleModel):
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Go on from the last state. No generator: every step takes the mean of all members.
 
-        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which that member states.
+        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which that member states,
+        drawn for a whole segment.
         """
         return self._begin(past, self.segment_len, generator)
 

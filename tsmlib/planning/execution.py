@@ -4,8 +4,8 @@ Open loop as in the paper (``execute``), or planning again every few steps from 
 """
 
 import time
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -67,27 +67,26 @@ class Trial:
         return self.plan.predicted_return - self.executed_return
 
 
-def execute(task: Task, plan: Plan | Tensor | Controller) -> Trial:
+def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10) -> Trial:
     """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say.
 
+    past_len: steps of past that a controller sees; those before the episode are x_0 repeated and no action.
     A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
     """
     actions = plan.actions if isinstance(plan, Plan) else plan
     if isinstance(actions, Tensor):
         seen, run = _run(task, open_loop(actions), actions.shape[1])
     else:
-        seen, run = _run(task, actions, task.horizon)
+        seen, run = _run(task, actions, task.horizon, past_len)
         actions = torch.from_numpy(seen.actions)
     return _measured(task, run, seen, actions, plan if isinstance(plan, Plan) else None)
 
 
 def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:
     """An episode from each of the task's starts, and the simulation that it ran in."""
-    run = make_simulation(task.env, len(task), returns=True)
-    begin: dict[str, Any] = {"seed": task.seeds} if task.begins_by_seed else {"seed": SENSORS, "states": task.start}
-    seen = collect(run, controller, horizon=horizon, past_len=past_len, **begin)
-    run.close()
-    return seen, run
+    seed, states = (task.seeds, None) if task.begins_by_seed else (SENSORS, task.start)
+    with closing(make_simulation(task.env, len(task), returns=True)) as run:
+        return collect(run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states), run
 
 
 def mpc(

@@ -228,8 +228,9 @@ def sampled_starts(
     if not 1 <= keep <= candidates:
         raise ValueError(f"keep is {keep} of {candidates} candidates, expected 1 to {candidates}")
     parameters = space.scale * space.noise(candidates, n_targets, torch.Generator().manual_seed(seed))
-    chosen = evaluate(predict, reward, space, parameters).topk(keep, dim=0).indices
-    return parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
+    returns = evaluate(predict, reward, space, parameters)
+    best = returns.where(torch.isfinite(returns), -torch.inf).topk(keep, dim=0).indices
+    return parameters.gather(0, _like(best, parameters).expand(-1, -1, *space.shape))
 
 
 def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:

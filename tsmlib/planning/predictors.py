@@ -92,7 +92,7 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
 
     The id of an arm, from ``start`` (B, dx): any state can be one, also one in the middle of an episode. In MuJoCo what
     follows is what would have followed, up to rounding; in pymunk, contacts that last forget the force with which they
-    press. UnsupportedEnvironment for an arm with noise or delay.
+    press. UnsupportedEnvironment for an arm with noise or delay; ValueError without ``start``.
     """
     if isinstance(env, Task) and env.seeds:
         sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
@@ -110,11 +110,13 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
             f"{name} hides its states behind noisy sensors or delays actions, so what would follow is no function of "
             f"what is seen; the true simulator of {arm} can be asked"
         )
+    if start is None:
+        raise ValueError(f"candidates in {name} have no common start; give start (B, dx), or a task")
     make = cache(partial(make_simulation, name))
 
     def predict(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
-        begin = None if start is None else np.tile(start, (n, 1))
+        begin = np.tile(start, (n, 1))
         seen = collect(make(n * n_targets), open_loop(actions.flatten(0, 1)), horizon=horizon, states=begin)
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,9 +63,8 @@ class Task:
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
         """
-        begun = make_simulation(env, n)
-        start = begun.reset(seed=seed).astype(np.float32)
-        begun.close()
+        with closing(make_simulation(env, n)) as begun:
+            start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
         return cls(
             name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance, seeds, success,

@@ -125,7 +125,8 @@ def learn_policy(
 
     reward: target (R, dg) -> reward of states (R, T, dx) and actions, such as ``rewards.reach``. draw: starts and
     targets of episodes. Episodes and noise are functions of (seed, iteration), so a run resumed from ``checkpoint``
-    continues as if it had not stopped. The model is left as it was.
+    continues as if it had not stopped; a checkpoint of other starts or targets, by ``summary``, is refused. The model
+    is left as it was.
 
     Raises, with the policy unchanged, ValueError for a reward of the wrong shape or without a gradient and
     FloatingPointError for one that is not finite where states are; TrainingStopped, with the weights of the last record
@@ -138,6 +139,8 @@ def learn_policy(
         policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
         reward=getattr(reward, "__name__", "reward"), seed=seed,
     )  # fmt: skip
+    if checkpoint is not None:
+        identity["drawn"] = summary(draw)
     state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), o.iterations, identity, checkpoint)
     learner = _Learner(policy, model, reward, draw, measure, callback, o, seed, state)
     purpose = f"learning a policy, seed {seed}"
@@ -238,6 +241,18 @@ def episodes_from(starts: Tensor, *, radius: float = 0.2) -> Draw:
         return starts[index], target
 
     return draw
+
+
+def summary(draw: Draw, n: int = 1000) -> dict[str, list[list[float]]]:
+    """Mean and standard deviation of ``n`` starts and targets, which tell one distribution of episodes from another.
+
+    To four decimals, so that they are the same on every machine.
+    """
+    drawn = zip(("starts", "targets"), draw(n, torch.Generator().manual_seed(0)), strict=True)
+    return {
+        name: [[round(x, 4) for x in part.tolist()] for part in (values.double().mean(0), values.double().std(0))]
+        for name, values in drawn
+    }
 
 
 def _clip(parameters: Sequence[Tensor], norm: float) -> Tensor:

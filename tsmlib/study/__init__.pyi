@@ -14,8 +14,10 @@ from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
 from .models import load_prior as load_prior
+from .models import parts as parts
 from .models import schedule as schedule
 from .models import train_all as train_all
+from .models import training_data as training_data
 from .needed import needs as needs
 from .parallel import precompute as precompute
 from .plans import along_the_way as along_the_way
@@ -35,8 +37,8 @@ from .predictions import score_all as score_all
 from .predictions import score_rows as score_rows
 from .predictions import scores as scores
 from .predictions import table as table
-from .robots import beside_the_oracle as beside_the_oracle
-from .robots import scoreboard as scoreboard
+from .robots import model_rows as model_rows
+from .robots import reference_rows as reference_rows
 from .runs import RESULTS as RESULTS
 from .tasks import FROZEN as FROZEN
 from .tasks import TASK_SEED as TASK_SEED

@@ -1,7 +1,7 @@
 """Data sets at a run's scale, collected where they are missing."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import cast
 
@@ -65,11 +65,9 @@ def datasets(run: Run, wanted: Iterable[tuple[str, str]]) -> dict[tuple[str, str
 
 def random_data(env: str, n: int, *, seed: int, horizon: int = 100) -> Trajectories:
     """``n`` episodes of smooth random torques, a function of (env, n, seed) alone."""
-    copies = gymnasium.make_vec(env, num_envs=n)
     torques = smooth_torques(n, horizon, generator=torch.Generator().manual_seed(seed))
-    data = collect(copies, open_loop(torques), horizon=horizon, seed=seed)
-    copies.close()
-    return data
+    with closing(gymnasium.make_vec(env, num_envs=n)) as copies:
+        return collect(copies, open_loop(torques), horizon=horizon, seed=seed)
 
 
 @contextmanager

@@ -98,7 +98,7 @@ def code_use(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
 def figure6(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
     """Costs and gaps of open-loop plans. by_target: rows with a ``target``."""
     published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks))
-    return Drawing(figures.figure6(published, yours), "figure6", planning.chosen(found))
+    return Drawing(figures.figure6(published, yours), "figure6", planning.plans_of(found))
 
 
 def predicted_and_executed(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
@@ -106,7 +106,7 @@ def predicted_and_executed(found: pd.DataFrame, by_target: pd.DataFrame, tasks: 
     some = [zoo.method(zoo.OURS, "latent", "cem"), *zoo.methods((zoo.PAPERS, "lstm", "onestep"), "cem", ["direct"])]
     published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks, methods=some))
     figure = figures.predicted_vs_true(published, yours)
-    return Drawing(figure, "05_predicted_and_executed", planning.chosen(found))
+    return Drawing(figure, "05_predicted_and_executed", planning.plans_of(found))
 
 
 def closed_loop(found: pd.DataFrame, by_target: pd.DataFrame, task: Task) -> Drawing:
@@ -119,7 +119,7 @@ def closed_loop(found: pd.DataFrame, by_target: pd.DataFrame, task: Task) -> Dra
 def figure7(learned: pd.DataFrame, found: pd.DataFrame) -> Drawing:
     """Learning curves of policies. learned: their rows and those of model_free.csv; found: with those of plans."""
     curves, yours = table.pair(learned, policies.learning_curves)
-    references = policies.references(planning.chosen(table.drawn(found)))
+    references = policies.references(planning.plans_of(table.drawn(found)))
     references = {task: levels for task, levels in references.items() if task in curves}
     figure = figures.figure7(curves, references, yours=yours)
     return Drawing(figure, "figure7", table.select(learned, execution="policy"))
@@ -131,7 +131,7 @@ def figure7(learned: pd.DataFrame, found: pd.DataFrame) -> Drawing:
 def filtering(found: pd.DataFrame, env: str, words: Sequence[str]) -> Drawing:
     """Errors to the clean state of models and filters behind noisy sensors."""
     panels = robustness.filtering_panels(table.drawn(found), env, words)
-    yours = robustness.own_errors(table.beside(found), env, words)
+    yours = robustness.own_errors(table.own_rows(found), env, words)
     rows = prediction.select(found, "rmse_clean", env=env, execution="segments", model=(*words, "filter"))
     return Drawing(figures.filtering_errors(*panels, yours=yours), "06_filtering", rows)
 

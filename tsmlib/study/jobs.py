@@ -19,7 +19,7 @@ from tsmlib.study.data import dataset, sizes
 from tsmlib.study.plans import CANDIDATES, TORQUES
 from tsmlib.study.policies import USUAL, Budget
 from tsmlib.study.results.policies import EPISODES
-from tsmlib.study.runs import Run
+from tsmlib.study.runs import RESULTS, Run
 from tsmlib.study.tasks import load_task
 
 
@@ -46,6 +46,9 @@ class Job(Protocol):
     def seconds(self, run: Run) -> float:
         """About how long it takes on one core."""
 
+    def ships(self, run: Run) -> bool:
+        """Whether one comes with the package that a run may take in place of its own."""
+
 
 @dataclass(frozen=True)
 class Data:
@@ -71,6 +74,9 @@ class Data:
     def seconds(self, run: Run) -> float:
         return sizes(run, self.env)[self.split] / 100
 
+    def ships(self, run: Run) -> bool:
+        return False
+
 
 @dataclass(frozen=True)
 class Model:
@@ -85,9 +91,9 @@ class Model:
         return f"models/{EnvSpec.parse(models.trained_on(self.env, self.word)).name}/{self.word}"
 
     def needs(self, run: Run) -> Sequence[Job]:
-        path = run.shipped / EnvSpec.parse(models.trained_on(self.env, self.word)).name / f"{self.word}.safetensors"
-        shipped = run.scale == "laptop" and run.seed == 0 and path.exists()
-        return () if shipped else [Data(models.trained_on(self.env, self.word), s) for s in ("train", "validation")]
+        if self.ships(run):
+            return ()
+        return [Data(models.trained_on(self.env, self.word), split) for split in ("train", "validation")]
 
     def make(self, run: Run) -> object:
         return models.load_or_train(run, self.env, self.word)
@@ -101,6 +107,9 @@ class Model:
 
     def seconds(self, run: Run) -> float:
         return models.training_seconds(run, models.trained_on(self.env, self.word), self.word)
+
+    def ships(self, run: Run) -> bool:
+        return _shipped(run, models.trained_on(self.env, self.word), self.word)
 
 
 @dataclass(frozen=True)
@@ -127,6 +136,9 @@ class Scores:
 
     def seconds(self, run: Run) -> float:
         return run.pick(smoke=1, laptop=20, paper=200)
+
+    def ships(self, run: Run) -> bool:
+        return False
 
 
 @dataclass(frozen=True)
@@ -160,6 +172,10 @@ class Plan:
         each = 12.0 if self.method.model == "oracle" else 3.0  # for each target
         return self.n * each * (10 if self.every else 1) * run.pick(smoke=0.01, laptop=0.5, paper=1)
 
+    def ships(self, run: Run) -> bool:
+        file = plans.file_name(self.env, self.method, iterations=self.iterations, every=self.every)
+        return run.scale == "laptop" and self.method.model == "oracle" and (RESULTS / f"{file}.safetensors").exists()
+
 
 @dataclass(frozen=True)
 class Policy:
@@ -187,6 +203,15 @@ class Policy:
 
     def seconds(self, run: Run) -> float:
         return policies.complete(run, self.budget).iterations * run.pick(smoke=0.5, laptop=1.0, paper=1.0)
+
+    def ships(self, run: Run) -> bool:
+        return _shipped(run, self.env, policies.file_name(self.method))
+
+
+def _shipped(run: Run, env: str, file: str) -> bool:
+    """Whether a model or policy comes with the package: for scale laptop and seed 0."""
+    path = run.shipped / EnvSpec.parse(env).name / f"{file}.safetensors"
+    return run.scale == "laptop" and run.seed == 0 and path.exists()
 
 
 def complete(run: Run, wanted: Iterable[Job]) -> dict[str, Job]:

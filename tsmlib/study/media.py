@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tsmlib import figures, rewards
 from tsmlib.envs import drawing
+from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.render import draw_scene
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.evaluation import latent
@@ -145,10 +146,8 @@ def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
 
 def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Each of the states (T, dx) of an arm drawn."""
-    env: Any = make_vec(env_id, num_envs=1).unwrapped
-    frames = np.stack([env.image(state, target) for state in states])
-    env.close()
-    return frames
+    with closing(cast(ArmVectorEnv, make_vec(env_id, num_envs=1).unwrapped)) as arm:
+        return np.stack([arm.image(state, target) for state in states])
 
 
 def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:

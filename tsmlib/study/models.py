@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, cast
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, TypedDict, cast
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from tsmlib.models.base import DynamicsModel
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
-from tsmlib.storage.files import StoreError
+from tsmlib.storage.files import Json, StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
@@ -32,7 +32,36 @@ if TYPE_CHECKING:
     import pandas as pd  # of the extra "study", which a pretrained model does not need
 
 PRETRAINED = ROOT / "data" / "pretrained"
-Header = Mapping[str, Any]  # JSON: what a file says of itself
+
+
+class TrainedCurve(TypedDict):
+    """A ``TrainingHistory`` as JSON."""
+
+    step: list[int]
+    seconds: list[float]
+    train: list[float]
+    validation: list[float]
+    bf16: list[bool]
+    resumed: list[str]
+
+
+class Header(TypedDict, total=False):
+    """What the file of a trained model says of itself. curves, bf16: by the keys of its stages (``zoo.keys``)."""
+
+    fingerprint: dict[str, Json]
+    model: str
+    seed: int
+    scale: str
+    curves: dict[str, TrainedCurve]
+    schedule: list[dict[str, Json]]
+    symmetries: int
+    bf16: list[str]
+    torch: str
+    threads: int
+    device: str
+    finished: str
+    seconds: float
+    inputs: dict[str, str]
 
 
 class TrainedModel(DynamicsModel, Protocol):
@@ -66,8 +95,8 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     own = run.folder(f"models/{folder}") / file
     for path in [own, run.shipped / folder / file] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            header = artifacts.read_header(path)
-            trained_at = replace(run, scale=str(header.get("scale", run.scale)))
+            header = cast(Header, artifacts.read_header(path))
+            trained_at = replace(run, scale=header.get("scale", run.scale))
             planned = [stage.stated() for stage in schedule(trained_at, env, model)]
             if header.get("model") != model:
                 raise StoreError(f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it")
@@ -136,13 +165,11 @@ def _load(path: Path, env: str, model: str) -> TrainedModel:
 def train(run: Run, env: str, model: str, path: Path) -> Trained:
     """Train a model by its schedule and store it at ``path``. Resumes from checkpoints beside it."""
     print(f"{env}: no trained {model} at scale {run.scale}; training it now, {_duration(run, env, model)}")
-    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
-    if (symmetries := _symmetries(env, model)) > 1:
-        data = symmetric(data)
+    data, held_out = training_data(run, env, model)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves, checkpoints = schedule(run, env, model), {}, []
     fewer = {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
-    for (k, part), (key, stage) in product(enumerate(_parts(net)), zip(zoo.keys(stages), stages, strict=True)):
+    for (k, part), (key, stage) in product(enumerate(parts(net)), zip(zoo.keys(stages), stages, strict=True)):
         key += f"@{k}" * bool(k)
         checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
@@ -153,7 +180,7 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
         curves[key] = asdict(curve)
     header = {
         "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "schedule": [stage.stated() for stage in stages], "symmetries": symmetries,
+        "schedule": [stage.stated() for stage in stages], "symmetries": _symmetries(env, model),
         "bf16": [key for key, curve in curves.items() if any(curve["bf16"])],  # as the processor had it
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"),
@@ -163,10 +190,16 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     artifacts.save_model(path, net, header)
     for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)
-    return Trained(net, artifacts.read_header(path))
+    return Trained(net, cast(Header, artifacts.read_header(path)))
 
 
-def _parts(net: TrainedModel) -> list[TrainedModel]:
+def training_data(run: Run, env: str, model: str) -> tuple[Trajectories, Trajectories]:
+    """What a model is trained on, with the symmetric copies where there are some; and the validation data."""
+    data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
+    return symmetric(data) if _symmetries(env, model) > 1 else data, held_out
+
+
+def parts(net: TrainedModel) -> list[TrainedModel]:
     """What is trained by itself, one after another: the decoders of a recurrent model, else the model."""
     return [net.alone(k) for k in range(net.members)] if isinstance(net, RecurrentTSM) and net.members > 1 else [net]
 

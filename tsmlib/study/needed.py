@@ -32,21 +32,21 @@ def needs(run: Run) -> list[Job]:
     return list(complete(run, declared(run)).values())
 
 
-class Chosen(NamedTuple):
+class Choice(NamedTuple):
     """Environments and models that a notebook's parameters ``env`` and ``models`` name."""
 
     envs: list[str]
     words: list[str]
 
 
-def chosen(run: Run) -> Chosen:
+def choice(run: Run) -> Choice:
     """What 02_train, 03_predict, 04_latent or 06_robustness is about."""
     coded = zoo.words(cls=zoo.CODED)
     known = {
         "02_train": [*zoo.words("dynamics", "ablation", cls=zoo.CODED), "prior"], "04_latent": coded,
     }.get(run.notebook, zoo.words("dynamics"))  # fmt: skip
     envs = [REACH] if run.notebook == "06_robustness" else parse_choice("env", str(run.parameter("env")), ENV_IDS)
-    return Chosen(envs, parse_choice("models", str(run.parameter("models")), known))
+    return Choice(envs, parse_choice("models", str(run.parameter("models")), known))
 
 
 APART = ("tsm", "tsm+teacher", "tsm+energy", "tsm+direct", "tsm+energy+direct")  # TSM with parts put in or taken away
@@ -54,7 +54,7 @@ APART = ("tsm", "tsm+teacher", "tsm+energy", "tsm+direct", "tsm+energy+direct") 
 
 def ablations(run: Run) -> list[tuple[str, str]]:
     """Environments and models that 03_predict scores beside those that are chosen: of seed 0, where all are."""
-    envs, words = chosen(run)
+    envs, words = choice(run)
     if run.scale == "laptop" or run.seed or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
         return []
     choices = run.pick(smoke=["tsm+plain"], laptop=[], paper=list(zoo.words("choice")))
@@ -139,7 +139,7 @@ class Robustness(NamedTuple):
 
 def robustness(run: Run) -> Robustness:
     """What 06_robustness asks for at a run's scale; policies, and the map of noise and delay, of seed 0 alone."""
-    words = chosen(run).words
+    words = choice(run).words
     words = run.pick(smoke=words[::2][:2], laptop=words, paper=words)
     ways = [method(*way, "policy") for way in (
         (PAPERS, "latent"), (PAPERS, "direct"), (OURS, "latent"),
@@ -189,12 +189,12 @@ def _for_collect(run: Run) -> list[Job]:
 
 
 def _for_models(run: Run) -> list[Job]:
-    envs, words = chosen(run)
+    envs, words = choice(run)
     return [*(Model(env, word) for env, word in product(envs, words)), *(Data(env, "test") for env in envs)]
 
 
 def _for_predict(run: Run) -> list[Job]:
-    pairs = [*product(*chosen(run)), *ablations(run)]
+    pairs = [*product(*choice(run)), *ablations(run)]
     return [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
 
 

@@ -18,7 +18,7 @@ from tsmlib.study.jobs import Job, complete
 from tsmlib.study.runs import Run, RunError
 
 
-def precompute(run: Run, jobs: Iterable[Job], *, progress: str = "ahead") -> None:
+def precompute(run: Run, jobs: Iterable[Job], *, progress: str = "jobs") -> None:
     """Make jobs, and what they need before them, as many at a time as there are cores.
 
     Of those that could begin, the longest first. At scale paper alone; elsewhere the notebook makes each thing when it

@@ -21,11 +21,12 @@ from tsmlib.planning.tasks import Task
 from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
 from tsmlib.storage import artifacts, tables
+from tsmlib.storage.files import Json
 from tsmlib.study.data import dataset, fingerprint, sizes
-from tsmlib.study.models import Header, TrainedModel, load_or_train, load_prior
+from tsmlib.study.models import TrainedModel, load_or_train, load_prior
 from tsmlib.study.predictions import table
 from tsmlib.study.results.policies import EPISODES, finished, learning_curves, learning_rows, plateau_rows
-from tsmlib.study.results.table import Row, of_task
+from tsmlib.study.results.table import PolicyHeader, Row, of_task
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
@@ -46,7 +47,7 @@ class Learned(NamedTuple):
     """A learned policy, and the header of its file: learning curve, seconds, seed, scale."""
 
     policy: Policy
-    header: Header
+    header: PolicyHeader
 
 
 def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learned:
@@ -65,26 +66,30 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
             f"search space is {method.search_space!r}, iterations {budget.iterations}, copies {budget.copies}; "
             f"expected {' or '.join(SEARCH_SPACES)}, 0 (the scale's default) or more iterations, and at least one copy"
         )
+    if not task.is_standard:  # a file of a policy is known by the name of its task
+        raise ValueError(
+            f"task {task.name!r} has a reward of its own; expected the paper's. Learn for it with tsmlib.learn_policy"
+        )
     net = load_or_train(run, task.env, method.model).model
     prior = load_prior(run, task.env) if method.search_space == "latent" else None
     weights = {"model": artifacts.digest(net.state_dict())}
     if prior is not None:
         weights["prior"] = artifacts.digest(prior.state_dict())
-    made_from = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
+    made_from: dict[str, Json] = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
     budget = complete(run, budget)
     own = _path(run, task.env, method)
     shipped = run.shipped / own.parent.name / own.name
     cls: type[Policy] = OneStepPolicy if prior is None else SegmentPolicy
     for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
-            header = artifacts.read_header(path)
+            header = cast(PolicyHeader, artifacts.read_header(path))
             if header.get("made_from") == made_from and (path == shipped or header.get("budget") == asdict(budget)):
                 return Learned(artifacts.load_model(path, cls, expect=fingerprint(task.env)), header)
     print(
         f"{task.env}: no {method.search_space} policy learned in {method.model} at scale {run.scale}; learning it now, "
         f"{budget.iterations} iterations of 0.1 to 1 s. Stopped, it goes on from there the next time"
     )
-    about = {"made_from": made_from, "budget": asdict(budget), "model": method.model,
+    about: PolicyHeader = {"made_from": made_from, "budget": asdict(budget), "model": method.model,
              "search_space": method.search_space, "targets": len(task)}  # fmt: skip
     return _learn(run, task, net, prior, budget, own, about)
 
@@ -95,7 +100,7 @@ def complete(run: Run, budget: Budget) -> Budget:
 
 
 def _learn(
-    run: Run, task: Task, net: TrainedModel, prior: ActionPrior | None, budget: Budget, path: Path, about: Header
+    run: Run, task: Task, net: TrainedModel, prior: ActionPrior | None, budget: Budget, path: Path, about: PolicyHeader
 ) -> Learned:
     """Learn a policy and store it at ``path``. Resumes from the checkpoint beside it."""
     data = dataset(run, task.env, "train")
@@ -110,14 +115,14 @@ def _learn(
         seed=1000 * run.seed, measure=lambda p: assess(p, net, task, seed=run.seed + 1), checkpoint=checkpoint,
         progress=f"{path.parent.name}: {path.stem}",
     )  # fmt: skip
-    header = {
-        **about, "fingerprint": fingerprint(task.env), "seed": run.seed, "scale": run.scale, "curve": asdict(curve),
-        "seconds": curve.seconds[-1], "torch": torch.__version__, "threads": torch.get_num_threads(),
-        "device": run.device, "finished": time.strftime("%Y-%m-%d"),
+    header: dict[str, Json] = {
+        **cast("dict[str, Json]", about), "fingerprint": fingerprint(task.env), "seed": run.seed, "scale": run.scale,
+        "curve": asdict(curve), "seconds": curve.seconds[-1], "torch": torch.__version__,
+        "threads": torch.get_num_threads(), "device": run.device, "finished": time.strftime("%Y-%m-%d"),
     }  # fmt: skip
     artifacts.save_model(path, policy.cpu(), header)
     shutil.rmtree(checkpoint)
-    return Learned(policy, artifacts.read_header(path))
+    return Learned(policy, cast(PolicyHeader, artifacts.read_header(path)))
 
 
 def _initialise(run: Run, data: Trajectories, prior: ActionPrior | None, budget: Budget) -> Policy:
@@ -142,10 +147,10 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
     rows: list[Row] = []
     for task, method, budget in wanted:
         found, words = learn(run, task, method, budget), [method.model] + ["prior"] * (method.search_space == "latent")
-        seconds = sum(cast("float", load_or_train(run, task.env, word).header["seconds"]) for word in words)
+        seconds = sum(load_or_train(run, task.env, word).header["seconds"] for word in words)
         rows += learning_rows(
             found.header, samples=100 * sizes(run, task.env)["train"], train_seconds=seconds,
-            n=cast("int", found.header.get("targets", 100)),  # those that it was measured on as it was learned
+            n=found.header.get("targets", 100),  # those that it was measured on as it was learned
             within_data=within_data(run, task, found.policy).tolist(),
         )  # fmt: skip
     if run.scale == "laptop":
@@ -155,7 +160,7 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
     for task in {task.env: task for task, *_ in wanted}.values():
         compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}
         common = of_task(task, run) | {"horizon": None}
-        rows += plateau_rows(compared, steps=task.horizon * EPISODES[run.scale], **common)
+        rows += plateau_rows(compared, common, steps=task.horizon * EPISODES[run.scale])
     return rows
 
 
@@ -177,7 +182,7 @@ def file_name(method: Method) -> str:
 def execute_policy(task: Task, policy: Policy) -> Trial:
     """Every copy of a policy on every target, one copy after the other."""
     many = task.times(policy.copies)
-    return execute(many, controller(policy, many.target))
+    return execute(many, controller(policy, many.target), past_len=policy.past_len)
 
 
 @torch.no_grad()
@@ -198,6 +203,6 @@ def assess(policy: Policy, model: DynamicsModel, task: Task, *, seed: int) -> di
     found = {
         "return_true": done.executed_return, "return_predicted": many.reward(*seen).sum(-1),
         "final_distance": done.final_distance,
-        "success": (done.final_distance <= task.tolerance).float(),
+        "success": cast("Tensor", done.success).float(),
     }  # fmt: skip
     return {name: values.unflatten(0, (policy.copies, -1)).mean(1) for name, values in found.items()}

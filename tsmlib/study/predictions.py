@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -90,10 +90,8 @@ def pooled_rows(
     not come to its end: RunError if ``whole``, else that seed is left out, and it is said.
     """
     name, parts = f"{run.notebook}{table}.csv", [tables.frame(rows)]
-    for path in sorted(run.dir.parent.glob(f"seed*/metrics/{name}")) if run.scale == "paper" else ():
-        if run.dir not in path.parents:
-            folder = path.parents[1]
-            other = replace(run, seed=int(folder.name.removeprefix("seed")), dir=folder)
+    for other in run.seeds() if run.scale == "paper" else ():
+        if other.dir != run.dir and (path := other.dir / "metrics" / name).exists():
             try:
                 require(other, run.notebook)
             except RunError as error:

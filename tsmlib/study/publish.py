@@ -215,7 +215,7 @@ def readme_results() -> str:
     predict, control = _shipped("03_predict"), _shipped("05_control")
     pushed = all(len(table.select(rows, env=PUSH, model=PAPERS)) for rows in (predict, control))
     env = PUSH if pushed else REACH
-    plans = table.select(planning_results.chosen(control, env=env, planners=["cem"]), search_space="latent")
+    plans = table.select(planning_results.plans_of(control, env=env, planners=["cem"]), search_space="latent")
     found = {
         "prediction error ↓": prediction_results.values(predict, "nrmse", env=env),
         "energy score ↓": prediction_results.values(predict, "energy_score_noise", env=env),
@@ -241,7 +241,7 @@ share: 1 for plans through the simulator, 0 for doing nothing; gap: mean size of
 
 def readme_loops(env: str) -> str:
     """One sentence: how often closed loops of each model bring the object home; and the longer training of OURS."""
-    closed = planning_results.chosen(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
+    closed = planning_results.plans_of(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
@@ -312,7 +312,7 @@ def results_page() -> str:
         + prediction_results.scores_table(predict, METRICS, env=env)
         for env, n in seeds.items()
     )
-    planned = ", ".join(f"{_seeds(planning_results.chosen(control, env=env))} for {task}" for env, task in
+    planned = ", ".join(f"{_seeds(planning_results.plans_of(control, env=env))} for {task}" for env, task in
                         ((REACH, "reaching"), (PUSH, "pushing")))  # fmt: skip
     peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
         "pets" in set(predict["model"])

@@ -88,7 +88,7 @@ def _update_seconds(net: RecurrentTSM, stage: Updates, data: Trajectories, held_
     return each
 
 
-def scoreboard(run: Run, train: Trajectories, held_out: Trajectories, test: Trajectories, seconds: float) -> list[Row]:
+def model_rows(run: Run, train: Trajectories, held_out: Trajectories, test: Trajectories, seconds: float) -> list[Row]:
     """Rows of every model's scores on ``test``, each after ``seconds`` of training; see ``results.robots``."""
     rows: list[Row] = []
     for word in MODELS:
@@ -101,7 +101,7 @@ def scoreboard(run: Run, train: Trajectories, held_out: Trajectories, test: Traj
     return rows
 
 
-def beside_the_oracle(
+def reference_rows(
     run: Run, task: Task, model: str, trial: Trial, space: SearchSpace, planner: Planner, *, every: int, n: int = 4
 ) -> list[Row]:
     """Rows of a trial planned through ``model``; on its task also of doing nothing, random actions, and the simulator.

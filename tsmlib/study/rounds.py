@@ -7,10 +7,11 @@ on as many random episodes, and on no new ones, trained as often. What differs b
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -117,14 +118,12 @@ def divided(data: Trajectories) -> tuple[Trajectories, Trajectories]:
 
 def walks(prior: ActionPrior, n: int, *, seed: int = 0) -> Trajectories:
     """What random codes of a prior do, an episode of each, from the environment's own starts."""
-    simulation = make_simulation(PENDULUM, n)
     segments = HORIZON // prior.segment_len
     codes = torch.randn(n, segments, prior.latent_dim, generator=torch.Generator().manual_seed(seed))
     with torch.no_grad():
         actions = LatentActions(prior, HORIZON).decode(codes[None])[0]
-    data = collect(simulation, open_loop(actions), horizon=HORIZON, seed=seed)
-    simulation.close()
-    return data
+    with closing(make_simulation(PENDULUM, n)) as simulation:
+        return collect(simulation, open_loop(actions), horizon=HORIZON, seed=seed)
 
 
 def plane(data: Trajectories) -> np.ndarray:
@@ -181,7 +180,7 @@ class World:
     """
 
     sizes: Mapping[str, Sizes]
-    learners: Mapping[str, Mapping[str, Any]]
+    learners: Mapping[str, Mapping[str, Json]]
     tested: Callable[[int], Task]
     drawn: Callable[[int, int], Task]
     random: Callable[[int, int], Trajectories]
@@ -299,7 +298,10 @@ def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], dict
     """What ``make`` gives, kept in a file: the same the next time, if it was made from the same."""
     if path is None:
         return make()
-    if path.exists() and (kept := cast(dict[str, Any], files.loads(path.read_bytes())))["made from"] == made_from:
+    if (
+        path.exists()
+        and (kept := cast("dict[str, dict[str, float]]", files.loads(path.read_bytes())))["made from"] == made_from
+    ):
         return kept["found"]
     found = make()
     files.write_bytes(path, files.dumps(path, {"made from": made_from, "found": cast(Json, found)}).encode())

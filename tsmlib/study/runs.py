@@ -9,10 +9,12 @@ What ships lies in ``ROOT``, below ``data`` and ``notebooks``: in a checkout the
 package in the working directory.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -78,6 +80,12 @@ class Run:
     def pick(self, *, smoke: T, laptop: T, paper: T) -> T:
         """The value for this run's scale."""
         return {"smoke": smoke, "laptop": laptop, "paper": paper}[self.scale]
+
+    def seeds(self) -> list[Run]:
+        """The same with every seed of this scale that has a folder beside this one, itself included."""
+        texts = (folder.name.removeprefix("seed") for folder in self.dir.parent.glob("seed*"))
+        seeds = sorted(int(text) for text in texts if text.isdecimal())
+        return [replace(self, seed=seed, dir=self.dir.with_name(f"seed{seed}")) for seed in seeds]
 
     def folder(self, name: str = ".") -> Path:
         """A folder of this run, made if need be."""

@@ -1,5 +1,6 @@
 """The frozen starts and targets of each environment's task."""
 
+from contextlib import closing
 from dataclasses import replace
 
 import gymnasium
@@ -39,7 +40,6 @@ def load_task(env: str, split: str = "test") -> Task:
 
 def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
     """Starts and targets from the environment's reset."""
-    copies = gymnasium.make_vec(env, num_envs=n)
-    start, info = copies.reset(seed=seed)
-    copies.close()
+    with closing(gymnasium.make_vec(env, num_envs=n)) as copies:
+        start, info = copies.reset(seed=seed)
     return Task.standard(env, start.astype(np.float32), torch.from_numpy(info["target"]).float())

@@ -20,7 +20,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import psutil
@@ -50,7 +50,8 @@ CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 class Step:
     """One process: a job, or a notebook. A job for several seeds at once would be one step, which all of them need.
 
-    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up.
+    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. ships: whether
+    something that comes with the package is taken in place of what it would make.
     """
 
     kind: str
@@ -60,6 +61,7 @@ class Step:
     command: str
     minutes: int
     mem_mb: int
+    ships: bool = False
 
 
 def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str, Step]:
@@ -81,7 +83,8 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
             if name not in found:
                 before = [f"{seed}/{other.name}" for other in job.needs(run)]
                 command = [word, "--job", job.name, *options]
-                found[name], first[name] = _step(run, job.kind, name, before, settings, command, job.seconds(run)), mine
+                made = _step(run, job.kind, name, before, settings, command, job.seconds(run))
+                found[name], first[name] = replace(made, ships=job.ships(run)), mine
             inputs[name] = None
             if found[name].settings != settings:
                 inputs[first[name]] = None
@@ -247,12 +250,12 @@ def _list(table: Mapping[str, Step], folder: Path) -> None:
 
 
 def _made(name: str, step: Step, folder: Path) -> bool:
-    """Whether what a step makes is there; if it still holds, only the step can tell."""
+    """Whether what a step makes is there, or ships; if it still holds, only the step can tell."""
     seed, _, rest = name.partition("/")
     if step.kind == "notebook":
         entry = manifest.statuses(folder.parent / seed).get(rest, {})
         return isinstance(entry, dict) and entry.get("state") == "complete"
-    return (folder.parent / name).with_name(f"{Path(name).name}.safetensors").exists()
+    return step.ships or (folder.parent / name).with_name(f"{Path(name).name}.safetensors").exists()
 
 
 def _snakemake(

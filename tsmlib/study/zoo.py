@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from importlib import import_module
 from itertools import product
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES, Look, Method
 
@@ -77,25 +77,25 @@ class Updates:
     patience: int = 0
     span: tuple[float, float] = (0.0, 1.0)
 
-    def options(self, past_len: int, **changes: Any) -> TrainingOptions:
+    def options(self, past_len: int, **changes: float | tuple[float, float]) -> TrainingOptions:
         """What ``fit`` takes. past_len: of the model; changes: of other fields, or of these."""
         from tsmlib.training.fit import TrainingOptions  # heavy
 
         own = {name: value for name, value in asdict(self).items() if name not in ("loss", "batch")}
         return TrainingOptions(**{"past_len": past_len, "batch_size": self.batch} | own | changes)
 
-    def stated(self) -> dict[str, Any]:
+    def stated(self) -> dict[str, Json]:
         """The stage as it stands in the header of a model: without ``bf16``, which holds where it is native."""
         return _as_json({name: value for name, value in asdict(self).items() if name != "bf16"})
 
 
-def stated(schedule: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def stated(schedule: Iterable[Mapping[str, Json]]) -> list[dict[str, Json]]:
     """The schedule in the header of a model, complete: what came later is at its default."""
     later = {field.name: field.default for field in fields(Updates) if field.default is not MISSING}
     return [{**_as_json(later), **stage} for stage in schedule]
 
 
-def _as_json(stage: Mapping[str, Any]) -> dict[str, Any]:
+def _as_json(stage: Mapping[str, Json]) -> dict[str, Json]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in stage.items()}
 
 

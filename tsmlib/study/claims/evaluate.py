@@ -81,12 +81,16 @@ class Effect:
         return STATES.index(self.state), float(value / (abs(high - low) + 1e-300))
 
     @property
-    def text(self) -> str:
-        """Estimate, interval and n in words."""
+    def estimate(self) -> str:
+        """Estimate and interval in words."""
         if self.value is None:
             return "no rows"
-        between = "" if self.low is None else f" [{self.low:.3g}, {self.high:.3g}]"
-        return f"{self.value:.3g}{between}, n = {self.n}"
+        return f"{self.value:.3g}" + ("" if self.low is None else f" [{self.low:.3g}, {self.high:.3g}]")
+
+    @property
+    def text(self) -> str:
+        """Estimate, interval and n in words."""
+        return self.estimate if self.value is None else f"{self.estimate}, n = {self.n}"
 
 
 STATES = ("fails", "missing", "open", "holds")  # of a whole rule: one check that fails decides, whatever is missing
@@ -162,14 +166,13 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
     files = {term.table for check in checks for term in check.number.terms}
     names = sorted(files | {f"{file}_rows" for file in files})
     rows = {name: tables_storage.load(path) for name in names if (path := RESULTS / f"{name}.csv").exists()}
-    folders = sorted(run.dir.parent.glob("seed*/metrics")) if run and run.scale == "paper" else []
-    for folder, name in itertools.product(folders, names):
-        if not (path := folder / f"{name}.csv").exists():
+    stems = {notebook.stem for notebook in notebooks().values()}
+    runs = run.seeds() if run and run.scale == "paper" else []
+    for one, name in itertools.product(runs, names):
+        if not (path := one.dir / "metrics" / f"{name}.csv").exists():
             continue
-        assert run
-        if name[3:] in notebooks():
-            seed = int(folder.parent.name.removeprefix("seed"))
-            require(replace(run, seed=seed, dir=folder.parent), name)
+        if name in stems:
+            require(one, name)
         own = tables_storage.load(path)
         shipped = rows.get(name, own[:0])
         rows[name] = pd.concat([shipped[~shipped["seed"].isin(own["seed"])], own], ignore_index=True)
@@ -222,7 +225,8 @@ def _effect(claim: Claim, check: Check, rows: Tables) -> Effect:
     try:
         return measure(check, rows)
     except ClaimError as error:
-        command = MADE_BY.get(error.table, f"python -m tsmlib run {error.table[3:]} --scale paper")
+        word = next((each.name for each in notebooks().values() if each.stem == error.table), "all")
+        command = MADE_BY.get(error.table, f"python -m tsmlib run {word} --scale paper")
         return Effect(check, "missing", why=f"{claim.id}: {error}. Run: {command}")
 
 

@@ -30,7 +30,7 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
     lines = []
     for verdict, other in zip(verdicts, ours, strict=True):
         claim, key, checks = verdict.claim, verdict.key, len(verdict.effects[""])
-        found = "no rows yet" if key.value is None else key.text.removesuffix(f", n = {key.n}")
+        found = "no rows yet" if key.value is None else key.estimate
         lines.append({
             "": claim.id, "the paper says": f"{claim.statement} ({claim.place})", "verdict": f"**{verdict.word}**",
             "with our model": other.word.lower(), "measured": claim.statistic,

@@ -72,7 +72,7 @@ def code_rows(model: Coded, seen: SampledFutures, generator: torch.Generator, /,
         found.append(dict(metric="importance", value=float(value), dimension=i))
     found += _spread(model, seen, after)
     common |= table.place(seen.env) | dict(planner="none", execution="segments", n=len(after))
-    return [common | row for row in found if math.isfinite(row["value"])]
+    return [common | row for row in found if math.isfinite(cast(float, row["value"]))]
 
 
 def _encoded(model: TSM, seen: SampledFutures, ever: Tensor, generator: torch.Generator) -> Iterator[Row]:

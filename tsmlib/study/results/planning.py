@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -144,7 +144,9 @@ def convergence(task: Task, plan: Plan, run: Run, method: Method) -> list[Row]:
 # Reading rows --------------------------------------------------------------------------------------------------------
 
 
-def chosen(found: pd.DataFrame, *, env: str = "", execution: str = OPEN, planners: Sequence[str] = ()) -> pd.DataFrame:
+def plans_of(
+    found: pd.DataFrame, *, env: str = "", execution: str = OPEN, planners: Sequence[str] = ()
+) -> pd.DataFrame:
     """Finished plans of an environment and some planners; the floors are always among them."""
     own = table.select(found, execution=execution, iteration=None, **({"env": env} if env else {}))
     return own[(own["model"] == "none") | own["planner"].isin(list(planners))] if planners else own
@@ -160,7 +162,7 @@ def returns(
     found: pd.DataFrame, env: str, *, planner: str = "cem", execution: str = OPEN
 ) -> dict[Method, dict[str, np.ndarray | None]]:
     """What ``figures.figure6`` draws of one task: method -> true and predicted returns, from rows with a ``target``."""
-    own = chosen(found, env=env, execution=execution, planners=[planner])
+    own = plans_of(found, env=env, execution=execution, planners=[planner])
     predicted = by_target(own, "return_predicted")
     return {
         method: {"true": true, "predicted": predicted.get(method)}
@@ -174,7 +176,7 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
     opened, closed = (
         {method: part["value"].to_numpy() for method, part in table.groups(table.with_method(own), "method")}
         for own in (
-            table.select(chosen(found, env=env, execution=way), metric="final_distance") for way in (OPEN, CLOSED)
+            table.select(plans_of(found, env=env, execution=way), metric="final_distance") for way in (OPEN, CLOSED)
         )
     )
     return {method: {"open": opened[method], "closed": distances} for method, distances in closed.items()}
@@ -182,7 +184,7 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
 
 def return_panels(
     found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem", methods: Sequence[Method] = ()
-) -> dict[str, Any]:
+) -> dict[str, dict[Method, dict[str, np.ndarray | None]]]:
     """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
     every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
     return {task: {m: rows[m] for m in methods or _ordered(rows) if m in rows} for task, rows in every.items()}
@@ -194,7 +196,7 @@ def _ordered(rows: Iterable[Method]) -> list[Method]:
     return sorted(rows, key=lambda method: order.index(method.model))
 
 
-def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, Any]:
+def distance_panels(found: pd.DataFrame, task: Task) -> dict[str, dict[Method, dict[str, np.ndarray]]]:
     """The input of ``figures.final_distances``."""
     return {task.name: final_distances(found, task.env)}
 
@@ -235,7 +237,7 @@ def _printed(plans: pd.DataFrame, columns: Columns) -> pd.DataFrame:
 @table.sourced
 def plans_table(found: pd.DataFrame, *, planner: str = "cem") -> pd.DataFrame:
     """Every model planned with by one planner, executed open loop, with floors and oracle, in Markdown."""
-    return _printed(chosen(found, planners=[planner]), MAIN)
+    return _printed(plans_of(found, planners=[planner]), MAIN)
 
 
 def violations_table(found: pd.DataFrame, *, env: str = "", planner: str = "cem") -> str:
@@ -245,7 +247,7 @@ def violations_table(found: pd.DataFrame, *, env: str = "", planner: str = "cem"
 
 @table.sourced
 def _violations(found: pd.DataFrame, env: str, planner: str) -> pd.DataFrame:
-    own = _printed(chosen(found, env=env, planners=[planner]), SIGNS)
+    own = _printed(plans_of(found, env=env, planners=[planner]), SIGNS)
     measured = "violations" in set(found["metric"])
     return (own if "source" in found else own.drop(columns="n")) if measured else own.iloc[:0]
 
@@ -257,14 +259,14 @@ def loops_table(found: pd.DataFrame) -> str:
 
 @table.sourced
 def _loops(found: pd.DataFrame) -> pd.DataFrame:
-    opened, closed = (_printed(chosen(found, execution=execution), LOOP) for execution in (OPEN, CLOSED))
+    opened, closed = (_printed(plans_of(found, execution=execution), LOOP) for execution in (OPEN, CLOSED))
     return opened.merge(closed, "right", ["env", "method", "n"], suffixes=(f", {OPEN}", f", {CLOSED}"))
 
 
 @table.sourced
 def planners_table(found: pd.DataFrame) -> pd.DataFrame:
     """Model and search space by planner, in Markdown: the mean executed return, and in brackets the gap."""
-    own = chosen(found)
+    own = plans_of(found)
     own = table.with_method(own[own["model"] != "none"], "model", "search_space")
     wide = table.means(own, ["env", "method"], ["planner", "metric"])
     cells = {
@@ -280,7 +282,7 @@ def planners_table(found: pd.DataFrame) -> pd.DataFrame:
 def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
     """What the action prior changes, in Markdown: latent minus direct, paired by target, with half the 95 % t interval.
     found: rows with a ``target``."""
-    own = table.select(chosen(found), metric=["return_true", "return_predicted"], search_space=["latent", "direct"])
+    own = table.select(plans_of(found), metric=["return_true", "return_predicted"], search_space=["latent", "direct"])
     by = ["env", "model", "planner", "seed", "target"]
     wide = own.pivot_table("value", by, ["search_space", "metric"], sort=False)
     lines = []
@@ -299,7 +301,7 @@ def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str 
     """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
     subject's cost and size of the gap minus theirs with half the 95 % t interval over targets; the cost also in each
     seed alone. Closed loop, the gap is that of the first plan. found: rows with a ``target``."""
-    planned = chosen(found, env=env, execution=execution, planners=["cem"])
+    planned = plans_of(found, env=env, execution=execution, planners=["cem"])
     seeds = [by_target(part, "return_true") for _, part in table.groups(planned, "seed")]
     costs = {way: -true for way, true in by_target(planned, "return_true").items() if way.search_space != "direct"}
     gaps, ours = gap_sizes(planned), next((way for way in costs if way.model == subject), None)
@@ -352,7 +354,7 @@ def thresholds_table(found: pd.DataFrame, model: str) -> pd.DataFrame:
 def plans_told(found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem") -> Iterator[str]:
     """A sentence per task on plans through learned models: cost beside the oracle's, size of the gap."""
     for task in tasks:
-        own = table.select(chosen(found, env=task.env), planner=planner)
+        own = table.select(plans_of(found, env=task.env), planner=planner)
         own = own[~own["model"].isin(["oracle", "none"])]
         cost, gap = (own[own["metric"] == metric]["value"] for metric in ("cost_over_oracle", "relative_gap_median"))
         if len(cost):
@@ -363,7 +365,7 @@ def plans_told(found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "ce
 @table.told
 def planners_told(found: pd.DataFrame, task: Task, model: str, planners: Sequence[str]) -> Iterator[str]:
     """A sentence on the executed returns of a model by some planners, in both search spaces."""
-    own = table.select(chosen(found, env=task.env), metric="return_true", model=model, planner=list(planners))
+    own = table.select(plans_of(found, env=task.env), metric="return_true", model=model, planner=list(planners))
     own = table.with_method(own)
     if own["planner"].nunique() == len(planners):
         said = [f"{method.label} {part['value'].mean():.2f}" for method, part in table.groups(own, "method")]
@@ -381,7 +383,7 @@ def thresholds(found: pd.DataFrame, model: str) -> pd.DataFrame:
         means = own.groupby("metric")["value"].mean()
         return defaultdict(lambda: math.nan, {str(metric): float(value) for metric, value in means.items()})
 
-    plans = {way: table.select(chosen(found, execution=way), planner="cem") for way in (OPEN, CLOSED)}
+    plans = {way: table.select(plans_of(found, execution=way), planner="cem") for way in (OPEN, CLOSED)}
     near, far = (measured(env, model, OPEN) for env in (REACH, PUSH))
     again, oracle = (measured(PUSH, word, CLOSED)["success"] for word in (model, "oracle"))
     others = table.select(plans[OPEN], env=PUSH, model=PAPER)

@@ -7,7 +7,6 @@ A record stands at the optimiser ``iteration``; for the model-free policies of b
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import ARRIVED
-from tsmlib.study.results.table import Row
+from tsmlib.study.results.table import PolicyHeader, Row
 
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration of learning (A.3)
 UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
@@ -31,7 +30,7 @@ Curves = dict[str, np.ndarray]
 
 
 def learning_rows(
-    header: Mapping[str, Any], *, samples: int, train_seconds: float, n: int = 100, within_data: Iterable[float] = ()
+    header: PolicyHeader, *, samples: int, train_seconds: float, n: int = 100, within_data: Iterable[float] = ()
 ) -> list[Row]:
     """Rows of a learned policy, one per record, copy and metric; header: as ``study.learn`` returns it.
 
@@ -61,7 +60,7 @@ def learning_rows(
     ]
 
 
-def plateau_rows(curves: Mapping[Method, Curves], *, steps: int, share: float = 0.9, **common: object) -> list[Row]:
+def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, share: float = 0.9) -> list[Row]:
     """Rows of what each policy needed to come to ``share`` of the common plateau (claims C37 and C39), one task's.
 
     curves: of one seed, of the policies that are compared. Their common plateau is what those learned inside models

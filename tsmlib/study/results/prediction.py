@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -85,7 +84,7 @@ def _calibrated(scores: Scores, where: Tensor | None, here: Row) -> list[Row]:
     ]
 
 
-def _coverage(level: Any) -> str:
+def _coverage(level: float | Tensor) -> str:
     return f"calibration{round(100 * float(level))}"
 
 
@@ -186,25 +185,31 @@ def curves(found: pd.DataFrame, metric: str, *, env: str, **where: object) -> di
     return table.methods(lines)
 
 
-def score_panels(found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]) -> dict[str, Any]:
+def score_panels(
+    found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]
+) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
     """The input of ``figures.figure5``: title -> environment -> method -> one value per seed; titles: of metrics."""
     found_of = {metric: {env: table.methods(values(found, metric, env=env)) for env in envs} for metric in titles}
     return {titles[metric]: {EnvSpec.parse(env).name: found for env, found in rows.items() if found}
             for metric, rows in found_of.items()}  # fmt: skip
 
 
-def horizon_panels(found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]) -> dict[str, Any]:
+def horizon_panels(
+    found: pd.DataFrame, titles: Mapping[str, str], envs: Sequence[str]
+) -> dict[str, dict[Method, np.ndarray]]:
     """The input of ``figures.against_horizon``: a panel for each environment and metric; titles: of metrics."""
     return {f"{EnvSpec.parse(env).name}: {title}": curves(found, metric, env=env)
             for env in envs for metric, title in titles.items()}  # fmt: skip
 
 
-def paired_panels(found: pd.DataFrame, subject: str, titles: Mapping[str, str], env: str) -> dict[str, Any]:
+def paired_panels(
+    found: pd.DataFrame, subject: str, titles: Mapping[str, str], env: str
+) -> dict[str, dict[Method, np.ndarray]]:
     """The input of ``figures.differences`` of an environment: a panel for each metric; titles: of metrics."""
     return {title: paired(found, subject, metric, env=env) for metric, title in titles.items()}
 
 
-def calibration_panels(found: pd.DataFrame, envs: Sequence[str]) -> dict[str, Any]:
+def calibration_panels(found: pd.DataFrame, envs: Sequence[str]) -> dict[str, dict[Method, np.ndarray]]:
     """The input of ``figures.calibration``: a panel for each environment, then those after contact."""
     contact = [env for env in envs if EnvSpec.parse(env).has_block]
     panels = {EnvSpec.parse(env).name: calibration(found, env=env) for env in envs}

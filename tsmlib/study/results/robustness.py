@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,7 @@ from tsmlib.study import zoo
 from tsmlib.study.results import table
 from tsmlib.study.results.policies import model_steps
 from tsmlib.study.results.prediction import paired, select, values
-from tsmlib.study.results.table import Row
+from tsmlib.study.results.table import PolicyHeader, Row
 
 LAST = 880  # iterations up to which policies are compared; by then the curves of 05_control are flat
 THRESHOLDS = {"lost": 0.2, "success50": 0.6}  # of a policy, with noise and with delay
@@ -50,7 +49,7 @@ def error_rows(
     return rows
 
 
-def policy_rows(header: Mapping[str, Any], distances: Tensor, *, level: float = 0.05) -> list[Row]:
+def policy_rows(header: PolicyHeader, distances: Tensor, *, level: float = 0.05) -> list[Row]:
     """Rows ``success50`` of a learned policy, one per copy: the share of targets within ``level`` metres at the end.
 
     distances (copies, targets): final distances in metres.
@@ -83,7 +82,7 @@ def filtering_panels(
     return ahead, now, raw
 
 
-def own_errors(found: pd.DataFrame, env: str, models: Sequence[str]) -> dict[str, Any]:
+def own_errors(found: pd.DataFrame, env: str, models: Sequence[str]) -> dict[str, dict[Method, np.ndarray]]:
     """The reader's own in ``figures.filtering_errors``: panel -> method -> errors ahead (k, 10)."""
     if not len(select(found, "rmse_clean", env=env, execution="segments", steps_ahead=1)):
         return {}

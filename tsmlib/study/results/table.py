@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypedDict, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.tasks import Task
 from tsmlib.statistics import interval
 from tsmlib.storage import tables
+from tsmlib.storage.files import Json
 from tsmlib.study import zoo
 from tsmlib.study.runs import Run
 from tsmlib.study.zoo import LOOKS, ZOO, method
@@ -33,8 +34,39 @@ KEYS = (
     "start",
     "what",
 )  # what a line is about
-Row = dict[str, Any]
+Row = dict[str, object]
+K = TypeVar("K")
+V = TypeVar("V")
 Columns = Mapping[str, tuple[str, str]]  # metric -> title and format of its column
+
+
+class LearnedCurve(TypedDict):
+    """A ``LearningCurve`` as JSON."""
+
+    iteration: list[int]
+    seconds: list[float]
+    predicted: list[list[float]]
+    measured: dict[str, list[list[float]]]
+    resumed: list[str]
+
+
+class PolicyHeader(TypedDict, total=False):
+    """What the file of a learned policy says of itself; targets: that it was measured on as it was learned."""
+
+    fingerprint: dict[str, Json]
+    made_from: dict[str, Json]
+    budget: dict[str, int]
+    model: str
+    search_space: str
+    targets: int
+    seed: int
+    scale: str
+    curve: LearnedCurve
+    seconds: float
+    torch: str
+    threads: int
+    device: str
+    finished: str
 
 
 # Places and methods --------------------------------------------------------------------------------------------------
@@ -59,9 +91,9 @@ def fields(method: Method) -> Row:
     return {"model": model, "search_space": method.search_space, "planner": planner}
 
 
-def policy(header: Mapping[str, Any]) -> Row:
+def policy(header: PolicyHeader) -> Row:
     """The columns of a learned policy, from the header of its file."""
-    return place(header["fingerprint"]["env"]) | dict(
+    return place(str(header["fingerprint"]["env"])) | dict(
         task=header["made_from"]["task"], model=header["model"], planner="policy", execution="policy",
         search_space=header["search_space"], seed=header["seed"], scale=header["scale"],
     )  # fmt: skip
@@ -83,7 +115,7 @@ def methods(values: Mapping[str, T]) -> dict[Method, T]:
 def save(run: Run, rows: Iterable[Row], **common: object) -> pd.DataFrame:
     """Save the rows of a run's notebook; common: what all have in common, beside seed, scale and no planner."""
     common = dict(planner="none", seed=run.seed, scale=run.scale) | common
-    return tables.save(run.metrics / f"{run.notebook}.csv", [common | row | place(row["env"]) for row in rows])
+    return tables.save(run.metrics / f"{run.notebook}.csv", [common | row | place(str(row["env"])) for row in rows])
 
 
 # Selections ----------------------------------------------------------------------------------------------------------
@@ -154,7 +186,7 @@ def drawn(found: pd.DataFrame) -> pd.DataFrame:
     return own if "paper" in set(own["scale"]) else select(found, source=PUBLISHED)
 
 
-def beside(found: pd.DataFrame) -> pd.DataFrame:
+def own_rows(found: pd.DataFrame) -> pd.DataFrame:
     """The reader's own rows, where ``drawn`` gives those of others."""
     if "source" not in found:
         return found.iloc[:0]
@@ -163,13 +195,13 @@ def beside(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def pair(
-    found: pd.DataFrame, read: Callable[[pd.DataFrame], Mapping[str, Mapping[Any, Any]]]
-) -> tuple[dict[str, Any], dict[str, Any]]:
+    found: pd.DataFrame, read: Callable[[pd.DataFrame], Mapping[str, Mapping[K, V]]]
+) -> tuple[dict[str, Mapping[K, V]], dict[str, Mapping[K, V]]]:
     """What ``read`` makes of the rows that are drawn in full, and of the reader's own beside them: title -> panel.
 
     Panels for which neither has rows are left out.
     """
-    first, second = read(drawn(found)), read(beside(found))
+    first, second = read(drawn(found)), read(own_rows(found))
     titles = [title for title in {**first, **second} if first.get(title) or second.get(title)]
     return {title: first.get(title, {}) for title in titles}, {
         title: second[title] for title in titles if second.get(title)
@@ -182,13 +214,13 @@ def stamp(found: pd.DataFrame, *, figure: bool = False) -> str:
     Arms of which nothing is published are named. figure: only of what a figure shows, which says less at scale paper;
     there it is said if other models with codes have rows and OURS has none.
     """
-    shown = pd.concat([drawn(found), beside(found)]) if figure else found
+    shown = pd.concat([drawn(found), own_rows(found)]) if figure else found
     said = []
     for source, part in groups(shown, "source"):
-        title = "" if figure and len(beside(found)) == 0 and source == YOURS else f"{source}: "
+        title = "" if figure and len(own_rows(found)) == 0 and source == YOURS else f"{source}: "
         said.append(f"{title}{_origin(part)}")
     known = set(select(found, source=PUBLISHED)["env"])
-    if figure and beside(found).empty:  # at scale paper it is what will be published
+    if figure and own_rows(found).empty:  # at scale paper it is what will be published
         known |= set(found["env"])
     if missing := [env for env in found["env"].unique() if env and env not in known]:
         said.append(f"of {', '.join(map(_env_name, missing))} nothing is published")
