@@ -18,7 +18,7 @@ def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], tabl
     ``tables.save`` and ``publish`` know nothing of it.
     """
     path = predictions.RESULTS / f"{run.notebook}{table}.csv"
-    published = tables.load(path) if path.exists() else tables.frame([])
+    published = tables.load(path) if tables.stored(path) else tables.frame([])
     own = predictions.pooled_rows(run, rows, table, whole=False)
     return _sourced(published, own)
 
@@ -32,7 +32,7 @@ def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFram
 def evidence_of(run: Run, notebook: str) -> pd.DataFrame:
     """``evidence`` of another notebook's table; of this run's rows those of this seed, where it ran there."""
     own, published = run.metrics / f"{notebook}.csv", predictions.RESULTS / f"{notebook}.csv"
-    return _sourced(*(tables.load(path) if path.exists() else tables.frame([]) for path in (published, own)))
+    return _sourced(*(tables.load(path) if tables.stored(path) else tables.frame([]) for path in (published, own)))
 
 
 def _sourced(published: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:

@@ -66,7 +66,6 @@ def publish(run: Run) -> None:
     for source, pattern, target in (
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
-        (run.metrics, "*.csv", RESULTS),
         (run.figures, "*.*", FIGURES),
     ):
         for path in sorted(source.glob(pattern)):
@@ -74,8 +73,10 @@ def publish(run: Run) -> None:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 files.write_bytes(copy, path.read_bytes())
+    for path in sorted(run.metrics.glob("*.csv")):
+        tables_storage.ship_bytes(RESULTS / path.name, path.read_bytes())
     for notebook, rows in tables.items():
-        tables_storage.save(RESULTS / f"{notebook}.csv", rows)
+        tables_storage.ship(RESULTS / f"{notebook}.csv", rows)
     manifest.write_manifest(ROOT / "data")
     publish_claims()
 
@@ -83,7 +84,8 @@ def publish(run: Run) -> None:
 def publish_table(run: Run, notebook: str) -> None:
     """Copy the table of one notebook of POOLED, with all its seeds, into data/; rewrite what is said of the results."""
     require(run, notebook)
-    tables_storage.save(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    tables_storage.ship(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    manifest.write_manifest(RESULTS.parent)
     publish_claims()
 
 
@@ -106,9 +108,14 @@ def _pooled(run: Run, notebook: str) -> pd.DataFrame:
 
 
 def publish_claims() -> None:
-    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent."""
+    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent.
+
+    A large table that is not compressed yet is compressed.
+    """
+    for path in filter(tables_storage.stored, sorted(RESULTS.glob("*.csv"))):  # StoreError where both forms are there
+        tables_storage.ship_bytes(path, manifest.read_text(path).encode())
     papers, ours = shipped_verdicts(PAPERS), shipped_verdicts(OURS)
-    tables_storage.save(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
+    tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
     _between(README, MARKS, readme_results())
     _between(RESULTS_PAGE, MARKS, results_page())
@@ -143,7 +150,7 @@ def _between(page: Path, marks: tuple[str, str], written: str) -> None:
 def _shipped(name: str) -> pd.DataFrame:
     """A table that ships; without rows where there is none."""
     path = RESULTS / f"{name}.csv"
-    return tables_storage.load(path) if path.exists() else tables_storage.frame([])
+    return tables_storage.load(path) if tables_storage.stored(path) else tables_storage.frame([])
 
 
 # Figures -------------------------------------------------------------------------------------------------------------

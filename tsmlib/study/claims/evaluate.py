@@ -161,7 +161,8 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
     checks = [check for claim in claims for found in claim.checks.values() for check in found]
     files = {term.table for check in checks for term in check.number.terms}
     names = sorted(files | {f"{file}_rows" for file in files})
-    rows = {name: tables_storage.load(path) for name in names if (path := RESULTS / f"{name}.csv").exists()}
+    paths = {name: tables_storage.stored(RESULTS / f"{name}.csv") for name in names}
+    rows = {name: tables_storage.load(path) for name, path in paths.items() if path}
     folders = sorted(run.dir.parent.glob("seed*/metrics")) if run and run.scale == "paper" else []
     for folder, name in itertools.product(folders, names):
         if not (path := folder / f"{name}.csv").exists():
