@@ -73,7 +73,7 @@ def packed(data: bytes) -> bytes:
 
 
 def unpacked(path: Path, data: bytes) -> bytes:
-    """What ``data`` of a file ``*.gz`` unpacks to. Raises StoreError for what is no gzip, cut or larger than UNPACKED."""
+    """What a file ``*.gz`` unpacks to. Raises StoreError for what is no gzip, cut, or larger than UNPACKED."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             found = file.read(UNPACKED + 1)

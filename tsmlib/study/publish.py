@@ -108,12 +108,8 @@ def _pooled(run: Run, notebook: str) -> pd.DataFrame:
 
 
 def publish_claims() -> None:
-    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent.
-
-    A large table that is not compressed yet is compressed.
-    """
-    for path in filter(tables_storage.stored, sorted(RESULTS.glob("*.csv"))):  # StoreError where both forms are there
-        tables_storage.ship_bytes(path, manifest.read_text(path).encode())
+    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent."""
+    compress()
     papers, ours = shipped_verdicts(PAPERS), shipped_verdicts(OURS)
     tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
@@ -121,6 +117,12 @@ def publish_claims() -> None:
     _between(RESULTS_PAGE, MARKS, results_page())
     _between(README, CLAIM_MARKS, readme_claims(papers, ours))
     _between(CLAIMS_PAGE, CLAIM_MARKS, claims_page(papers, ours))
+
+
+def compress() -> None:
+    """Compress the large tables that are not yet. StoreError where one is there in both forms."""
+    for path in filter(tables_storage.stored, sorted(RESULTS.glob("*.csv"))):
+        tables_storage.ship_bytes(path, manifest.read_text(path).encode())
 
 
 def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
