@@ -35,6 +35,7 @@ from tsmlib.study.zoo import OURS, PAPERS
 
 README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
+FULL_PAGE = ROOT / "docs" / "claims_in_full.md"  # claim by claim
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
 ASKED = {  # parameters for these cells: without the plain arm, and plans for few targets
@@ -108,7 +109,8 @@ def _pooled(run: Run, notebook: str) -> pd.DataFrame:
 
 
 def publish_claims() -> None:
-    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent."""
+    """Judge every claim from the tables that ship, and write README, docs/results.md, docs/claims.md and
+    docs/claims_in_full.md. Idempotent."""
     compress()
     papers, ours = shipped_verdicts(PAPERS), shipped_verdicts(OURS)
     tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
@@ -117,6 +119,14 @@ def publish_claims() -> None:
     _between(RESULTS_PAGE, MARKS, results_page())
     _between(README, CLAIM_MARKS, readme_claims(papers, ours))
     _between(CLAIMS_PAGE, CLAIM_MARKS, claims_page(papers, ours))
+    _between(FULL_PAGE, CLAIM_MARKS, full_page(papers, ours))
+    draw_claims(papers)
+
+
+def draw_claims(papers: list[evaluate.Verdict]) -> list[Path]:
+    """The figure of all claims. Returns its files."""
+    figure = figures.claim_margins(claims_report.margins(papers))
+    return [*figures.save(figures.stamp(figure, "Rows: published; the paper's model"), FIGURES / "claims")]
 
 
 def compress() -> None:
@@ -167,6 +177,7 @@ def publish_figures() -> list[Path]:
     for figure, stem, rows in drawings_of_rows():
         figures.stamp(figure, table.stamp(rows, figure=True))
         drawn |= set(figures.save(figure, FIGURES / stem))
+    drawn |= set(draw_claims(shipped_verdicts(PAPERS)))
     with TemporaryDirectory() as folder:
         for notebook in runs.notebooks().values():
             for path in drawn_by_cells(notebook, Path(folder)):
@@ -308,6 +319,13 @@ The paper ends on what it leaves to future work (section 6). These questions and
 of `{OURS}`, and are not counted above.
 
 {claims_report.answers(shipped_answers(), root="../")}"""
+
+
+def full_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Every claim in full, in the order of the paper."""
+    return "\n\n".join(
+        claims_report.in_full(first, second, root="../") for first, second in zip(papers, ours, strict=True)
+    )
 
 
 def results_page() -> str:
