@@ -2,6 +2,7 @@ from .comparison import evidence as evidence
 from .comparison import evidence_of as evidence_of
 from .comparison import save_evidence as save_evidence
 from .data import SPLITS as SPLITS
+from .data import TASK_SEED as TASK_SEED
 from .data import dataset as dataset
 from .data import datasets as datasets
 from .data import parse_choice as parse_choice
@@ -38,7 +39,6 @@ from .robots import beside_the_oracle as beside_the_oracle
 from .robots import scoreboard as scoreboard
 from .runs import RESULTS as RESULTS
 from .tasks import FROZEN as FROZEN
-from .tasks import TASK_SEED as TASK_SEED
 from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
 from .torques import task_torques as task_torques

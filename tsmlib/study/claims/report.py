@@ -93,7 +93,7 @@ def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
         {"reading": reading or "as the paper words it", "verdict": _under(found), "deciding check": _deciding(found)}
         for reading, found in verdict.effects.items()
     ]
-    return f"""### {claim.id}
+    return f"""## {claim.id}
 
 > {claim.statement} ({claim.place})
 
