@@ -14,6 +14,8 @@ from tsmlib import figures
 from tsmlib.storage import tables
 from tsmlib.study import adaptation, publish, rounds, runs
 from tsmlib.study.results import exploration as results
+from tsmlib.study.results import table
+from tsmlib.study.results.exploration import PENDULUM, PUSH
 from tsmlib.study.runs import ROOT, Run
 
 RUN = Run("10_explore", "smoke", 0, ROOT / "runs" / "nowhere")
@@ -46,9 +48,8 @@ def test_a_fine_tuned_model_of_the_standard_arm_predicts_the_weak_one_better_tha
 
 @pytest.mark.parametrize(("word", "lacks"), [("lstm", set()), ("ensemble+mse", {"highest"})])  # what a prior does
 def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lacks: set[str]) -> None:
-    sizes = rounds.Sizes(4, 1, 2, 2, 2, 4, 2, 1)
-    rows = tables.frame(rounds.loop(RUN, word, sizes))
-    assert set(rows["metric"]) == set(results.ROUNDS) - lacks
+    rows = tables.frame(rounds.loop(RUN, word))
+    assert set(rows["metric"]) == set(results.ROUNDS[PENDULUM]) - lacks
     assert rows["env_steps"].unique().tolist() == [400, 600]
     titles = ["executed return", "size of the gap"]
     panels = results.round_panels(rows, titles)
@@ -57,6 +58,114 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
     assert values.shape == (1, 2)
     figures.rounds(panels, "", yours=panels)
     assert "own plans, round 0 -> 1: executed return" in results.sentences(rows)
+
+
+def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) -> None:
+    sizes = rounds.WORLDS[PUSH].sizes["smoke"]
+    found = [rounds.loop(RUN, "lstm", env=PUSH, data=data, folder=tmp_path) for data in results.DATA]
+    rows = tables.frame([row for part in found for row in part])
+    assert set(rows["metric"]) == set(results.ROUNDS[PUSH])
+    assert set(rows["sim"]) == {"mujoco"}
+    first, last = 100 * sizes.first, 100 * (sizes.first + sizes.episodes)
+    for data, steps in zip(results.DATA, ([first, last], [first, last], [first, first]), strict=True):
+        assert table.select(rows, configuration=data, metric="success")["env_steps"].tolist() == steps
+    before = table.select(rows, iteration=0, metric="return_true")["value"]
+    assert len(before) == 3
+    assert before.nunique() == 1  # all begin with one learner
+    panels = results.round_panels(rows, ["share within 5 cm"], PUSH)["share within 5 cm"]
+    assert [method.variant for method in panels] == ["", results.RANDOM]  # those that take steps
+    assert results.round_panels(rows, ["share within 5 cm"]) == {}  # of the pendulum, nothing
+    assert "share within 5 cm" in results.rounds_table(rows, PUSH)
+    assert f"`{PUSH}`, `lstm` on {results.NONE}, round 0 -> 1: executed return" in results.sentences(rows)
+
+
+def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = rounds.loop(RUN, "rtsm", env=PUSH)
+
+    def killed(*given: object, **named: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rounds, "explore", killed)
+        with pytest.raises(KeyboardInterrupt):
+            rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path)
+    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path) == whole
+    monkeypatch.setattr(rounds, "measure", lambda *given: killed)  # without any work
+    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path) == whole
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    (("rtsm", {"env": "tsm/Reacher-v0"}), "no rounds are measured on 'tsm/Reacher-v0'; there are Pendulum-v1, tsm/Re"),
+    (("tsm", {}), "'tsm' does not explore Pendulum-v1; there are rtsm, lstm, ensemble"),
+    (("rtsm", {"data": "none"}), "data is 'none'; expected one of own plans, random episodes, no new episodes"),
+])  # fmt: skip
+def test_a_loop_that_nobody_knows_is_refused(given: tuple[str, dict[str, str]], said: str) -> None:
+    word, named = given
+    with pytest.raises(ValueError, match=said):
+        rounds.loop(RUN, word, **named)
+
+
+def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> None:
+    common = dict(env=PUSH, metric="return_true", scale="paper")
+    loop = common | dict(model="rtsm", planner="cem", execution="closed loop", configuration=results.PLANNED)
+    policy = common | dict(model="sac", planner="policy", execution="policy", seed=0)
+    rows = tables.frame([
+        loop | dict(seed=seed, iteration=k, env_steps=steps, value=value + seed)
+        for seed in (0, 2) for k, (steps, value) in enumerate([(500, -21), (600, -16), (700, -11)])
+    ])  # fmt: skip
+    free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (9000, -15))])
+    cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
+    assert cells == ["SAC", "9,000", "-15.00", "`rtsm`", "600", "6.7%", "-10.00", "-", "1 / 2"]
+    assert results.steps_table(tables.frame([]), free) == results.steps_table(rows, tables.frame([])) == ""
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (["rounds", "--envs", "tsm/Reacher-v0", "--models", "rtsm"], "no rounds are measured on 'tsm/Reacher-v0'"),
+    (["rounds", "--envs", PUSH, "--models", "ensemble+mse"], "'ensemble+mse' does not explore tsm/ReacherPush-v1"),
+    (["predict", "--envs", PENDULUM, "--models", "rtsm"], "predict takes no Pendulum-v1"),
+    (["adaptation", "--models", "rtsm", "--variants", "mass2"], "cannot be chosen: it has no object"),
+    (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
+    (["adaptation", "--models", "ensemble+mse", "--envs", PUSH], "no pretrained ensemble"),
+    (["adaptation", "--models", "rtsm", "--episodes", "1"], "expected at least 2, since one is held out"),
+    (["peers"], "peers, and nothing else, takes tables that are there; got none"),
+    (["peers", "nowhere.csv"], "takes tables that are there; got ['nowhere.csv']"),
+])  # fmt: skip
+def test_rows_that_cannot_be_made_are_refused_before_any_work(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(ROOT / "benchmarks" / "settings" / "rows.py", "--scale", "smoke", *options)
+    assert said in capsys.readouterr().err
+
+
+def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "RESULTS", tmp_path / "results")
+    (tmp_path / "results").mkdir()
+    row = dict(env=PUSH, metric="return_true", value=-9.0, n=4, seed=0, scale="paper", configuration="own plans")
+    made = {
+        "loop": row | dict(model="pets", planner="cem", execution="closed loop", iteration=5, env_steps=75_000),
+        "free": row | dict(model="sac", planner="policy", execution="policy", env_steps=1_000_000),
+    }
+    for name, each in made.items():
+        tables.save(tmp_path / f"{name}.csv", [each])
+    for _ in range(2):  # once more changes nothing
+        run_script(ROOT / "benchmarks" / "settings" / "rows.py", "peers", *(str(tmp_path / f"{n}.csv") for n in made))
+    found = {name: tables.load(tmp_path / "results" / f"{name}.csv") for name in ("10_explore", "10_model_free")}
+    assert [rows["model"].tolist() for rows in found.values()] == [["pets"], ["sac"]]
+    assert "75,000" in results.rounds_table(found["10_explore"], PUSH)
+    ((method, (at, _)),) = results.round_panels(found["10_explore"], ["executed return"], PUSH)[
+        "executed return"
+    ].items()
+    assert (method.model, at.tolist()) == ("pets", [75_000])
+
+
+def test_every_variant_changes_the_pushing_arm_and_those_of_the_mass_no_reacher() -> None:
+    arms = {word: adaptation.changed(PUSH, word) for word in adaptation.VARIANTS}
+    assert {word: arm for word, arm in arms.items() if word != "standard"} == {
+        word: f"tsm/ReacherPush-{word}-v1" for word in adaptation.VARIANTS if word != "standard"
+    }
+    with pytest.raises(ValueError, match="no variant is called 'heavier'; there are standard, mass0.5"):
+        adaptation.changed(PUSH, "heavier")
 
 
 def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None:

@@ -12,6 +12,7 @@ import judge
 import numpy as np
 import pandas as pd
 import pytest
+import quality
 import rows
 import spent
 import torch
@@ -168,3 +169,27 @@ def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> Non
     ])  # fmt: skip
     found = decoders.compared(lines, "ours").set_index("judged by")["cost of ours minus this"]
     assert found.to_dict() == {"better": "+0.50", "ours": "", "worse": "-3.00"}
+
+
+def test_a_doubling_of_the_training_time_is_read_from_neighbouring_lines_of_a_model() -> None:
+    about = {"env": "e", "model": "ours"}
+    values = {400: 1.0, 100: 4.0}
+    lines = pd.DataFrame([about | {"seconds": s} | dict.fromkeys(quality.MEASURES, v) for s, v in values.items()])
+    found = quality.doublings(lines)
+    assert (found["from"].item(), found["to"].item()) == (100, 400)
+    assert np.allclose(found[list(quality.MEASURES)], -0.5)
+
+
+def test_a_shipped_model_gets_one_line_of_quality_however_often_it_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    script = runs.ROOT / "benchmarks/settings/quality.py"
+    model = runs.ROOT / "data/pretrained/Reacher/onestep.safetensors"
+    options = ["--targets", "2", "--episodes", "4", "--out", str(tmp_path / "quality.csv")]
+    for _ in range(2):
+        run_script(script, "measure", str(model), *options)
+    line = pd.read_csv(tmp_path / "quality.csv")
+    assert line[["model", "seconds"]].to_numpy().tolist() == [["onestep", 80]]
+    assert np.isfinite(line[["energy_10", "nrmse_80", "cost", "gap"]].to_numpy()).all()
+    assert "| onestep" in run_script(script, "table", *options)

@@ -123,6 +123,37 @@ def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
         explored(*learners(seed=1), options=options(rounds=1), folder=tmp_path)
 
 
+def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> None:
+    def unasked(k: int) -> tsm.Task:
+        raise AssertionError
+
+    def given(k: int) -> tsm.Trajectories | None:
+        return tsm.collect_random(ARM, EPISODES, horizon=HORIZON, seed=k) if k == 1 else None
+
+    learned = learners()
+    found = explored(*learned, tasks=unasked, episodes=given, folder=tmp_path)
+    assert (len(found.train), len(found.held_out)) == (6 + EPISODES - 1, 2 + 1)
+    assert [record["env_steps"] for record in found.records] == [EPISODES * HORIZON] * 2
+    again = learners()
+    assert explored(*again, tasks=unasked, episodes=given, folder=tmp_path).records == found.records
+    assert bits(*again) == bits(*learned)
+    with pytest.raises(StoreError, match="is of another exploration"):
+        explored(*learners(), folder=tmp_path)
+
+
+def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit, seen = exploration.fit, []
+
+    def watched(part: Any, loss: Any, train: tsm.Trajectories, *given: Any, **named: Any) -> Any:
+        seen.append((type(part), len(train)))
+        return fit(part, loss, train, *given, **named)
+
+    monkeypatch.setattr(exploration, "fit", watched)
+    explored(*learners(), options=options(rounds=1), augmented=lambda data: data.joined(data))
+    n = 6 + EPISODES - 1
+    assert seen == [(tsm.ActionPrior, n), (tsm.RecurrentTSM, 2 * n)]
+
+
 def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores() -> None:
     train = data("Pendulum-v1")
     model = tsm.OneStep.for_data(train, hidden=8)
@@ -212,11 +243,13 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
 @pytest.mark.parametrize(("given", "said"), [
     (dict(options=options(bonus=1.0)), "OneStep is deterministic: its samples do not disagree. Take bonus=0"),
     (dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)), "are of tsm/ReacherObstacle-v0, the data"),
+    (dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)), "states have 10 dimensions, those of tsm/Reacher-v0 6"),
     (dict(tasks=lambda k: tasks(k, n=1)), "round 1 has 1 task; expected at least 2"),
 ])  # fmt: skip
 def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> None:
+    usual = {"model": tsm.OneStep.for_data(data(), hidden=8), "prior": learners()[1]}
     with pytest.raises(ValueError, match=said):
-        explored(tsm.OneStep.for_data(data(), hidden=8), learners()[1], **given)
+        explored(**(usual | given))
 
 
 @pytest.mark.parametrize(("changes", "said"), [

@@ -160,6 +160,13 @@ def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) ->
 
 
 @needs_sb3
+def test_sac_updates_as_often_per_step_as_its_configuration_says() -> None:
+    for updates, episodes, each in ((0.25, 20, 5), (1, 40, 40)):
+        setting = {"learning_rate": 3e-4, "episodes": episodes, "updates": updates}
+        assert model_free.learner("sac", "tsm/Reacher-v0", setting, seed=0).gradient_steps == each
+
+
+@needs_sb3
 def test_the_library_is_told_how_an_episode_ended() -> None:
     arms = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
     arms.reset()
@@ -212,7 +219,7 @@ def test_the_readme_states_what_is_run() -> None:
     assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v1']:,} pushing" in readme
     steps = model_free.SEARCH_STEPS
     assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v1']:,} for" in readme
-    for name in ("learning_rate", "target_kl", "episodes", "std"):
+    for name in ("learning_rate", "target_kl", "episodes", "std", "updates"):
         values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
         assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name
     assert f"minibatches of {model_free.MINIBATCH} steps" in readme

@@ -19,10 +19,10 @@ from torch import Tensor
 from tsmlib import study
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
-from tsmlib.planning.execution import Trial
+from tsmlib.planning.execution import Trial, execute
 from tsmlib.sampling import SharedNoise
 from tsmlib.storage import tables
-from tsmlib.study import runs
+from tsmlib.study import rounds, runs
 from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment, Trajectories
 
@@ -42,6 +42,10 @@ def load(name: str) -> ModuleType:
 
 pets = load("pets")
 speed = load("speed")
+loop = load("loop")
+needs_mbrl = pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in ("mbrl", "hydra")), reason="mbrl-lib is not installed; README.md"
+)
 
 
 @pytest.fixture
@@ -369,3 +373,42 @@ def test_the_readme_names_the_pins_and_options_that_exist() -> None:
     for option in re.findall(r" (--(?!no-deps)[a-z-]+)", readme):
         assert f'add_argument("{option}"' in source, option
     assert f"{pets.LEARNING_RATE:g}, weight decay {pets.WEIGHT_DECAY:.5f}, batches of {pets.BATCH}" in readme
+
+
+@pytest.mark.parametrize("env", loop.SETTINGS)
+def test_a_robot_of_mbrl_lib_returns_what_the_same_actions_do_here(env: str) -> None:
+    here = rounds.world(env)
+    task, unit = here.drawn(2, 5), loop.unit_of(here.random(2, 3))
+    robot = loop.Robot(lambda i: task.take([i]), unit, bound=1.0)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 100, task.action_dim)).astype(np.float32)
+    returns, seen = [], []
+    for episode in actions:
+        first, _ = robot.reset()
+        assert first.shape == unit.shape
+        steps = [robot.step(action) for action in episode]
+        assert [truncated for *_, truncated, _ in steps] == [False] * 99 + [True]
+        assert not any(terminated for _, _, terminated, _, _ in steps)
+        returns.append(sum(reward for _, reward, *_ in steps))
+        seen.append(np.stack([observed for observed, *_ in steps]))
+        predicted = robot.reward(torch.from_numpy(episode), torch.from_numpy(seen[-1]))
+        np.testing.assert_allclose(predicted[:, 0], [reward for _, reward, *_ in steps], atol=1e-4)
+    trial = execute(task, torch.from_numpy(actions))
+    np.testing.assert_allclose(returns, trial.executed_return, atol=1e-3)
+    assert loop.executed(task, torch.from_numpy(actions))["return_true"] == pytest.approx(np.mean(returns), abs=1e-3)
+
+
+@needs_mbrl
+def test_its_own_loop_leaves_rows_of_the_last_round(tmp_path: Path) -> None:
+    out = tmp_path / "loop.csv"
+    loop.main(["--env", "tsm/ReacherPush-v1", "--scale", "smoke", "--out", str(out)])
+    rows = tables.load(out)
+    assert set(rows["metric"]) == {"return_true", "success", "final_distance"}
+    sizes = rounds.world("tsm/ReacherPush-v1").sizes["smoke"]
+    assert set(rows["env_steps"]) == {100 * (sizes.first + sizes.rounds * sizes.episodes)}
+    assert set(rows["model"]) == {"pets"}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mbrl") is not None, reason="mbrl-lib is installed")
+def test_without_mbrl_lib_the_loop_says_where_it_is_told_how(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"mbrl-lib cannot be imported .*README.md tells how"):
+        loop.main(["--scale", "smoke", "--out", str(tmp_path / "x.csv")])

@@ -73,6 +73,10 @@ EVERY: dict[str, Callable[[], Figure]] = {
     "differences": lambda: figures.differences(
         {"reach": scores(*MODELS[1:]), "push": {LSTM: np.array([1.0])}}, "nats", TSM, lower_is_better=["push"]
     ),
+    "training_time": lambda: figures.training_time(
+        {t: {m: (np.array([145.0, 580, 2320]), np.array([3.0, 2, 1])) for m in MODELS} for t in ("cost", "gap")},
+        ships=580.0,
+    ),
     "gallery": lambda: gallery(*episodes(TSM, LSTM), contact=np.array([3, -1, 3, 3, 19]), by=TSM),
     "gallery, tip": lambda: gallery(*episodes(*MODELS), path="tip"),
 }  # fmt: skip

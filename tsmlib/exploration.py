@@ -25,6 +25,7 @@ from tqdm.auto import tqdm
 from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics
+from tsmlib.models.features import Features
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, mpc
 from tsmlib.planning.planners import cem
@@ -50,6 +51,7 @@ class Trainable(DynamicsModel, Protocol):
 
 Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
 Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
+Episodes = Callable[[int], Trajectories | None]  # round -> episodes that no plan made, or none
 
 
 @dataclass(frozen=True)
@@ -114,14 +116,25 @@ def explore(
     progress: str = "",
     measure: Measure | None = None,  # of model and prior, after every round
     callback: Callback | None = None,  # at every round
+    augmented: Callable[[Trajectories], Trajectories] | None = None,  # of what the model is trained on
+    episodes: Episodes | None = None,  # in place of plans, to compare with
 ) -> Exploration:
     """Rounds of planning, executing and learning, by a ``model`` and a ``prior`` that were trained on ``train``.
 
     Both go on being trained, in place, on all data so far. prior=None: the actions themselves are searched. tasks(k):
     those of round k = 1, 2, ..., one episode each. Given a ``folder``, a loop that was killed goes on from there with
-    the same bits; StoreError for the folder of another loop. ValueError for tasks of another robot than the data's, and
-    for a bonus where the model has no samples.
+    the same bits; StoreError for the folder of another loop. ValueError for a model or tasks of another robot than the
+    data's, and for a bonus where the model has no samples.
+
+    augmented: training data -> with their symmetric copies, say; held-out data stay as they are. episodes: what is
+    learned from in each round where nothing is planned, or None for what is there already; ``tasks`` are not asked.
     """
+    features = getattr(model, "features", None)
+    if isinstance(features, Features) and len(features.step_std) != train.states.shape[2]:
+        raise ValueError(
+            f"the model's states have {len(features.step_std)} dimensions, those of {train.env} "
+            f"{train.states.shape[2]}; expected a model of the robot that explores"
+        )
     if options.bonus and not as_dynamics(model).stochastic:
         raise ValueError(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
@@ -131,6 +144,7 @@ def explore(
     identity: dict[str, Json] = {
         "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
         "data": [artifacts.trajectories_digest(data) for data in (train, held_out)],
+        "episodes": "planned" if episodes is None else "given",
     }  # fmt: skip
     found, began = Exploration(train, held_out), time.process_time()
     with ExitStack() as stack:
@@ -138,13 +152,19 @@ def explore(
             stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
             place = None if folder is None else _Round(folder / f"round-{k:03d}", identity)
-            episodes, record = _collected(k, model, prior, train, tasks, options, seed, place)
-            n = min(len(episodes) - 1, max(1, round(options.held_out * len(episodes))))
-            found.held_out = found.held_out.joined(episodes.take(slice(n)))
-            found.train = found.train.joined(episodes.take(slice(n, None)))
+            new, record = (
+                _collected(k, model, prior, train, tasks, options, seed, place)
+                if episodes is None else (episodes(k), dict[str, float]())
+            )  # fmt: skip
             before = found.records[-1]["env_steps"] if found.records else 0
-            record = {"round": k, "env_steps": before + int(episodes.steps.sum())} | record
-            found.records.append(_trained(k, model, prior, found, record, options, seed, place, measure))
+            if new is not None:
+                n = min(len(new) - 1, max(1, round(options.held_out * len(new))))
+                found.held_out = found.held_out.joined(new.take(slice(n)))
+                found.train = found.train.joined(new.take(slice(n, None)))
+                before += int(new.steps.sum())
+            record = {"round": k, "env_steps": before} | record
+            train_on = found.train if augmented is None else augmented(found.train)
+            found.records.append(_trained(k, model, prior, found, train_on, record, options, seed, place, measure))
             if callback is not None:
                 callback(Progress(k, time.process_time() - began, found.records[-1]))
     return found
@@ -190,19 +210,19 @@ def _collected(
 
 
 def _trained(
-    k: int, model: Trainable, prior: ActionPrior | None, found: Exploration, record: dict[str, float],
-    options: ExplorationOptions, seed: int, place: _Round | None, measure: Measure | None,
+    k: int, model: Trainable, prior: ActionPrior | None, found: Exploration, augmented: Trajectories,
+    record: dict[str, float], options: ExplorationOptions, seed: int, place: _Round | None, measure: Measure | None,
 ) -> dict[str, float]:  # fmt: skip
     """The record of round k with what training gave; ``model`` and ``prior`` trained, or loaded if they are there."""
     if place is not None and (stored := place.models(model, prior)) is not None:
         return stored
-    parts: list[tuple[str, nn.Module, Loss, TrainingOptions]] = []
+    parts: list[tuple[str, nn.Module, Loss, Trajectories, TrainingOptions]] = []
     if prior is not None and options.prior is not None:
-        parts.append(("prior_validation", prior, prior.loss, options.prior))
-    parts.append(("validation", cast(nn.Module, model), model.loss, options.model))
-    for name, part, loss, training in parts:
+        parts.append(("prior_validation", prior, prior.loss, found.train, options.prior))
+    parts.append(("validation", cast(nn.Module, model), model.loss, augmented, options.model))
+    for name, part, loss, data, training in parts:
         checkpoint = None if place is None else place.folder / f"{name}.checkpoint"
-        curve = fit(part, loss, found.train, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
+        curve = fit(part, loss, data, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
         record[name] = min(curve.validation)
     if measure is not None:
         record |= measure(model, prior)
@@ -294,7 +314,8 @@ class _Round:
 
     def _record(self, path: Path) -> dict[str, float]:
         header = artifacts.read_header(path)
-        if differs := artifacts.differences(cast(dict[str, Json], header.get("identity", {})), dict(self.identity)):
+        found = {"episodes": "planned", **cast(dict[str, Json], header.get("identity", {}))}  # that key came later
+        if differs := artifacts.differences(found, dict(self.identity)):
             raise StoreError(
                 f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "
                 "or go back to those settings"

@@ -20,17 +20,12 @@ import pandas as pd
 import torch
 
 import tsmlib as tsm
-from tsmlib.envs import variant
 from tsmlib.study import adaptation
 from tsmlib.study.models import TrainedModel
 from tsmlib.study.results import table
 from tsmlib.trajectory import Trajectories
 
 HERE = Path(__file__).resolve().parent
-VARIANTS = {
-    "standard": {}, "mass0.5": {"mass": 0.5}, "mass2": {"mass": 2.0}, "damping0.5": {"damping": 0.5},
-    "damping2": {"damping": 2.0}, "links0.12x0.11": {"link_lengths": (0.12, 0.11)}, "gain0.7": {"torque_gain": 0.7},
-}  # fmt: skip
 KEY = ["arm", "variant", "model", "way", "episodes", "seed"]
 SEARCH = dict(candidates=96, elites=9, iterations=5)
 held_out = cache(adaptation.held_out)
@@ -85,7 +80,7 @@ def summary(lines: pd.DataFrame) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", default="tsm/ReacherPush-v1")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--variants", nargs="+", choices=adaptation.VARIANTS, default=list(adaptation.VARIANTS))
     parser.add_argument("--models", nargs="+", choices=adaptation.BUDGETS, default=["rtsm", "lstm"])
     parser.add_argument("--ways", nargs="+", choices=adaptation.WAYS, default=list(adaptation.WAYS))
     parser.add_argument("--episodes", nargs="+", type=int, default=[5, 20, 80])
@@ -98,7 +93,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for seed in given.seeds:
         for name in given.variants:
-            env = variant(given.arm, **VARIANTS[name])  # type: ignore[arg-type]
+            env = adaptation.changed(given.arm, name)
             for word in given.models:
                 for way in (way for way in adaptation.ways(word) if way in given.ways):
                     for n in [0] if way == "zero-shot" else given.episodes:

@@ -1,4 +1,4 @@
-"""Policies learned without a model, by Stable-Baselines3: the model-free curves of figure 7.
+"""Policies learned without a model, by Stable-Baselines3: the model-free curves of figure 7, and those of 10_explore.
 
 PPO from Stable-Baselines3 and TRPO from sb3-contrib (the paper names no method) on the tasks of section 5.3.2: the
 reward, the starts, the targets and the steps of an episode are those of ``tsmlib.study.learn``, which asks a model
@@ -6,6 +6,9 @@ where these ask the simulator. A few configurations are tried on validation targ
 seed, and its executed return on the frozen test targets is measured along the way. README.md tells how to install it.
 
     OMP_NUM_THREADS=1 python benchmarks/model_free/model_free.py
+
+SAC, which is no policy gradient and learns from all that it has seen, is asked for by name. 10_explore compares all
+three after as many steps as ``--steps`` says.
 
 Every finished run is kept in the table and not repeated; of one that was stopped the table holds the beginning.
 """
@@ -35,7 +38,8 @@ from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment
 
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v1")
-ALGORITHMS = ("ppo", "trpo")
+GRADIENTS = ("ppo", "trpo")  # those of figure 7
+ALGORITHMS = (*GRADIENTS, "sac")
 GAMMA = 0.99  # A.3
 # The first four are half of all combinations, in which each pair of values meets once; pushing had higher returns with
 # more episodes and larger torques, and the last two go further that way.
@@ -56,7 +60,15 @@ SETTINGS: dict[str, list[dict[str, float]]] = {
         {"target_kl": 0.03, "episodes": 80, "std": 0.37},
         {"target_kl": 0.03, "episodes": 200, "std": 0.37},
     ],
-}  # episodes: per update; std: of the actions, at first
+    "sac": [
+        {"learning_rate": 3e-4, "episodes": 20, "updates": 0.25},
+        {"learning_rate": 3e-4, "episodes": 40, "updates": 1},
+        {"learning_rate": 1e-3, "episodes": 20, "updates": 1},
+        {"learning_rate": 1e-3, "episodes": 40, "updates": 0.25},
+        {"learning_rate": 3e-4, "episodes": 20, "updates": 1},
+        {"learning_rate": 1e-3, "episodes": 40, "updates": 1},
+    ],
+}  # episodes: per update, of SAC side by side; std: of the actions, at first; updates: per step of the environment
 MINIBATCH = 250  # steps; of PPO, and of TRPO's value function
 STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 600_000}  # of the environment, by each seed
 SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v1": 200_000}  # by each configuration
@@ -168,12 +180,18 @@ def vectorised(episodes: Episodes) -> Any:
 def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
     """The library's algorithm with a configuration of the search; what is not named here is the library's default."""
     from sb3_contrib import TRPO
-    from stable_baselines3 import PPO
+    from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.vec_env import VecNormalize
 
-    special = {name: value for name, value in setting.items() if name not in ("episodes", "std")}
-    network = dict(net_arch=[64, 64], activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
+    special = {name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")}
+    network: dict[str, Any] = dict(net_arch=[64, 64], activation_fn=torch.nn.ReLU)
     arms = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
+    if algorithm == "sac":
+        return SAC(
+            "MlpPolicy", VecNormalize(arms, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
+            gradient_steps=max(1, round(setting["updates"] * setting["episodes"])), **special,
+        )  # fmt: skip
+    network["log_std_init"] = math.log(setting["std"])
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
         "MlpPolicy", VecNormalize(arms, gamma=GAMMA), n_steps=horizon(env), batch_size=MINIBATCH, gamma=GAMMA,
         policy_kwargs=network, seed=seed, device="cpu", **special,
@@ -285,7 +303,7 @@ def search(table: Table, env: str, algorithm: str, *, steps: int) -> dict[str, f
 def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     found.add_argument("--env", choices=ENVS, help="one task instead of both")
-    found.add_argument("--algorithm", choices=ALGORITHMS, help="one instead of both")
+    found.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=GRADIENTS, help="default ppo and trpo")
     found.add_argument("--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})")
     found.add_argument("--seeds", type=int, default=3, help="0, 1, ... (default 3)")
     found.add_argument("--records", type=int, default=RECORDS, help=f"along each curve (default {RECORDS})")
@@ -304,7 +322,7 @@ def main(given: list[str] | None = None) -> None:
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     table = Table(arguments.out)
     pairs = list(itertools.product([arguments.env] if arguments.env else ENVS,
-                                   [arguments.algorithm] if arguments.algorithm else ALGORITHMS))  # fmt: skip
+                                   arguments.algorithm))  # fmt: skip
     steps = {env: arguments.steps or STEPS[env] for env in ENVS}
     tried = {env: min(steps[env], SEARCH_STEPS[env]) for env in ENVS}
     best = {(env, algorithm): search(table, env, algorithm, steps=tried[env]) for env, algorithm in pairs}

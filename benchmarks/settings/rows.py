@@ -17,9 +17,12 @@ search spaces, beside held-out torques and those of the prior, and the signal of
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.
 
-rounds: of exploration on the pendulum, by own plans and as many random episodes; adaptation: shipped models adapted to
-the arm with 70 % of the torque, in every way, from --episodes, and one trained on it in full (10_explore). Neither asks
-for --envs.
+rounds: of exploration on --envs, by default the pendulum, by each of --data: own plans, as many random episodes, or no
+new ones (the same training alone). What was trained stays in the run's folder, where a loop that was killed goes on.
+adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
+reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
+beside them, in the files that are named: mbrl-lib's loop (benchmarks/peers) in 10_explore, policies without a model
+(benchmarks/model_free) as 10_model_free.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
@@ -34,14 +37,13 @@ from pathlib import Path
 import pandas as pd
 
 from tsmlib import study
-from tsmlib.envs import variant
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, notebooks, parameters, rounds, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
-from tsmlib.study.results import action_prior, planning
+from tsmlib.study.results import action_prior, exploration, planning
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import RESULTS
 
@@ -50,6 +52,8 @@ NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
     "latent": "04_latent", "torques": "07_action_prior", "rounds": "10_explore", "adaptation": "10_explore",
 }  # fmt: skip
+WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
+WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -107,14 +111,45 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     return rows
 
 
-def adapted(run: runs.Run, models: list[str], episodes: list[int]) -> list[Row]:
-    """Rows of 10_explore.csv: of shipped models, adapted to a weaker arm; zero-shot whatever the episodes are."""
-    env, rows = variant("tsm/Reacher-v0", torque_gain=0.7), list[Row]()
-    for word in models:
-        for way in (*adaptation.ways(word), adaptation.REFERENCE):
+def adapted(run: runs.Run, models: list[str], envs: list[str], ways: list[str], episodes: list[int]) -> list[Row]:
+    """Rows of 10_explore.csv: of shipped models, adapted to changed arms; zero-shot whatever the episodes are."""
+    rows = list[Row]()
+    for env, word in product(envs, models):
+        for way in (way for way in (*adaptation.ways(word), adaptation.REFERENCE) if way in ways):
             for n in episodes[:1] if way in ("zero-shot", adaptation.REFERENCE) else episodes:
                 rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
     return rows
+
+
+def wanted_rounds(parser: argparse.ArgumentParser, given: argparse.Namespace) -> list[tuple[str, str, str]]:
+    """Environment, model and data of every loop; ends the command where a model does not explore there."""
+    for env, word in (pairs := list(product(given.envs or [rounds.PENDULUM], given.models))):
+        try:
+            rounds.require(env, word)
+        except ValueError as error:
+            parser.error(str(error))
+    return [(env, word, data) for env, word in pairs for data in given.data]
+
+
+def wanted_arms(parser: argparse.ArgumentParser, given: argparse.Namespace) -> list[str]:
+    """Changed arms; ends the command where an arm has nothing to change, or a model does not ship or adapt."""
+    try:
+        arms = [adaptation.changed(arm, word) for arm in given.envs or [WEAK[0]] for word in given.variants]
+        for arm, word in product(arms, given.models):
+            adaptation.require(arm, word)
+    except ValueError as error:
+        parser.error(str(error))
+    return arms
+
+
+def published_peers(files: list[Path]) -> None:
+    """Rows of other libraries, from the tables that benchmarks/peers and benchmarks/model_free wrote."""
+    rows = tables.frame(pd.concat([tables.load(path) for path in files]))
+    loops, policies = rows[rows["execution"] == "closed loop"], rows[rows["execution"] == "policy"]
+    if len(loops):
+        publish("10_explore", loops)
+    if len(policies):  # whole: a learner's steps may have been others before
+        tables.save(RESULTS / "10_model_free.csv", policies)
 
 
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
@@ -129,22 +164,38 @@ def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: li
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies"))
-    parser.add_argument("--envs", nargs="+", default=[], choices=ENV_IDS, metavar="ENV")
+    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "peers"))
+    parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
+    parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, rounds.PENDULUM), metavar="ENV")
     parser.add_argument("--models", nargs="+", default=[], choices=zoo.words(), metavar="MODEL")
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
+    parser.add_argument("--data", nargs="+", default=exploration.DATA[:2], choices=exploration.DATA, help="of rounds")
+    parser.add_argument("--variants", nargs="+", default=[WEAK[1]], choices=adaptation.VARIANTS, metavar="VARIANT",
+                        help=f"of the arm that is adapted to (default {WEAK[1]})")  # fmt: skip
+    parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="of adaptation (default all)")
     parser.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
     parser.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
     parser.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
+    if bool(given.files) != (given.part == "peers") or not all(path.is_file() for path in given.files):
+        missing = [str(path) for path in given.files if not path.is_file()]
+        parser.error(f"peers, and nothing else, takes tables that are there; got {missing or given.files or 'none'}")
+    if given.part == "peers":
+        published_peers(given.files)
+        manifest.write_manifest(Path(RESULTS).parent)
+        return
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
     if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
+    if rounds.PENDULUM in given.envs and given.part != "rounds":
+        parser.error(f"{given.part} takes no {rounds.PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
+    if min(given.episodes) < 2:
+        parser.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part in ("predict", "ablations"):
@@ -155,11 +206,11 @@ def main() -> None:
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":
-        sizes = rounds.SIZES[run.scale]
-        loops = list(product(given.models, (False, True)))
-        publish(notebook, [row for word, random in loops for row in rounds.loop(run, word, sizes, random=random)])
+        for env, word, data in wanted_rounds(parser, given):
+            publish(notebook, rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds")))
     elif given.part == "adaptation":
-        publish(notebook, adapted(run, given.models, given.episodes))
+        for env in wanted_arms(parser, given):
+            publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))
     elif given.part == "gradients":
         starts = [study.load_task(env).take(2) for env in given.envs]
         publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])

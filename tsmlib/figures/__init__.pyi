@@ -39,6 +39,7 @@ from .prediction import against_horizon as against_horizon
 from .prediction import calibration as calibration
 from .prediction import differences as differences
 from .prediction import figure5 as figure5
+from .prediction import training_time as training_time
 from .robustness import advantage_map as advantage_map
 from .robustness import filtering_errors as filtering_errors
 from .robustness import imperfect_episode as imperfect_episode

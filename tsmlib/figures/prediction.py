@@ -71,6 +71,39 @@ def figure5(
 
 
 @styled
+def training_time(
+    curves: Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]], *, ships: float | None = None
+) -> Figure:
+    """Measures against the time that training took, one panel each, both axes logarithmic; one training a mark.
+
+    curves: title -> method -> seconds (k,) and values (k,), positive; ships: the seconds that shipped models took, a
+    dashed line.
+    """
+    figure, grid = panels(len(curves), 4, 1.6)
+    look_of = axes.looks(curves)
+    for ax, (title, lines) in zip(grid, curves.items(), strict=True):
+        every: list[float] = []
+        for method, (seconds, values) in lines.items():
+            seconds = finite(f"seconds of {title}, {method.label}", seconds, "k")
+            values = finite(f"values of {title}, {method.label}", values, f"{len(seconds)}")
+            ax.plot(seconds, values, **look_of[method] | {"ms": 4}, zorder=3)
+            every += seconds.tolist()
+        low, high = min(line.get_ydata().min() for line in ax.lines), max(line.get_ydata().max() for line in ax.lines)
+        axes.log_axis(ax, low / 1.15, high * 1.15)
+        ax.set(title=title, xscale="log", xlim=(min(every) / 1.3, max(every) * 1.3))
+        ax.set_xticks(sorted(set(every)), [axes.spell(value) for value in sorted(set(every))])
+        ax.minorticks_off()
+        if ships is not None:
+            ax.axvline(ships, color=DARK, ls=DASHED, lw=0.7, zorder=1)
+    for ax in grid[-4:]:
+        ax.set_xlabel("training (s)")
+    handles = axes.entries(look_of, ms=4)
+    if ships is not None:
+        handles.append(entry("as shipped", color=DARK, ls=DASHED, lw=0.7))
+    return axes.finish(figure, [grid], handles, 6)
+
+
+@styled
 def against_horizon(
     curves: Panels, ylabel: str | Mapping[str, str], *, log: Collection[str] = (),
     reference: Mapping[str, float] | None = None, columns: int = 3, yours: Panels | None = None,

@@ -1,5 +1,6 @@
 from .comparison import evidence as evidence
 from .comparison import evidence_of as evidence_of
+from .comparison import published as published
 from .comparison import save_evidence as save_evidence
 from .data import SPLITS as SPLITS
 from .data import TASK_SEED as TASK_SEED

@@ -14,6 +14,8 @@ import time
 from collections.abc import Mapping
 from typing import Literal, NamedTuple, cast
 
+from tsmlib.envs import variant
+from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import Scores, score
 from tsmlib.fine_tuning import Part, fine_tune
@@ -36,6 +38,10 @@ REFERENCE: Reference = results.REFERENCE
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
 EPISODES = (5, 20, 80)  # of the changed arm
+VARIANTS: Mapping[str, Changes] = {  # of an arm; those of the mass only where there is something to push
+    "standard": {}, "mass0.5": {"mass": 0.5}, "mass2": {"mass": 2.0}, "damping0.5": {"damping": 0.5},
+    "damping2": {"damping": 2.0}, "links0.12x0.11": {"link_lengths": (0.12, 0.11)}, "gain0.7": {"torque_gain": 0.7},
+}  # fmt: skip
 FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen
 
 
@@ -60,6 +66,20 @@ BUDGETS: Mapping[str, TuningBudget] = {
 def ways(word: str) -> tuple[Way, ...]:
     """The ways of a model: without codes there are none to fit."""
     return tuple(way for way in WAYS if way in ("zero-shot", "scratch") or way in BUDGETS[word].lr)
+
+
+def changed(arm: str, word: str) -> str:
+    """An arm as one of VARIANTS; ValueError naming those that there are, and where it has nothing to change."""
+    if word not in VARIANTS:
+        raise ValueError(f"no variant is called {word!r:.80}; there are {', '.join(VARIANTS)}")
+    return variant(arm, **VARIANTS[word])
+
+
+def require(env: str, word: str) -> None:
+    """ValueError where a model is not adapted, or none of the standard arm ships; naming those that there are."""
+    if word not in BUDGETS:
+        raise ValueError(f"{word!r:.80} is not adapted; there are {', '.join(BUDGETS)}")
+    load_pretrained(word, env=EnvSpec.parse(env).standard.id)
 
 
 def few(env: str, n: int, *, seed: int = 0) -> tuple[Trajectories, Trajectories]:

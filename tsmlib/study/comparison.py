@@ -17,10 +17,14 @@ def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], tabl
     what follows the notebook's name in the table's, ``_rows`` for instance. What is written stays without the column:
     ``tables.save`` and ``publish`` know nothing of it.
     """
-    path = predictions.RESULTS / f"{run.notebook}{table}.csv"
-    published = tables.load(path) if tables.stored(path) else tables.frame([])
     own = predictions.pooled_rows(run, rows, table, whole=False)
-    return _sourced(published, own)
+    return _sourced(published(f"{run.notebook}{table}"), own)
+
+
+def published(table: str) -> pd.DataFrame:
+    """A table that ships; without rows where there is none."""
+    path = predictions.RESULTS / f"{table}.csv"
+    return tables.load(path) if tables.stored(path) else tables.frame([])
 
 
 def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFrame:

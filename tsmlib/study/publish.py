@@ -344,7 +344,7 @@ def results_page() -> str:
     peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
         "pets" in set(predict["model"])
     )
-    pages = robots_page(_shipped("09_your_own")), exploration_page(_shipped("10_explore"))
+    pages = robots_page(_shipped("09_your_own")), exploration_page(_shipped("10_explore"), _shipped("10_model_free"))
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
     return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
@@ -428,8 +428,8 @@ MuJoCo robots and over whole episodes; they were not run here:
 {robots_results.model_free_table()}"""
 
 
-def exploration_page(rows: pd.DataFrame) -> str:
-    """Rounds of exploration and adapted models of 10_explore; empty without rows."""
+def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> str:
+    """Rounds of exploration and adapted models of 10_explore; empty without rows. free: model-free learners, beside."""
     if not len(rows):
         return ""
     seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
@@ -440,10 +440,31 @@ benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made
 starts that no round trains on; steps count the random episodes before the first round.
 
 {exploration_results.rounds_table(rows)}
-
-The arm has lost 30 % of its torque; n test episodes, open loop after ten observed steps, in units of the standard arm.
+{_pushing_rounds(rows, free)}
+The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque. n test episodes, open loop after ten
+observed steps, in units of the standard arm.
 Seeds are of the few episodes and of the updates on them: all begin from the one model that ships.
 
 {exploration_results.ways_table(rows)}
 
 {exploration_results.sentences(rows)}"""
+
+
+def _pushing_rounds(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
+    """The part of that page on the arm that pushes; empty without rows."""
+    if not (found := exploration_results.rounds_table(rows, exploration_results.PUSH)):
+        return ""
+    page = f"""
+The arm that pushes, planned again every ten steps, to the first n frozen targets; "{exploration_results.NONE}" is the
+same training on the first random episodes alone:
+
+{found}
+"""
+    if free is not None and (beside := exploration_results.steps_table(rows, free)):
+        page += f"""
+Environment steps to the same return, means over seeds (of the policy / of the rounds), on the frozen targets; the
+fewest of rounds are their random episodes:
+
+{beside}
+"""
+    return page

@@ -1,22 +1,25 @@
-"""Rounds of exploration on Gymnasium's pendulum, from a few random episodes on: what 10_explore measures.
+"""Rounds of exploration on Gymnasium's pendulum and on the pushing arm: what 10_explore measures.
 
-A learner is a model, with an action prior if it plans over codes. Beside the loop (``explore``) stands the same learner
-on as many random episodes, trained as often.
+A learner is a model, with an action prior if it plans over codes. Beside the loop (``explore``) stand the same learner
+on as many random episodes, and on no new ones, trained as often. What differs between the two robots is a ``World``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tsmlib.collection import collect, collect_random, open_loop
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import make_simulation
+from tsmlib.envs.symmetry import symmetric
 from tsmlib.exploration import ExplorationOptions, Measure, Trainable, explore
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
@@ -26,26 +29,28 @@ from tsmlib.planning.execution import mpc
 from tsmlib.planning.planners import cem
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
+from tsmlib.storage import files
+from tsmlib.storage.files import Json
 from tsmlib.study import zoo
+from tsmlib.study.data import random_data
 from tsmlib.study.results import exploration as results
-from tsmlib.study.results.exploration import HORIZON, PENDULUM
+from tsmlib.study.results.exploration import HORIZON, PENDULUM, PLANNED, PUSH, RANDOM
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
+from tsmlib.study.tasks import draw_task, load_task
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
-LEARNERS: Mapping[str, Mapping[str, Any]] = {  # arguments of the model, beyond the defaults
-    "rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 64},
-}  # fmt: skip
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans
-TESTED = 1000  # seed of the starts that measure, of no round
+TESTED = 1000  # seed of the pendulum's starts that measure, of no round
 
 
 @dataclass(frozen=True)
 class Sizes:
     """Of a loop: random episodes before it, rounds, episodes of each, updates of each training, starts that measure.
 
-    candidates, elites, iterations: of every plan; one is made every ten steps.
+    candidates, elites, iterations: of every plan; one is made every ten steps. before: updates of the model before the
+    first round; prior: updates of each training of the prior; 0: as many as the model has in a round.
     """
 
     first: int
@@ -56,23 +61,26 @@ class Sizes:
     candidates: int
     elites: int
     iterations: int
+    before: int = 0
+    prior: int = 0
 
-    def training(self, past_len: int, future_len: int) -> TrainingOptions:
-        """Of a model or a prior, in every round."""
+    def training(self, past_len: int, future_len: int, *, updates: int = 0, muon: float = 0.0) -> TrainingOptions:
+        """Of a model or a prior, by default in a round."""
+        steps = updates or self.updates
         return TrainingOptions(
-            past_len, future_len, self.updates, batch_size=64, lr=2e-3, warmup=min(20, self.updates),
-            validate_every=max(1, self.updates // 4),
+            past_len, future_len, steps, batch_size=64, lr=2e-3, warmup=min(20, steps), muon=muon,
+            validate_every=max(1, steps // 4),
         )  # fmt: skip
 
-    def options(self, past_len: int) -> ExplorationOptions:
+    def options(self, past_len: int, *, muon: float = 0.0) -> ExplorationOptions:
         """Of ``explore``, for a model that reads as many steps of past."""
         return ExplorationOptions(
-            model=self.training(past_len, 20), prior=self.training(10, 10), rounds=self.rounds,
-            candidates=self.candidates, elites=self.elites, iterations=self.iterations,
+            model=self.training(past_len, 20, muon=muon), prior=self.training(10, 10, updates=self.prior),
+            rounds=self.rounds, candidates=self.candidates, elites=self.elites, iterations=self.iterations,
         )  # fmt: skip
 
 
-SIZES = {  # by scale
+SIZES = {  # of the pendulum, by scale
     "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
     "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
     "paper": Sizes(6, 4, 4, 120, 8, 24, 5, 2),
@@ -93,7 +101,7 @@ def swing_up(n: int, seed: int) -> Task:
 
 def tasks(episodes: int, seed: int) -> Callable[[int], Task]:
     """Round -> its starts."""
-    return lambda k: swing_up(episodes, seed=100_000 * (seed + 1) + 1000 * k)
+    return lambda k: swing_up(episodes, seed=_seed(seed, k))
 
 
 def random_episodes(n: int, seed: int) -> Trajectories:
@@ -132,18 +140,20 @@ def planner(sizes: Sizes, seed: int) -> Planner:
     )  # fmt: skip
 
 
-def measure(sizes: Sizes, seed: int) -> Measure:
-    """Plans from the same starts after every round, and how high random codes of the prior swing the pendulum."""
-    task = swing_up(sizes.starts, seed=TESTED)
+def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
+    """Plans from the same starts after every round; of the pendulum, how high random codes of the prior swing it."""
+    task = world(env).tested(sizes.starts)
 
     def measured(model: DynamicsModel, prior: ActionPrior | None) -> dict[str, float]:
-        trial = mpc(task, model, space_of(prior), planner(sizes, seed))
+        trial = mpc(task, model, space_of(prior, env), planner(sizes, seed))
         assert trial.success is not None
         found = {
             "return_true": float(trial.executed_return.mean()), "gap_absolute": float(trial.gap.abs().mean()),
             "success": float(trial.success.float().mean()),
         }  # fmt: skip
-        if prior is not None:
+        if task.position is not None:
+            found["final_distance"] = float(trial.final_distance.mean())
+        if prior is not None and env == PENDULUM:
             found["highest"] = highest(walks(prior, max(8, sizes.starts)))
         return found
 
@@ -155,9 +165,66 @@ def highest(data: Trajectories) -> float:
     return float(data.states[..., 0].max(1).mean())
 
 
-def space_of(prior: ActionPrior | None) -> SearchSpace:
+def space_of(prior: ActionPrior | None, env: str = PENDULUM) -> SearchSpace:
     """Codes of the prior, or torques where there is none."""
-    return DirectActions(HORIZON, 1, rms=0.6) if prior is None else LatentActions(prior, HORIZON)
+    here = world(env)
+    return DirectActions(HORIZON, here.action_dim, rms=here.rms) if prior is None else LatentActions(prior, HORIZON)
+
+
+@dataclass(frozen=True)
+class World:
+    """What differs between the robots that explore.
+
+    learners: arguments of each model, beyond the defaults; muon: its rate, if any. tested: starts that measure;
+    drawn: (episodes, seed) -> the tasks of a round; random: (episodes, seed) -> what random torques of ``rms`` do.
+    augmented: what a model is trained on, made of its training data.
+    """
+
+    sizes: Mapping[str, Sizes]
+    learners: Mapping[str, Mapping[str, Any]]
+    tested: Callable[[int], Task]
+    drawn: Callable[[int, int], Task]
+    random: Callable[[int, int], Trajectories]
+    action_dim: int
+    rms: float
+    muon: Mapping[str, float]
+    augmented: Callable[[Trajectories], Trajectories] | None = None
+
+
+WORLDS = {
+    PENDULUM: World(
+        SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 64}},
+        tested=lambda n: swing_up(n, seed=TESTED), drawn=swing_up, random=random_episodes, action_dim=1, rms=0.6,
+        muon={},
+    ),
+    # 500 episodes are a tenth of the study's, and all that a loop takes, 750, is less than a tenth of the steps that
+    # the model-free learners take. Hidden sizes are those that make an update of both models equally long.
+    PUSH: World(
+        {
+            "smoke": Sizes(6, 1, 3, 2, 2, 4, 2, 1), "laptop": Sizes(100, 2, 10, 300, 10, 48, 6, 3, 600, 200),
+            "paper": Sizes(500, 5, 50, 2500, 100, 64, 8, 3, 6000, 500),
+        },
+        {"rtsm": {"hidden": 96}, "lstm": {}},
+        tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
+        random=lambda n, seed: random_data(PUSH, n, seed=seed), action_dim=2, rms=0.1,
+        muon={"rtsm": 0.01, "lstm": 0.02}, augmented=symmetric,  # as the study trains both
+    ),
+}  # fmt: skip
+
+
+def world(env: str) -> World:
+    """The world of an environment; ValueError naming those that there are."""
+    if env not in WORLDS:
+        raise ValueError(f"no rounds are measured on {env!r:.80}; there are {', '.join(WORLDS)}")
+    return WORLDS[env]
+
+
+def require(env: str, word: str) -> World:
+    """The world of an environment; ValueError where there is none, or a model does not explore it."""
+    here = world(env)
+    if word not in here.learners:
+        raise ValueError(f"{word!r:.80} does not explore {env}; there are {', '.join(here.learners)}")
+    return here
 
 
 class Learner(NamedTuple):
@@ -169,43 +236,71 @@ class Learner(NamedTuple):
     held_out: Trajectories
 
 
-def learner(word: str, sizes: Sizes, seed: int) -> Learner:
-    """One of LEARNERS as a loop begins."""
-    train, held_out = divided(random_episodes(sizes.first, 1000 * seed))  # episode i is of seed + i
-    made_for = cast(type[RecurrentTSM], zoo.find(word).load())
-    model = made_for.for_data(train, seed=seed, **LEARNERS[word])
+def learner(word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None) -> Learner:
+    """One of a world's learners as a loop begins; a training that was stopped goes on from ``folder``."""
+    here = require(env, word)
+    train, held_out = divided(here.random(sizes.first, 1000 * seed))  # the pendulum's episode i is of seed + i
+    made_for = cast(type[RecurrentTSM], zoo.find(word).load())  # what is used here of one, all have
+    model = made_for.for_data(train, seed=seed, **here.learners[word])
     prior = None if word in WITHOUT_PRIOR else ActionPrior.for_data(train, seed=seed, channels=16)
-    _train(model, prior, train, held_out, sizes, seed)
+    kept = {name: None if folder is None else folder / f"{name}.checkpoint" for name in ("prior", "model")}
+    if prior is not None:
+        how = sizes.training(10, 10, updates=sizes.prior)
+        fit(prior, prior.loss, train, held_out, how, seed=seed, checkpoint=kept["prior"])
+    how = sizes.training(model.past_len, 20, updates=sizes.before, muon=here.muon.get(word, 0.0))
+    data = train if here.augmented is None else here.augmented(train)
+    fit(model, model.loss, data, held_out, how, seed=seed, checkpoint=kept["model"])
     return Learner(model, prior, train, held_out)
 
 
-def _train(
-    model: nn.Module, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories, sizes: Sizes, seed: int
-) -> None:
-    options = sizes.options(cast(RecurrentTSM, model).past_len)
-    if prior is not None and options.prior is not None:
-        fit(prior, prior.loss, train, held_out, options.prior, seed=seed)
-    fit(model, cast(RecurrentTSM, model).loss, train, held_out, options.model, seed=seed)
+def loop(
+    run: Run, word: str, *, env: str = PENDULUM, data: str = PLANNED, sizes: Sizes | None = None,
+    folder: Path | None = None,
+) -> list[Row]:  # fmt: skip
+    """Rows of a learner's rounds, round 0 before them.
+
+    data: its own plans, or one of the other ``results.DATA`` in their place. sizes: by default the world's at the run's
+    scale. Given a ``folder``, a loop that was killed goes on from there with the same bits, and loops of the same
+    learner on other data begin with what was trained and measured before round 1.
+    """
+    if data not in results.DATA:
+        raise ValueError(f"data is {data!r:.80}; expected one of {', '.join(results.DATA)}")
+    here, seed = world(env), run.seed
+    sizes = sizes or here.sizes[run.scale]
+    own = None if folder is None else folder / (env if env == PENDULUM else EnvSpec.parse(env).name) / word
+    model, prior, train, held_out = learner(word, sizes, seed, env, own)
+    measured, began = measure(sizes, seed, env), len(train) + len(held_out)
+    options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0))
+
+    def new(k: int) -> Trajectories | None:
+        return here.random(sizes.episodes, _seed(seed, k)) if data == RANDOM else None
+
+    zero = _once(None if own is None else own / "round-0.json", {"sizes": asdict(sizes), "seed": seed},
+                 lambda: dict(measured(model, prior)))  # fmt: skip
+    found = explore(
+        model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
+        options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
+        progress=f"{env} {word}: {data}", measure=measured, augmented=here.augmented,
+        episodes=None if data == PLANNED else new, folder=None if own is None else own / data.replace(" ", "-"),
+    )  # fmt: skip
+    records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **zero}, *found.records]
+    return results.round_rows(
+        run, word, records, sizes.starts, first=began * HORIZON, env=env, data=data,
+        space="direct" if prior is None else "latent",
+    )  # fmt: skip
 
 
-def loop(run: Run, word: str, sizes: Sizes, *, random: bool = False) -> list[Row]:
-    """Rows of a learner's rounds, round 0 before them; random: on as many random episodes, in place of its plans."""
-    model, prior, train, held_out = learner(word, sizes, run.seed)
-    measured, began = measure(sizes, run.seed), len(train) + len(held_out)
-    records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **measured(model, prior)}]
-    if random:
-        for k in range(1, sizes.rounds + 1):
-            new = random_episodes(sizes.episodes, seed=100_000 * (run.seed + 1) + 1000 * k)
-            train, held_out = train.joined(new.take(slice(1, None))), held_out.joined(new.take(slice(1)))
-            _train(cast(nn.Module, model), prior, train, held_out, sizes, 1000 * run.seed + k)
-            steps = k * sizes.episodes * HORIZON
-            records.append({"round": k, "env_steps": steps, **measured(model, prior)})
-    else:
-        options = sizes.options(model.past_len)
-        options = options if prior else replace(options, prior=None)
-        found = explore(
-            model, prior, train, held_out, tasks(sizes.episodes, run.seed), options,
-            seed=run.seed, progress=f"{PENDULUM} {word}", measure=measured,
-        )  # fmt: skip
-        records += found.records
-    return results.round_rows(run, word, records, sizes.starts, first=began * HORIZON, random=random)
+def _seed(seed: int, k: int) -> int:
+    """Of the tasks, or the random episodes, of round k."""
+    return 100_000 * (seed + 1) + 1000 * k
+
+
+def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], dict[str, float]]) -> dict[str, float]:
+    """What ``make`` gives, kept in a file: the same the next time, if it was made from the same."""
+    if path is None:
+        return make()
+    if path.exists() and (kept := cast(dict[str, Any], files.loads(path.read_bytes())))["made from"] == made_from:
+        return kept["found"]
+    found = make()
+    files.write_bytes(path, files.dumps(path, {"made from": made_from, "found": cast(Json, found)}).encode())
+    return found

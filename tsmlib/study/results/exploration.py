@@ -1,8 +1,8 @@
 """Results of 10_explore: rows of rounds of exploration and of adapted models; panels, tables and sentences from rows.
 
 Rounds are ``closed loop``; ``iteration`` is the round, ``env_steps`` were executed until then, random ones included,
-and ``configuration`` says whose episodes were learned from. Adapted models are ``open loop``; ``env_steps`` are those
-of the changed arm that they know, and ``configuration`` is the way (``study.adaptation``).
+and ``configuration`` says whose episodes were learned from (DATA). Adapted models are ``open loop``; ``env_steps`` are
+those of the changed arm that they know, and ``configuration`` is the way (``study.adaptation``).
 """
 
 from __future__ import annotations
@@ -22,11 +22,17 @@ from tsmlib.study.results.planning import CLOSED, OPEN
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 
-PENDULUM, HORIZON = "Pendulum-v1", 100
-PLANNED, RANDOM = "own plans", "random episodes"
+PENDULUM, PUSH, HORIZON = "Pendulum-v1", "tsm/ReacherPush-v1", 100
+TASKS = {PENDULUM: "swing up", PUSH: "push"}
+PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
+DATA = (PLANNED, RANDOM, NONE)  # of each round; the last is training alone
 REFERENCE: Final = "reference"
-ROUNDS = {"return_true": "executed return", "gap_absolute": "size of the gap", "success": "share upright",
-          "highest": "highest by random codes"}  # fmt: skip
+_BOTH = {"return_true": "executed return", "gap_absolute": "size of the gap"}
+ROUNDS = {
+    PENDULUM: {**_BOTH, "success": "share upright", "highest": "highest by random codes"},
+    PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
+}
+MODEL_FREE = ("ppo", "trpo", "sac")
 SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
 WAYS = {
     "zero-shot": Look("zero-shot", "#7A7A7A", "o"), "all": Look("all weights", "#003C8F", "*"),
@@ -40,20 +46,25 @@ WAYS = {
 
 
 def round_rows(
-    run: Run, word: str, records: Sequence[Mapping[str, float]], n: int, *, first: int, random: bool = False
-) -> list[Row]:
-    """What was measured on ``n`` starts after each round. first: environment steps before round 1."""
+    run: Run, word: str, records: Sequence[Mapping[str, float]], n: int, *, first: int, env: str = PENDULUM,
+    data: str = PLANNED, space: str = "latent",
+) -> list[Row]:  # fmt: skip
+    """What was measured on ``n`` starts after each round.
+
+    first: environment steps before round 1; data: one of DATA; space: that is searched.
+    """
     common = dict(
-        env=PENDULUM, task="swing up", model=word, planner="cem", horizon=HORIZON, execution=CLOSED, n=n,
-        search_space="latent" if "highest" in records[0] else "direct", configuration=RANDOM if random else PLANNED,
-        seed=run.seed, scale=run.scale,
+        env=env, task=TASKS[env], model=word, planner="cem", horizon=HORIZON, execution=CLOSED, n=n, search_space=space,
+        configuration=data, seed=run.seed, scale=run.scale,
     )  # fmt: skip
+    if env != PENDULUM:
+        common["sim"] = EnvSpec.parse(env).simulator
     return [
         common | dict(
             iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
             value=float(record[metric]),
         )
-        for record in records for metric in ROUNDS if metric in record
+        for record in records for metric in ROUNDS[env] if metric in record
     ]  # fmt: skip
 
 
@@ -76,11 +87,16 @@ def adapted_rows(
 # Panels --------------------------------------------------------------------------------------------------------------
 
 
-def round_panels(rows: pd.DataFrame, titles: Sequence[str]) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
-    """Title of ROUNDS -> learner -> environment steps (R,) and values (k, R), for ``figures.rounds``."""
+def round_panels(
+    rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM
+) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
+    """Title of ROUNDS -> learner -> environment steps (R,) and values (k, R), for ``figures.rounds``.
+
+    Without those that take no steps.
+    """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
-    rounds = table.select(rows, execution=CLOSED)
-    for metric, title in ROUNDS.items():
+    rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM])
+    for metric, title in ROUNDS[env].items():
         for (word, space, data), own in table.groups(
             table.select(rounds, metric=metric), ["model", "search_space", "configuration"]
         ):
@@ -109,17 +125,49 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 
 @table.sourced
-def rounds_table(rows: pd.DataFrame) -> pd.DataFrame:
+def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
     """A line for each learner and round."""
     lines = []
     keys = ["model", "configuration", "iteration"]
-    for (word, data, k), own in table.groups(table.select(rows, execution=CLOSED), keys):
+    for (word, data, k), own in table.groups(table.select(rows, env=env, execution=CLOSED), keys):
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{int(own['env_steps'].max()):,}"}
-        for metric, title in ROUNDS.items():
+        for metric, title in ROUNDS[env].items():
             values = table.select(own, metric=metric)["value"]
             line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
         lines.append({**line, "n": int(own["n"].max())})
     return pd.DataFrame(lines)
+
+
+def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
+    """Environment steps of rounds to the final return of each model-free learner, and of that learner to the last
+    round's; means over seeds. Empty where either has no rows.
+
+    free: learning curves of ``benchmarks/model_free``. "-" for a return that was not reached.
+    """
+    if not (len(rows) and len(free)):
+        return ""
+    rounds = table.select(rows, env=env, execution=CLOSED, configuration=PLANNED, metric="return_true")
+    learned = table.select(free, env=env, planner="policy", subset="", metric="return_true")
+    lines = []
+    for policy, theirs in table.groups(table.select(learned, model=MODEL_FREE), "model"):
+        curve = theirs.groupby("env_steps")["value"].mean()
+        for word, ours in table.groups(rounds, "model"):
+            own = ours.groupby("env_steps")["value"].mean()
+            taken, end = _steps_to(own, curve.iloc[-1]), float(curve.index[-1])
+            lines.append({
+                "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{curve.iloc[-1]:.2f}",
+                "rounds of": f"`{word}`", "steps to that return": "-" if taken is None else f"{taken:,.0f}",
+                "share": "-" if taken is None else f"{taken / end:.1%}", "return after the last": f"{own.iloc[-1]:.2f}",
+                "steps of the policy to it": "-" if (t := _steps_to(curve, own.iloc[-1])) is None else f"{t:,.0f}",
+                "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
+            })  # fmt: skip
+    return table.markdown(pd.DataFrame(lines))
+
+
+def _steps_to(curve: pd.Series, level: float) -> float | None:
+    """The first steps at which a curve has come to a level, None if it never does."""
+    there = curve.index[curve >= level]
+    return float(there[0]) if len(there) else None
 
 
 @table.sourced
@@ -141,14 +189,16 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
 def sentences(rows: pd.DataFrame) -> Iterator[str]:
     """What the rounds changed, learner by learner; how much of the zero-shot error each way leaves, and how much of
     what the reference takes off it."""
-    for (word, data), own in table.groups(table.select(rows, execution=CLOSED), ["model", "configuration"]):
+    keys = ["env", "model", "configuration"]
+    for (env, word, data), own in table.groups(table.select(rows, execution=CLOSED), keys):
         first, last = own["iteration"].min(), own["iteration"].max()
         means = own.groupby(["metric", "iteration"])["value"].mean()
         said = [
             f"{title} {means[metric, first]:.2f} -> {means[metric, last]:.2f}"
-            for metric, title in ROUNDS.items() if metric in means
+            for metric, title in ROUNDS[env].items() if metric in means
         ]  # fmt: skip
-        yield f"`{word}` on {data}, round {first} -> {last}: {', '.join(said)}."
+        where = "" if env == PENDULUM else f"`{env}`, "
+        yield f"{where}`{word}` on {data}, round {first} -> {last}: {', '.join(said)}."
     last_steps = table.select(rows, execution=OPEN, metric="energy_score_noise")
     last_steps = last_steps[last_steps["steps_ahead"] == last_steps["steps_ahead"].max()]
     for (env, word), own in table.groups(last_steps, ["env", "model"]):

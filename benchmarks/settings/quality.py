@@ -1,0 +1,184 @@
+"""Quality of trained models against the time that training took: predictions, plans and physical violations.
+
+    python benchmarks/settings/quality.py measure runs/paper/seed0/settings/ReacherPush/*.safetensors
+    python benchmarks/settings/quality.py table
+    python benchmarks/settings/quality.py figure
+
+measure adds a line to quality.csv for each file, trained by ``budgets.py`` or shipped (``data/pretrained``); a line
+that is there already is not made again. Of a recurrent TSM with several decoders it measures the first alone, so that
+all lines are of one network. Nothing is taken from the test split:
+
+    energy, nrmse   10 and 80 steps ahead and the mean over 90, of 200 fresh episodes, 32 samples of each; residual
+                    noise is fitted on the validation split
+    cost            minus the executed return of plans for the validation targets: cross-entropy method over codes of
+                    the prior, 96 candidates x 10, judged by the mode, open loop, planner seed 0
+    gap             mean size of predicted minus executed return, predicted by 32 samples that had no part in planning
+    violations      share of those samples' steps that violate physics
+
+table prints the lines as Markdown, with what a doubling of the time buys: the slope of log value over log time between
+the last two lines of a model. figure draws them into figures/training_time.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pandas as pd
+import torch
+
+from tsmlib import study
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.evaluation import exploitation, prediction
+from tsmlib.figures import prediction as drawings
+from tsmlib.figures import style
+from tsmlib.models.base import DynamicsModel
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.planning.execution import execute
+from tsmlib.planning.planners import cem, reevaluate
+from tsmlib.planning.predictors import fresh_predictor, model_predictor
+from tsmlib.planning.search_spaces import LatentActions
+from tsmlib.storage import artifacts
+from tsmlib.study import runs, zoo
+from tsmlib.study.data import dataset, random_data
+from tsmlib.study.models import load_prior
+from tsmlib.study.results import table
+
+HERE = Path(__file__).resolve().parent
+FRESH_SEED = 2_000_004  # of episodes that no training, choice or published score has seen
+MEASURES = {  # column -> title and unit; of each a smaller value is better
+    "energy_10": "energy score, 10 steps", "energy_80": "energy score, 80 steps", "energy": "energy score, mean",
+    "nrmse_10": "nRMSE, 10 steps", "nrmse_80": "nRMSE, 80 steps", "cost": "cost of plans (m)", "gap": "gap (m)",
+    "violations": "physical violations (share of steps)",
+}  # fmt: skip
+KEY = ["env", "model", "seed", "seconds", "muon"]
+
+
+def described(path: Path) -> dict[str, object]:
+    """What the header of a model says of its training; seconds are nominal, of its stages on the reference machine."""
+    header = artifacts.read_header(path)
+    env = header["fingerprint"]["env"]
+    whole = zoo.find(header["model"]).schedule(EnvSpec.parse(env))
+    schedule = zoo.stated(header.get("schedule", [stage.stated() for stage in whole]))
+    share = schedule[0]["steps"] / whole[0].steps
+    curves = list(header["curves"].values())[: len(schedule)]  # of the first decoder
+    return {
+        "env": env, "model": header["model"], "seed": header["seed"],
+        "seconds": round(share * zoo.BUDGET[EnvSpec.parse(env).standard.name]), "muon": schedule[0]["muon"],
+        "updates": sum(curve["step"][-1] for curve in curves),
+        "cpu_seconds": round(sum(curve["seconds"][-1] for curve in curves)),
+        "validation": min(curves[-1]["validation"]),
+    }  # fmt: skip
+
+
+def predicted(net: DynamicsModel, env: str, n_episodes: int) -> dict[str, float]:
+    """Scores of predictions, of fresh episodes."""
+    run = runs.resolve("03_predict", scale="paper", seed=0)
+    fresh = random_data(env, n_episodes, seed=FRESH_SEED)
+    found = prediction.score(net, net.features, fresh, dataset(run, env, "validation"), samples=32, progress="scores")
+    mean = found.against_horizon()
+    energy, nrmse = mean["energy_score_noise"], mean["nrmse"]
+    return {
+        "energy_10": float(energy[9]), "energy_80": float(energy[79]), "energy": float(energy.mean()),
+        "nrmse_10": float(nrmse[9]), "nrmse_80": float(nrmse[79]), "coverage80": float(mean["coverage80"].mean()),
+    }  # fmt: skip
+
+
+def planned(net: DynamicsModel, env: str, n_targets: int) -> dict[str, object]:
+    """What plans for validation targets cost, predict and violate."""
+    task = study.load_task(env, "validation").take(n_targets)
+    past = task.past(net.past_len)
+    space = LatentActions(load_prior(runs.resolve("05_control", scale="laptop"), env), task.horizon)
+    plan = cem(
+        model_predictor(net, past), task.reward, space, len(task), candidates=96, elites=9, iterations=10, seed=0
+    )
+    plan = reevaluate(plan, fresh_predictor(net, past, seed=1), task.reward)
+    trial = execute(task, plan)
+    found: dict[str, object] = {
+        "targets": len(task), "cost": -float(trial.executed_return.mean()),
+        "gap": float((plan.predicted_return - trial.executed_return).abs().mean()),
+        "within": float((trial.final_distance < task.tolerance).float().mean()),
+        "violations": float("nan"), "costs": " ".join(f"{-value:.3f}" for value in trial.executed_return.tolist()),
+    }  # fmt: skip
+    if task.name == "push":
+        shares = exploitation.shares(task.start, plan.states.numpy(), env)
+        found["violations"] = float(shares["violations"].mean())
+    return found
+
+
+def measured(path: Path, n_targets: int, n_episodes: int) -> dict[str, object]:
+    """A line of the table."""
+    said = described(path)
+    env = str(said["env"])
+    net = artifacts.load_model(path, zoo.find(str(said["model"])).load())
+    one = net.alone(0) if isinstance(net, RecurrentTSM) else cast(DynamicsModel, net)
+    return said | predicted(one, env, n_episodes) | planned(one, env, n_targets)
+
+
+def doublings(lines: pd.DataFrame) -> pd.DataFrame:
+    """What a doubling of the training time changes, as a share, from each line to the next of the same model."""
+    found = []
+    for (env, model), group in lines.groupby(["env", "model"], sort=False):
+        group = group.sort_values("seconds")
+        for before, after in zip(group.iloc[:-1].itertuples(), group.iloc[1:].itertuples(), strict=True):
+            times = np.log2(after.seconds / before.seconds)
+            ratios = {name: getattr(after, name) / getattr(before, name) for name in MEASURES}
+            changes = {name: ratio ** (1 / times) - 1 for name, ratio in ratios.items()}
+            found.append({"env": env, "model": model, "from": before.seconds, "to": after.seconds} | changes)
+    return pd.DataFrame(found)
+
+
+def tables(lines: pd.DataFrame) -> str:
+    """Both tables, as Markdown."""
+    values, changes = lines.sort_values(["env", "model", "seconds"], kind="stable"), doublings(lines)
+    spelled = values[["model", "seconds", "cpu_seconds", "updates", "muon"]].assign(
+        **{title: values[name].map("{:.3g}".format) for name, title in MEASURES.items()},
+        **{"within 5 cm": values["within"].map("{:.0%}".format)},
+    )
+    if changes.empty:
+        return table.markdown(spelled)
+    each = changes[["model", "from", "to"]].assign(
+        **{title: changes[name].map("{:+.0%}".format) for name, title in MEASURES.items()}
+    )
+    return f"{table.markdown(spelled)}\n\nA doubling of the time changes these by:\n\n{table.markdown(each)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("measure", "table", "figure"))
+    parser.add_argument("files", nargs="*", type=Path, help="trained models")
+    parser.add_argument("--targets", type=int, default=100, help="of validation (default 100)")
+    parser.add_argument("--episodes", type=int, default=200, help="fresh ones, to score predictions of (default 200)")
+    parser.add_argument("--out", type=Path, default=HERE / "quality.csv", help="default quality.csv beside this script")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    if given.what == "measure" and not given.files:
+        parser.error("measure wants files of trained models, such as data/pretrained/ReacherPush/lstm.safetensors")
+    for path in given.files:
+        known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame(columns=KEY)
+        said = described(path)
+        if (known[KEY] == [said[name] for name in KEY]).all(axis=1).any():
+            print(f"{path}: measured already")
+            continue
+        line = measured(path, given.targets, given.episodes)
+        known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame()  # another process may have added some
+        pd.concat([known, pd.DataFrame([line])]).to_csv(given.out, index=False, float_format="%.4g")
+        print({name: value for name, value in line.items() if name != "costs"}, flush=True)
+    if given.what == "table":
+        print(tables(pd.read_csv(given.out)))
+    elif given.what == "figure":
+        lines = pd.read_csv(given.out)
+        curves = {
+            title: {
+                zoo.method(str(model)): (group["seconds"].to_numpy(), group[name].to_numpy())
+                for model, group in lines.sort_values("seconds").groupby("model", sort=False)
+            }
+            for name, title in MEASURES.items()
+        }
+        style.save(drawings.training_time(curves), runs.ROOT / "figures" / "training_time")
+
+
+if __name__ == "__main__":
+    main()
