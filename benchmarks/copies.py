@@ -3,7 +3,9 @@
 A gradient of a training loss, at the batch and the future of the study's schedule, of one model and of --copies with
 weights, windows and noise of their own, put through ``torch.func.vmap`` as one call. Windows are drawn beforehand, and
 the optimiser's step is left out, which costs as much per weight either way. CPU seconds; on --device cuda by the clock.
-Models that step through a backward pass of their own (LSTM, rtsm) have no such form.
+Models that step through a backward pass of their own (LSTM, rtsm) have no such form. Of rtsm it is one step of the
+recurrence instead, with its backward pass by autograd and rows as in each stage: of one model by ``addmm``, and of all
+copies by ``baddbmm`` over stacked weights.
 
     python benchmarks/copies.py        or        python -m tsmlib bench copies
 """
@@ -20,6 +22,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from tsmlib import study
+from tsmlib.models.recurrent import SAMPLES
 from tsmlib.study import runs
 from tsmlib.study.zoo import Updates
 from tsmlib.trajectory import Segment, Window, batches
@@ -82,18 +85,51 @@ def ways(word: str, stage: Updates, copies: int, device: str) -> dict[str, Calla
     return {"one": timed(device, one), "many": timed(device, many)}
 
 
+def step(net: Any, copies: int, rows: int, device: str) -> Callable[[], float]:
+    """A step of a decoder of rtsm and its backward pass, ten times: of one copy, or of several stacked ones."""
+    decoder = net.decoders[0].over(net.features)
+    stack = (copies,) if copies > 1 else ()
+    product: Callable[..., Tensor] = torch.baddbmm if stack else torch.addmm
+    cell, hidden, out = (w.detach().expand(*stack, *w.shape).clone().requires_grad_() for w in
+                         (decoder.cell, decoder.hidden, decoder.out))  # fmt: skip
+    n = cell.shape[-1] // 4
+    given, c = (torch.randn(*stack, rows, size, device=device) for size in (cell.shape[-2], n))
+    given.requires_grad_()
+    zeros = [torch.zeros(size, device=device) for size in (4 * n, hidden.shape[-1], out.shape[-1])]
+
+    def call() -> None:
+        for _ in range(10):
+            for leaf in (cell, hidden, out, given):
+                leaf.grad = None
+            forget, write, read, new = product(zeros[0], given, cell).chunk(4, -1)
+            memory = forget.sigmoid() * c + write.sigmoid() * new.tanh()
+            seen = torch.cat([given[..., : hidden.shape[-2] - n], read.sigmoid() * memory.tanh()], -1)
+            active = nn.functional.silu(product(zeros[1], seen, hidden))
+            product(zeros[2], active, out[..., :-1, :]).sum().backward()
+
+    return timed(device, call)
+
+
 def main() -> None:
     options = parser(__doc__, rounds=7)
-    options.add_argument("--models", default="tsm,onestep,multistep")
+    options.add_argument("--models", default="tsm,onestep,multistep,rtsm")
     options.add_argument("--copies", type=int, default=10)
     options.add_argument("--device", default="cpu")
     arguments = parsed(options)
     rows, copies = [], arguments.copies
     for word in arguments.models.split(","):
         for stage in study.schedule(runs.resolve("bench", scale="laptop"), ENV, word):
-            seconds = interleaved(ways(word, stage, copies, arguments.device), arguments.rounds)
+            what = "a gradient"
+            if word == "rtsm":
+                what, n = "ten steps and back", stage.batch * (1 if stage.loss == "point_loss" else SAMPLES)
+                net = study.initialise(runs.resolve("bench", scale="laptop"), word, study.random_data(ENV, 50, seed=0))
+                net = net.to(arguments.device)
+                both = {"one": step(net, 1, n, arguments.device), "many": step(net, copies, n, arguments.device)}
+            else:
+                both = ways(word, stage, copies, arguments.device)
+            seconds = interleaved(both, arguments.rounds)
             rows.append(Row.of(
-                f"{copies} trainings of {word} as one, {stage.loss}, a gradient: seconds", seconds["many"],
+                f"{copies} trainings of {word} as one, {stage.loss}, {what}: seconds", seconds["many"],
                 "one training", seconds["one"], unit="s", env=ENV, sim="mujoco", task="push", model=word,
                 configuration=stage.loss, metric="seconds",
             ))  # fmt: skip

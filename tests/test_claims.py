@@ -318,6 +318,7 @@ def test_what_is_written_and_what_is_stored_are_what_the_shipped_rows_say() -> N
     again = "what is written of the claims is not what data/results says; run: python -m tsmlib publish --claims"
     assert publish.readme_claims(papers, ours) in publish.README.read_text(), again
     assert publish.claims_page(papers, ours) in publish.CLAIMS_PAGE.read_text(), again
+    assert publish.full_page(papers, ours) in publish.FULL_PAGE.read_text(), again
     shipped = tables_storage.load(evaluate.RESULTS / "08_claims.csv")
     stored = set(shipped[["model", "claim", "verdict", "sha256"]].itertuples(index=False, name=None))
     assert stored == {(v.claim.subject, v.claim.id, v.word, v.claim.sha256) for v in papers + ours}, again
@@ -438,9 +439,57 @@ def test_the_figure_has_a_row_for_every_claim_with_rows() -> None:
     marks = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
     assert len(marks) == 2
     assert all(0 < x < 1 for x in marks)
+    (ticks,) = [line.get_xdata() for line in ax.lines if line.get_marker() == "|"]
+    assert len(ticks) == 3  # a training seed each
+    assert all(0 < x <= 1 for x in ticks)
     nothing = report.margins([evaluate.judge(superiority(LSTM), Tables({}))])
     with pytest.raises(ValueError, match="no claim has rows"):
         figures.claim_margins(nothing)
+
+
+def test_a_claim_in_full_shows_every_seed_of_every_check_and_each_reading() -> None:
+    rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0, q.ll(TSM, REACHER) < 8]), readings=SHARED)
+    rows = [score("tsm", k, 1.0 + 4 * k) for k in range(3)]
+    fair = [score("tsm", k, -1.0 - 0.1 * k, metric="ll_shared") for k in range(3)]
+    verdict = evaluate.judge(rule, frames(of_03_predict=rows + fair))
+    text = report.in_full(verdict, verdict)
+    strips = [line for line in text.splitlines() if "|" in line and "; asked" in line]
+    assert len(strips) == 2
+    for strip in strips:
+        drawn, _, words = strip.partition("  open  ")
+        assert drawn.count("o") == 3  # the middle one hides the mean
+        assert drawn.index("|") == report.HALF
+        assert "5 [-" in words
+    assert strips[0].index("o") > report.HALF  # all seeds lie beyond 0
+    read = [[cell.strip() for cell in line.split("|")[1:3]] for line in text.splitlines() if line.startswith("| ")]
+    assert read[1:] == [["as the paper words it", "inconclusive"], ["A1b one shared variance", "not replicated"]]
+    assert "What would change it: about 10 training seeds that differ as these do" in text
+
+
+def test_seeds_to_decide_are_those_that_put_the_interval_beside_the_margin() -> None:
+    rows = [score("tsm", k, 1.0 + 4 * k) for k in range(3)]
+    (effect,) = evaluate.judge(claim(lambda q: iter([q.ll(TSM, REACHER) > 2])), frames(of_03_predict=rows)).effects[""]
+    n = report.seeds_to_decide(effect)
+    for size, beside in ((n - 1, False), (n, True)):
+        values = np.resize([-1.0, 1.0], size)
+        values = 5 + 4 * (values - values.mean()) / values.std(ddof=1)
+        mean, half = interval(values)
+        assert (mean - half > 2) is bool(beside)
+
+
+@pytest.mark.parametrize(
+    ("tsm", "said"),
+    [
+        ([3.0, 3.1, 3.2], "to the other side of its margin, 3.1 from where it lies on the right one"),
+        ([-3.0, -3.1, -3.2], "to the other side of its margin, 3.1 from where it lies on the wrong one"),
+        ([3.0], "another training seed"),
+        ([], "rows, which are missing"),
+    ],
+)
+def test_what_would_change_a_verdict_is_said(tsm: list[float], said: str) -> None:
+    rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0]))
+    verdict = evaluate.judge(rule, frames(of_03_predict=[score("tsm", k, value) for k, value in enumerate(tsm)]))
+    assert said in report.change(verdict)
 
 
 def test_two_random_effects_cover_the_mean_where_seeds_alone_do_not() -> None:

@@ -42,6 +42,18 @@ def test_tables_ship_with_the_rows_of_every_seed_and_all_their_columns(tmp_path:
         assert ("dimension" in rows) == (notebook == "04_latent")
 
 
+def test_publishing_compresses_a_large_table_once_and_changes_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publish, "RESULTS", tmp_path)
+    rows = tables_storage.save(tmp_path / "05_control_rows.csv", rows_of(**{"Reacher-v0": [0]}).drop(columns="source"))
+    manifest.write_manifest(tmp_path)
+    monkeypatch.setattr(tables_storage, "LARGE", 10)
+    publish.compress()
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["05_control_rows.csv.gz", "MANIFEST.json"]
+    assert tables_storage.load(tmp_path / "05_control_rows.csv").equals(rows)
+
+
 def test_a_seed_that_did_not_come_to_its_end_stops_publishing(tmp_path: Path) -> None:
     run = seed(tmp_path, 0)
     seed(tmp_path, 1, state="failed")

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import tsmlib
-from tsmlib.storage import manifest
+from tsmlib.storage import manifest, tables
 from tsmlib.study.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -43,6 +43,13 @@ def test_the_lock_covers_every_dependency() -> None:
     locked = pins() | pins("docs/requirements.lock")
     assert names <= {name.lower().replace("_", "-") for name in locked}
     assert not pins().keys() & pins("docs/requirements.lock").keys()
+
+
+def test_what_ships_is_small_and_large_tables_are_compressed() -> None:
+    sizes = {path: path.stat().st_size for path in (ROOT / "data").rglob("*") if path.is_file()}
+    assert sum(sizes.values()) < 35e6
+    large = [path.name for path in sizes if path.suffix == ".csv" and sizes[path] > tables.LARGE]
+    assert not large, "python -m tsmlib publish --claims"
 
 
 def test_version_and_licence_are_stated_once_and_alike() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import json
 import os
 import pickle
@@ -324,6 +325,58 @@ def test_a_header_that_is_not_json_is_refused(saved: Path) -> None:
         with pytest.raises(StoreError, match=r"thing\.safetensors cannot be written"):
             artifacts.save(saved, {"a": torch.ones(1)}, kind="thing", header=header)
     assert saved.read_bytes() == before
+
+
+def test_a_compressed_table_is_the_same_table_and_the_same_bytes_at_any_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [{"metric": "success", "value": 0.1, "seed": seed} for seed in range(50)]
+    plain = tables.save(tmp_path / "t.csv", rows)
+    text = (tmp_path / "t.csv").read_bytes()
+    tables.save(tmp_path / "a.csv.gz", rows)
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    tables.save(tmp_path / "b.csv.gz", rows)
+    packed = (tmp_path / "a.csv.gz").read_bytes()
+    assert packed == (tmp_path / "b.csv.gz").read_bytes()
+    assert gzip.decompress(packed) == text
+    assert tables.load(tmp_path / "a.csv.gz").equals(plain)
+    assert tables.load(tmp_path / "b.csv").equals(plain)  # by the name that the notebooks use
+
+
+def test_a_table_ships_in_one_form_alone_whichever_its_size_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, rows = tmp_path / "t.csv", [{"metric": "success", "value": 0.1, "seed": seed} for seed in range(50)]
+    for large, name in ((100, "t.csv.gz"), (10_000, "t.csv"), (100, "t.csv.gz")):
+        monkeypatch.setattr(tables, "LARGE", large)
+        assert tables.ship(path, rows).equals(tables.load(path))
+        assert [each.name for each in tmp_path.iterdir()] == [name]
+        assert tables.stored(path) == tmp_path / name
+    other = gzip.compress(gzip.decompress((tmp_path / "t.csv.gz").read_bytes()), 1)
+    (tmp_path / "t.csv.gz").write_bytes(other)
+    tables.ship(path, rows)
+    assert (tmp_path / "t.csv.gz").read_bytes() == other  # packed otherwise, and the same table
+    path.write_bytes(gzip.decompress(other))
+    with pytest.raises(StoreError, match=r"t\.csv is there compressed as well"):
+        tables.load(path)
+
+
+def test_a_compressed_table_that_is_cut_changed_or_too_large_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "t.csv.gz"
+    tables.save(path, [{"metric": "success", "value": 0.1, "seed": seed} for seed in range(50)])
+    good = path.read_bytes()
+    changed = bytearray(good)
+    changed[len(good) // 2] ^= 1
+    for bad in (b"", good[:-9], bytes(changed), b"env,sim\n"):
+        path.write_bytes(bad)
+        with pytest.raises(StoreError, match=r"t\.csv\.gz"):
+            tables.load(path)
+    path.write_bytes(good)
+    monkeypatch.setattr(files, "UNPACKED", 1000)
+    with pytest.raises(StoreError, match="unpacks to more than 1000 bytes"):
+        tables.load(path)
 
 
 def test_a_table_with_a_wrong_column_or_number_is_refused(tmp_path: Path) -> None:

@@ -16,10 +16,9 @@ from tsmlib.__main__ import main
 from tsmlib.storage import files, manifest
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import parameters, runs, workflow, zoo
-from tsmlib.study.data import HELD_OUT_SEED
+from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import RunError
-from tsmlib.study.tasks import TASK_SEED
 
 HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
 needs_snakemake = pytest.mark.skipif(not HAS_SNAKEMAKE, reason="no Snakemake: pip install 'tsmlib[cluster]'")
@@ -63,6 +62,8 @@ def test_seeds_of_held_out_episodes_and_targets_are_refused(
     assert main(["run", "all", "--scale", "smoke", "--seeds", f"{seed - 1}-{seed}"]) == 2
     assert "draws held-out episodes or targets" in capsys.readouterr().err
     assert not list(place.iterdir())
+    with pytest.raises(ParameterError, match="draws held-out episodes or targets"):  # without a workflow
+        dataset(runs.resolve("01_collect", scale="smoke", seed=seed), "tsm/Reacher-v0", "train")
 
 
 # Steps ---------------------------------------------------------------------------------------------------------------

@@ -73,11 +73,11 @@ def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
-def publish(name: str, rows: Iterable[Row]) -> None:
+def publish(name: str, rows: pd.DataFrame | Iterable[Row]) -> None:
     """Merge rows into a table of data/results."""
     path = RESULTS / f"{name}.csv"
-    table = merged(tables.load(path) if path.exists() else tables.frame([]), rows)
-    tables.save(path, table)
+    table = merged(tables.load(path) if tables.stored(path) else tables.frame([]), rows)
+    tables.ship(path, table)
     print(f"{path.name}: {len(table)} rows")
 
 

@@ -18,21 +18,24 @@ VERDICTS = {  # verdict -> colour
 
 
 @styled
-def claim_margins(claims: Sequence[tuple[str, str, str, np.ndarray]]) -> Figure:
+def claim_margins(claims: Sequence[tuple[str, str, str, np.ndarray, np.ndarray]]) -> Figure:
     """Every effect against its margin, a row per claim: the margin is the line, the claimed side tinted.
 
-    claims: id, verdict, the deciding effect in words, and how far estimate and ends of the interval of each effect
-    (n, 3) lie beyond the margin, the deciding one last; ends that are NaN are no interval. Each effect has a scale of
-    its own, to the furthest end: the further out the estimate, the surer. Thick is the one that decides; an open mark
-    has no interval. ValueError without claims.
+    claims: id, verdict, the deciding effect in words, how far estimate and ends of the interval of each effect (n, 3)
+    lie beyond the margin, the deciding one last, and how far each of its training seeds does; ends that are NaN are no
+    interval. Each effect has a scale of its own, to the furthest end: the further out the estimate, the surer. Thick is
+    the one that decides, with its seeds as ticks; an open mark has no interval. ValueError without claims.
     """
     if not claims:
         raise ValueError("no claim has rows: nothing to draw")
     figure, ax = plt.subplots(figsize=(WIDTH, 0.17 * len(claims) + 0.75))
     ax.axvspan(0, 1.05, color="#EEF6F2", lw=0, zorder=0)
     ax.axvline(0, color="#555555", lw=0.8, zorder=1)
-    for y, (_, verdict, text, beyond) in enumerate(claims):
-        scaled = beyond / np.maximum(np.fmax.reduce(np.abs(beyond), axis=1, keepdims=True), 1e-300)
+    for y, (_, verdict, text, beyond, seeds) in enumerate(claims):
+        furthest = np.maximum(np.fmax.reduce(np.abs(beyond), axis=1, keepdims=True), 1e-300)
+        furthest[-1] = np.fmax.reduce(np.abs(seeds), initial=furthest[-1, 0])
+        scaled = beyond / furthest
+        ax.plot(seeds / furthest[-1], [y] * len(seeds), "|", color=VERDICTS[verdict], zorder=3, ms=6, mew=0.6)
         offsets = [*np.linspace(-0.25, 0.25, len(beyond) - 1), 0.0]
         for i, (value, low, high) in enumerate(scaled):
             main, at = i == len(beyond) - 1, y + offsets[i]

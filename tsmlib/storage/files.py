@@ -1,12 +1,15 @@
-"""Atomic writes, one read, JSON, and locks that name who holds them."""
+"""Atomic writes, one read, compression, JSON, and locks that name who holds them."""
 
 import contextlib
 import glob
+import gzip
+import io
 import json
 import os
 import socket
 import sys
 import time
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -19,6 +22,7 @@ PathLike = str | os.PathLike[str]
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
 
 MANIFEST, STATUS = "MANIFEST.json", "status.json"
+UNPACKED = 2**28  # bytes that a compressed file may hold
 
 
 class StoreError(ValueError):
@@ -58,6 +62,26 @@ def read_bytes(path: PathLike) -> bytes:
         raise StoreError(f"{path} does not exist. Check the name, or run the notebook that makes it.") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"cannot read {path}: {error}. Check its name and permissions.") from error
+
+
+def packed(data: bytes) -> bytes:
+    """Bytes as gzip, without a name or a time in it."""
+    file = io.BytesIO()
+    with gzip.GzipFile("", "wb", fileobj=file, mtime=0) as into:
+        into.write(data)
+    return file.getvalue()
+
+
+def unpacked(path: Path, data: bytes) -> bytes:
+    """What a file ``*.gz`` unpacks to. Raises StoreError for what is no gzip, cut, or larger than UNPACKED."""
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            found = file.read(UNPACKED + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise StoreError(f"{path} is damaged, or no gzip: {error}. {remedy(path)}") from error
+    if len(found) > UNPACKED:
+        raise StoreError(f"{path} unpacks to more than {UNPACKED} bytes, expected fewer. {remedy(path)}")
+    return found
 
 
 def remedy(path: Path) -> str:

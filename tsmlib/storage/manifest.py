@@ -8,7 +8,7 @@ from typing import Any
 
 from tsmlib.storage import files as files_storage
 from tsmlib.storage.artifacts import read_header
-from tsmlib.storage.files import MANIFEST, STATUS, Json, PathLike, StoreError, read_bytes, remedy
+from tsmlib.storage.files import MANIFEST, STATUS, Json, PathLike, StoreError, read_bytes, remedy, unpacked
 
 
 def write_json(path: PathLike, value: Json) -> None:
@@ -27,12 +27,12 @@ def read_own_json(path: PathLike) -> dict[str, Json]:
 
 
 def read_text(path: PathLike) -> str:
-    """The text of a file, checked against the folder's manifest, if any."""
+    """The text of a file, checked against the folder's manifest, if any; of one named ``*.gz`` what it unpacks to."""
     path = Path(path)
     data = read_bytes(path)
     _require_sha256(path, data, _listed(path.resolve()))
     try:
-        return data.decode()
+        return (unpacked(path, data) if path.suffix == ".gz" else data).decode()
     except UnicodeDecodeError as error:
         raise StoreError(f"{path} is not text: {error}. {remedy(path)}") from error
 

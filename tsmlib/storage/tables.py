@@ -1,4 +1,4 @@
-"""Results tables: pandas DataFrames, as CSV with fixed columns on disk."""
+"""Results tables: pandas DataFrames, as CSV with fixed columns on disk; ``*.csv.gz`` is the same, compressed."""
 
 import csv
 import io
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tsmlib.storage.files import PathLike, StoreError, remedy, write_bytes
+from tsmlib.storage.files import PathLike, StoreError, packed, read_bytes, remedy, unpacked, write_bytes
 from tsmlib.storage.manifest import read_text
 
 COLUMNS = (
@@ -22,6 +22,7 @@ EXTRA = ("split", "lag", "samples", "dimension", "copy", "target", "start", "tor
 _COUNTS = ("horizon", "steps_ahead", "iteration", "env_steps", "delay", "n", "seed", "lag", "samples", "dimension",
            "copy", "target")  # fmt: skip
 _NUMBERS = ("noise", "value", "start", "torque_weight")
+LARGE = 900_000  # bytes; a table of more ships compressed
 
 
 def frame(rows: pd.DataFrame | Iterable[Mapping[str, object]]) -> pd.DataFrame:
@@ -39,11 +40,56 @@ def frame(rows: pd.DataFrame | Iterable[Mapping[str, object]]) -> pd.DataFrame:
 def save(
     path: PathLike, rows: pd.DataFrame | Iterable[Mapping[str, object]], *, extra: Sequence[str] = ()
 ) -> pd.DataFrame:
-    """Write a results table as CSV in one step; floats as their shortest exact text. Returns it as ``load`` would.
+    """Write a results table in one step; floats as their shortest exact text. Returns it as ``load`` would.
 
     extra: columns beyond COLUMNS and EXTRA. Raises StoreError for any other column and for a number that is not finite.
     """
     path = Path(path)
+    table, data = _written(path, rows, extra)
+    write_bytes(path, packed(data) if path.suffix == ".gz" else data)
+    return table
+
+
+def ship(
+    path: PathLike, rows: pd.DataFrame | Iterable[Mapping[str, object]], *, extra: Sequence[str] = ()
+) -> pd.DataFrame:
+    """``save`` a table ``*.csv`` where it ships, which is ``*.csv.gz`` where it is LARGE."""
+    table, data = _written(Path(path), rows, extra)
+    ship_bytes(path, data)
+    return table
+
+
+def ship_bytes(path: PathLike, data: bytes) -> None:
+    """The bytes of a table ``*.csv`` where it ships; the other of its two forms goes."""
+    plain, gz = _forms(Path(path))
+    if len(data) <= LARGE:
+        write_bytes(plain, data)
+        gz.unlink(missing_ok=True)
+        return
+    if not gz.exists() or unpacked(gz, read_bytes(gz)) != data:  # another zlib may pack the same into other bytes
+        write_bytes(gz, packed(data))
+    plain.unlink(missing_ok=True)
+
+
+def stored(path: PathLike) -> Path | None:
+    """The file of a table ``*.csv``: as it is named, or compressed beside that; None where neither is there.
+
+    Raises StoreError where both are.
+    """
+    found = [form for form in _forms(Path(path)) if form.exists()]
+    if len(found) > 1:
+        raise StoreError(f"{path} is there compressed as well, expected one of both: delete the one that is older.")
+    return found[0] if found else None
+
+
+def _forms(path: Path) -> tuple[Path, Path]:
+    return path, path.with_name(f"{path.name}.gz")
+
+
+def _written(
+    path: Path, rows: pd.DataFrame | Iterable[Mapping[str, object]], extra: Sequence[str]
+) -> tuple[pd.DataFrame, bytes]:
+    """A table as ``load`` gives it, and as CSV."""
     given = [] if isinstance(rows, pd.DataFrame) else list(rows)
     table = frame(given or rows)
     known = [*COLUMNS, *EXTRA, *extra]
@@ -63,16 +109,17 @@ def save(
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table.columns)
     writer.writerows(row.values() for row in records(table))
-    write_bytes(path, text.getvalue().encode())
-    return table
+    return table, text.getvalue().encode()
 
 
 def load(path: PathLike) -> pd.DataFrame:
     """A results table, checked against the folder's manifest, if any; columns as ``frame`` makes them.
 
+    Of ``*.csv`` the compressed form, where that is there alone.
+
     Raises StoreError for a file that is missing, damaged, cut or no results table.
     """
-    path = Path(path)
+    path = stored(path) or Path(path)
     reader = csv.reader(io.StringIO(read_text(path)), strict=True)
     try:
         columns, *rows = reader

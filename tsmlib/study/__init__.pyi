@@ -3,6 +3,7 @@ from .comparison import evidence_of as evidence_of
 from .comparison import published as published
 from .comparison import save_evidence as save_evidence
 from .data import SPLITS as SPLITS
+from .data import TASK_SEED as TASK_SEED
 from .data import dataset as dataset
 from .data import datasets as datasets
 from .data import parse_choice as parse_choice
@@ -41,7 +42,6 @@ from .robots import model_rows as model_rows
 from .robots import reference_rows as reference_rows
 from .runs import RESULTS as RESULTS
 from .tasks import FROZEN as FROZEN
-from .tasks import TASK_SEED as TASK_SEED
 from .tasks import draw_task as draw_task
 from .tasks import load_task as load_task
 from .torques import task_torques as task_torques

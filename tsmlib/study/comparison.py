@@ -24,7 +24,7 @@ def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], tabl
 def published(table: str) -> pd.DataFrame:
     """A table that ships; without rows where there is none."""
     path = predictions.RESULTS / f"{table}.csv"
-    return tables.load(path) if path.exists() else tables.frame([])
+    return tables.load(path) if tables.stored(path) else tables.frame([])
 
 
 def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFrame:
@@ -36,7 +36,7 @@ def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFram
 def evidence_of(run: Run, notebook: str) -> pd.DataFrame:
     """``evidence`` of another notebook's table; of this run's rows those of this seed, where it ran there."""
     own, published = run.metrics / f"{notebook}.csv", predictions.RESULTS / f"{notebook}.csv"
-    return _sourced(*(tables.load(path) if path.exists() else tables.frame([]) for path in (published, own)))
+    return _sourced(*(tables.load(path) if tables.stored(path) else tables.frame([]) for path in (published, own)))
 
 
 def _sourced(published: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:

@@ -19,7 +19,16 @@ from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
 SPLITS = ("train", "validation", "test")
-HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # the same for every run seed
+HELD_OUT_SEED = {"validation": 1_000_001, "test": 1_000_002}  # of episodes, the same for every run seed
+TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}  # of targets
+
+
+def require_other_seed(*seeds: int) -> None:
+    """ParameterError for a training seed that draws held-out episodes or targets."""
+    if held_out := sorted({*HELD_OUT_SEED.values(), *TASK_SEED.values()} & set(seeds)):
+        raise ParameterError(
+            f"seed {held_out[0]} draws held-out episodes or targets, on which nothing may be trained; choose others."
+        )
 
 
 def parse_choice(parameter: str, text: str, known: Sequence[str]) -> list[str]:
@@ -46,8 +55,7 @@ def dataset(run: Run, env: str, split: str) -> Trajectories:
     if path.exists():
         with remade_by(f"python -m tsmlib run collect --scale {run.scale} --seed {run.seed}", path):
             return artifacts.load_trajectories(path, expect=fingerprint(env))
-    if run.seed in HELD_OUT_SEED.values():
-        raise ParameterError(f"seed {run.seed} draws the held-out episodes; choose another one to train with")
+    require_other_seed(run.seed)
     seed = HELD_OUT_SEED.get(split, run.seed)
     if n >= 1000:
         print(f"{env}: collecting {n:,} episodes for {split}, about {n / 100:.0f} s on one core")

@@ -106,7 +106,7 @@ def pooled_rows(
 def table(run: Run, name: str) -> pd.DataFrame:
     """A run's table, else the published one; without rows where neither is there."""
     for path in (run.metrics / name, RESULTS / name):
-        if path.exists():
+        if tables.stored(path):
             return tables.load(path)
     return tables.frame([])
 

@@ -35,6 +35,7 @@ from tsmlib.study.zoo import OURS, PAPERS
 
 README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
+FULL_PAGE = ROOT / "docs" / "claims_in_full.md"  # claim by claim
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
 ASKED = {  # parameters for these cells: without the plain arm, and plans for few targets
@@ -66,7 +67,6 @@ def publish(run: Run) -> None:
     for source, pattern, target in (
         (run.models, "*/*.safetensors", run.shipped),
         (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
-        (run.metrics, "*.csv", RESULTS),
         (run.figures, "*.*", FIGURES),
     ):
         for path in sorted(source.glob(pattern)):
@@ -74,8 +74,10 @@ def publish(run: Run) -> None:
                 copy = target / path.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 files.write_bytes(copy, path.read_bytes())
+    for path in sorted(run.metrics.glob("*.csv")):
+        tables_storage.ship_bytes(RESULTS / path.name, path.read_bytes())
     for notebook, rows in tables.items():
-        tables_storage.save(RESULTS / f"{notebook}.csv", rows)
+        tables_storage.ship(RESULTS / f"{notebook}.csv", rows)
     manifest.write_manifest(ROOT / "data")
     publish_claims()
 
@@ -83,7 +85,8 @@ def publish(run: Run) -> None:
 def publish_table(run: Run, notebook: str) -> None:
     """Copy the table of one notebook of POOLED, with all its seeds, into data/; rewrite what is said of the results."""
     require(run, notebook)
-    tables_storage.save(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    tables_storage.ship(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    manifest.write_manifest(RESULTS.parent)
     publish_claims()
 
 
@@ -106,14 +109,30 @@ def _pooled(run: Run, notebook: str) -> pd.DataFrame:
 
 
 def publish_claims() -> None:
-    """Judge every claim from the tables that ship, and write README, docs/results.md and docs/claims.md. Idempotent."""
+    """Judge every claim from the tables that ship, and write README, docs/results.md, docs/claims.md and
+    docs/claims_in_full.md. Idempotent."""
+    compress()
     papers, ours = shipped_verdicts(PAPERS), shipped_verdicts(OURS)
-    tables_storage.save(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
+    tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
     _between(README, MARKS, readme_results())
     _between(RESULTS_PAGE, MARKS, results_page())
     _between(README, CLAIM_MARKS, readme_claims(papers, ours))
     _between(CLAIMS_PAGE, CLAIM_MARKS, claims_page(papers, ours))
+    _between(FULL_PAGE, CLAIM_MARKS, full_page(papers, ours))
+    draw_claims(papers)
+
+
+def draw_claims(papers: list[evaluate.Verdict]) -> list[Path]:
+    """The figure of all claims. Returns its files."""
+    figure = figures.claim_margins(claims_report.margins(papers))
+    return [*figures.save(figures.stamp(figure, "Rows: published; the paper's model"), FIGURES / "claims")]
+
+
+def compress() -> None:
+    """Compress the large tables that are not yet. StoreError where one is there in both forms."""
+    for path in filter(tables_storage.stored, sorted(RESULTS.glob("*.csv"))):
+        tables_storage.ship_bytes(path, manifest.read_text(path).encode())
 
 
 def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
@@ -143,7 +162,7 @@ def _between(page: Path, marks: tuple[str, str], written: str) -> None:
 def _shipped(name: str) -> pd.DataFrame:
     """A table that ships; without rows where there is none."""
     path = RESULTS / f"{name}.csv"
-    return tables_storage.load(path) if path.exists() else tables_storage.frame([])
+    return tables_storage.load(path) if tables_storage.stored(path) else tables_storage.frame([])
 
 
 # Figures -------------------------------------------------------------------------------------------------------------
@@ -158,6 +177,7 @@ def publish_figures() -> list[Path]:
     for figure, stem, rows in drawings_of_rows():
         figures.stamp(figure, table.stamp(rows, figure=True))
         drawn |= set(figures.save(figure, FIGURES / stem))
+    drawn |= set(draw_claims(shipped_verdicts(PAPERS)))
     with TemporaryDirectory() as folder:
         for notebook in runs.notebooks().values():
             for path in drawn_by_cells(notebook, Path(folder)):
@@ -299,6 +319,13 @@ The paper ends on what it leaves to future work (section 6). These questions and
 of `{OURS}`, and are not counted above.
 
 {claims_report.answers(shipped_answers(), root="../")}"""
+
+
+def full_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Every claim in full, in the order of the paper."""
+    return "\n\n".join(
+        claims_report.in_full(first, second, root="../") for first, second in zip(papers, ours, strict=True)
+    )
 
 
 def results_page() -> str:

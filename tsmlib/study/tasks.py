@@ -11,10 +11,9 @@ from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import artifacts
-from tsmlib.study.data import remade_by
+from tsmlib.study.data import TASK_SEED, remade_by
 from tsmlib.study.runs import ROOT
 
-TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 FROZEN = ROOT / "data" / "tasks"
 
 

@@ -29,14 +29,13 @@ from tsmlib.storage import files, manifest
 from tsmlib.storage.files import writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import notebooks
-from tsmlib.study.data import HELD_OUT_SEED
+from tsmlib.study.data import require_other_seed
 from tsmlib.study.jobs import complete
 from tsmlib.study.needed import needs
 from tsmlib.study.notebooks import Execution, terminable
 from tsmlib.study.parallel import cores
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import NOTEBOOKS, Notebook, Run, RunError
-from tsmlib.study.tasks import TASK_SEED
 
 SNAKEFILE = Path(__file__).with_name("Snakefile")
 POOL = "pool"  # in place of an executor: no Snakemake
@@ -118,10 +117,7 @@ def prepare(
 
     Raises ParameterError, for seeds of held-out episodes and targets too.
     """
-    if held_out := sorted({*HELD_OUT_SEED.values(), *TASK_SEED.values()} & set(seeds)):
-        raise ParameterError(
-            f"seed {held_out[0]} draws held-out episodes or targets, on which nothing may be trained; choose others."
-        )
+    require_other_seed(*seeds)
     last = sorted(chosen, key=lambda notebook: notebook.stem == CLAIMS)
     claims = [notebook for notebook in last if notebook.stem == CLAIMS]
     order = [(notebook, seed) for seed in seeds for notebook in last if notebook not in claims]

@@ -48,7 +48,7 @@ class Effect:
     """What rows say of a check: estimate, interval where there is one, n in words, and a state.
 
     p: one-sided p value against lying on the claimed side of the margin, where there is an interval.
-    seeds: of training.
+    by_seed: the number of each training seed, the mean over its trials where it has some.
     """
 
     check: Check
@@ -59,12 +59,18 @@ class Effect:
     n: str = ""
     why: str = ""
     p: float = np.nan
-    seeds: int = 0
+    by_seed: tuple[float, ...] = ()
+
+    @property
+    def seeds(self) -> int:
+        """How many training seeds there are."""
+        return len(self.by_seed)
 
     @property
     def beyond(self) -> np.ndarray:
-        """How far estimate and ends of the interval (3,) lie beyond the margin: negative on the wrong side, or NaN."""
-        ends = np.array([np.nan if end is None else end for end in (self.value, self.low, self.high)])
+        """How far estimate, ends of the interval and seeds (3 + seeds,) lie beyond the margin: negative on the wrong
+        side, or NaN."""
+        ends = np.array([np.nan if end is None else end for end in (self.value, self.low, self.high, *self.by_seed)])
         return (ends - self.check.margin) * (-1 if self.check.op[0] == "<" else 1)
 
     @property
@@ -75,7 +81,7 @@ class Effect:
     @property
     def ease(self) -> tuple[int, float]:
         """Sorts checks by how far they are from holding, the furthest first."""
-        value, low, high = self.beyond
+        value, low, high = self.beyond[:3]
         if np.isnan(low):  # of what has no interval the side alone is known
             return STATES.index(self.state), -1.0 if value < 0 else 0.0
         return STATES.index(self.state), float(value / (abs(high - low) + 1e-300))
@@ -165,7 +171,8 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
     checks = [check for claim in claims for found in claim.checks.values() for check in found]
     files = {term.table for check in checks for term in check.number.terms}
     names = sorted(files | {f"{file}_rows" for file in files})
-    rows = {name: tables_storage.load(path) for name in names if (path := RESULTS / f"{name}.csv").exists()}
+    paths = {name: tables_storage.stored(RESULTS / f"{name}.csv") for name in names}
+    rows = {name: tables_storage.load(path) for name, path in paths.items() if path}
     stems = {notebook.stem for notebook in notebooks().values()}
     runs = run.seeds() if run and run.scale == "paper" else []
     for one, name in itertools.product(runs, names):
@@ -238,7 +245,7 @@ def measure(check: Check, rows: Tables) -> Effect:
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
     values, n = of_seeds(check, asked)
     found = compared(check, random_effects(values, crossed=not any(term.curve for term in asked)), n)
-    return replace(found, seeds=len(values))
+    return replace(found, by_seed=tuple(values.mean(1).tolist()))
 
 
 def of_seeds(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[np.ndarray, str]:

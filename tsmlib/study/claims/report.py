@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
-from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, REPLICATED, VERDICTS, Claim
-from tsmlib.study.claims.evaluate import Verdict
+from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, REPLICATED, UNTESTABLE, VERDICTS, Claim
+from tsmlib.study.claims.evaluate import STATES, Effect, Verdict
 from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
 
@@ -80,16 +81,118 @@ def readings(verdicts: Sequence[Verdict]) -> str:
     return markdown(pd.DataFrame(lines, columns=["reading", "turns", "does not turn"]))
 
 
-def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, np.ndarray]]:
+def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
+    """One claim as a section in Markdown: what the paper says, verdict, every check with all its seeds, the verdict
+    under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
+    claim, effects = verdict.claim, verdict.effects[""]
+    several = f"All of {len(effects)} checks have to hold" if len(effects) > 1 else "One check has to hold"
+    known = verdict.why if verdict.word in (DEFINITIONAL, UNTESTABLE) else claim.why.get(verdict.word, "")
+    known = f" {known}" if known else ""
+    pictures = "\n".join([f"{'against':<{HALF}}|{'for it':>{HALF}}", *map(_strip, effects)])
+    read = [
+        {"reading": reading or "as the paper words it", "verdict": _under(found), "deciding check": _deciding(found)}
+        for reading, found in verdict.effects.items()
+    ]
+    return f"""## {claim.id}
+
+> {claim.statement} ({claim.place})
+
+**{verdict.word}**; with `{ours.claim.subject}` {ours.word.lower()}.{known}
+
+Measured: {claim.statistic}. {several}. Shown in {_links(claim, root)}.
+
+```text
+{pictures}
+```
+
+{markdown(pd.DataFrame(read))}
+
+What would change it: {change(verdict)}"""
+
+
+HALF = 18  # characters on either side of the margin
+
+
+def _strip(effect: Effect) -> str:
+    """A check as one line: seeds o, estimate x and interval - against the margin |, then in words."""
+    beyond = effect.beyond
+    places: list[str] = [" "] * (2 * HALF + 1)
+    if not np.isnan(beyond[0]):
+        at = HALF + np.rint(HALF * np.nan_to_num(beyond / max(np.nanmax(np.abs(beyond)), 1e-300))).astype(int)
+        value, low, high, *seeds = at.tolist()
+        if effect.low is not None:
+            places[min(low, high) : max(low, high) + 1] = "-" * (abs(high - low) + 1)
+    places[HALF] = "|"
+    if not np.isnan(beyond[0]):
+        for mark, where in (("x", [value]), ("o", seeds)):
+            for place in where:
+                places[place] = mark
+    return f"{''.join(places)}  {effect.state:7}  {effect.text}; asked {effect.check.text}"
+
+
+def _under(effects: Sequence[Effect]) -> str:
+    """What would be the verdict if this reading were the only one."""
+    state = min((effect.state for effect in effects), key=STATES.index)
+    return {"holds": "replicated", "fails": "not replicated", "open": "inconclusive", "missing": "no rows"}[state]
+
+
+def _deciding(effects: Sequence[Effect]) -> str:
+    key = min(effects, key=lambda effect: effect.ease)
+    return f"{key.text}, asked {key.check.asked}"
+
+
+def change(verdict: Verdict) -> str:
+    """What would change a verdict, from the check that decides it, in words."""
+    key, checks = verdict.key, len(verdict.effects[""])
+    if verdict.word == DEFINITIONAL:
+        return "nothing that could be measured."
+    if verdict.word == UNTESTABLE:
+        return "rows, which are missing."
+    if verdict.word == DEPENDENT:
+        return "to know what the paper means: the readings above differ."
+    if key.low is None:
+        return "another training seed, since one has no interval."
+    away, low, high = key.beyond[:3]
+    if verdict.word in (REPLICATED, FAILED):
+        side, half = "right" if away > 0 else "wrong", max(abs(high - low) / 2, 1e-300)
+        return (
+            f"rows that bring the mean of the deciding check to the other side of its margin, {abs(away):.3g} from "
+            f"where it lies on the {side} one: {abs(away) / half:.1f} times half its interval."
+        )
+    side = "right" if away > 0 else "wrong"
+    if low * high > 0:
+        return (
+            f"more rows: the interval of the deciding check lies on the {side} side of its margin by itself, but not "
+            f"by Holm's procedure over {checks} checks."
+        )
+    if key.seeds < 2 or "trials" in key.n:
+        return f"more training seeds and trials: the mean of the deciding check lies on the {side} side of its margin."
+    wanted = seeds_to_decide(key)
+    many = f"about {wanted} training seeds" if wanted else "more than 100 training seeds"
+    return (
+        f"{many} that differ as these do, which put the interval of the deciding check on the {side} side of its "
+        "margin, where its mean lies."
+    )
+
+
+def seeds_to_decide(effect: Effect) -> int:
+    """How many training seeds that differ as these do leave the margin outside of the interval; 0: more than 100."""
+    deviation, away = np.std(effect.by_seed, ddof=1), abs(effect.beyond[0])
+    sizes = np.arange(2, 101)
+    enough = sizes[stdtrit(sizes - 1, (1 + effect.check.level) / 2) * deviation / np.sqrt(sizes) < away]
+    return int(enough[0]) if len(enough) else 0
+
+
+def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, np.ndarray, np.ndarray]]:
     """What ``figures.claim_margins`` draws, of every claim with rows.
 
-    Id, verdict, the deciding effect in words, and how far each estimate and its interval (n, 3) lie beyond the margin,
-    the deciding one last.
+    Id, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie beyond the margin, the
+    deciding one last, and how far the training seeds of that one (seeds,) do.
     """
     found = []
     for verdict in verdicts:
         effects = sorted(verdict.effects[""], key=lambda effect: effect is verdict.key)
         if any(effect.value is not None for effect in effects):
-            beyond = np.array([e.beyond for e in effects if e.value is not None or e is verdict.key])
-            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond))
+            beyond = np.array([e.beyond[:3] for e in effects if e.value is not None or e is verdict.key])
+            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond, verdict.key.beyond[3:]))
     return found
