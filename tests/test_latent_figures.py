@@ -110,6 +110,16 @@ def test_a_row_has_the_mean_over_seeds_of_each_model() -> None:
     assert marks(left, OURS) == [(2.0, 1)]
 
 
+def test_labels_of_spread_and_error_do_not_run_into_each_other() -> None:
+    grown = np.geomspace(0.01, 0.3, 10)
+    figure = figures.spread_against_error(
+        {word: dict.fromkeys(METHODS, (grown, 2 * grown)) for word in ("wall", "arm")}
+    )
+    figure.canvas.draw()
+    left, right = (ax.xaxis.label.get_window_extent() for ax in figure.axes)
+    assert left.x1 + 10 < right.x0
+
+
 def test_a_panel_of_codes_names_the_models_without_values_in_it() -> None:
     values = {"KL": {"Push": {TSM: np.array([1.0])}}, "spread": {"Push": dict.fromkeys(METHODS, np.array([1.0]))}}
     left, right = figures.code_use(values, {"KL": "nats", "spread": "share"}, {}).axes

@@ -230,9 +230,9 @@ def deflection_intervals(found: Mapping[Method, tuple[np.ndarray, np.ndarray]], 
 def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, float]) -> Figure:
     """The object's paths under codes on a walk from one code (dark) to another (light), cos(a) first + sin(a) last.
 
-    start (dx,): the last observed state; paths (n, T, 2): the object's paths; jumps: number of codes on the same walk ->
-    the largest distance in m between the ends of two neighbours. The middle panel shows the ends of the paths from that
-    of the first code's, since all of them together may differ little.
+    start (dx,): the last observed state; paths (n, T, 2): the object's paths; jumps: number of codes on the same walk
+    -> the largest distance in m between the ends of two neighbours. The middle panel shows the ends of the paths from
+    that of the first code's, since all of them together may differ little.
     """
     paths = finite("paths", paths, "n T 2")
     shades = WALK(np.linspace(0, 0.92, len(paths)))
@@ -254,9 +254,11 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     refined.plot(counts, [100 * jumps[n] for n in counts], color="#222222", marker="o", ms=3.5)
     halved = [100 * jumps[counts[0]] * (counts[0] - 1) / (n - 1) for n in counts]
     refined.plot(
-        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="twice the codes, half the gap", zorder=1
+        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="twice the codes, half of it", zorder=1
     )
-    refined.set(xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest gap between neighbours' ends")
+    refined.set(
+        xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest distance of neighbours"
+    )
     log_axis(refined, 50 * min(jumps.values()), 200 * max(jumps.values()))
     refined.set_xticks(counts, [str(n) for n in counts])
     refined.minorticks_off()

@@ -237,7 +237,8 @@ def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
             ax.locator_params(nbins=5)
     dot = entry("one target, mean over training seeds", color=DARK, ls="", marker="o", ms=2.6, mew=0)
     diagonal = entry("executed as predicted", color="#999999", lw=0.7)
-    return finish(figure, [], [dot, diagonal, entry("gap", color=PALE, lw=0.8), *yours_entry(*own.values())], 4)
+    gap = entry("gap", color=PALE, ls="", marker="|", ms=7)
+    return finish(figure, [], [dot, diagonal, gap, *yours_entry(*own.values())], 4)
 
 
 @styled
