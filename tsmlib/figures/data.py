@@ -67,9 +67,10 @@ def state_histograms(states: np.ndarray, names: Sequence[str], units: Sequence[s
     figure, axes = panels(len(names), 5 if len(names) > 6 else 3, 1.05)
     for ax, values, word, unit in zip(axes, flat.T, names, units, strict=True):
         values, unit = (100 * values, "cm") if unit == "m" else (values, unit)
-        counts, *_ = ax.hist(values, bins=int(np.clip(len(values) ** 0.5, 10, 60)), color=DARK, alpha=0.75, linewidth=0)
+        bins = int(np.clip(len(values) ** 0.5, 10, 60))
+        ax.hist(values, bins=bins, color=DARK, alpha=0.75, linewidth=0)
         label, ylim = f"{dimension(word)} ({unit})", (0.0, None)
-        if counts.max() > len(values) / 2:  # else it would hide all others
+        if np.histogram(values, bins)[0].max() > len(values) / 2:  # else it would hide all others
             ax.set_yscale("log")
             ax.yaxis.set_minor_locator(NullLocator())
             label, ylim = f"{label}\nheights logarithmic", (0.5, None)
