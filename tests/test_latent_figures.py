@@ -184,6 +184,14 @@ def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
     assert "0.25" in figure.axes[1].texts[0].get_text()
 
 
+def test_the_note_of_figure_10_covers_no_torques() -> None:
+    figure = ten()
+    figure.canvas.draw()
+    for ax in figure.axes[1:]:
+        lowest = min(line.get_ydata().min() for line in ax.lines)
+        assert ax.texts[0].get_window_extent().y1 < ax.transData.transform((0, lowest))[1]
+
+
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="k, 3"):
         recall(recall=np.zeros((2, 4)))

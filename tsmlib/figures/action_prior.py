@@ -32,6 +32,7 @@ def figure10(plans: Mapping[Method, np.ndarray], dt: float, changes: Mapping[Met
     limit = max(float(np.abs(actions).max()) for actions in plans.values())
     for ax, (method, actions) in zip(axes, plans.items(), strict=True):
         style.torques(ax, actions, dt, method.look.colour, limit=limit)
+        ax.set_ylim(-1.4 * limit, 1.08 * limit)  # the note stands below all torques
         ax.set_title(f"{method.look.name}\n{', '.join(method.how)}", fontsize=7)
         if method.model != "data":
             style.note(ax, f"mean |Δu|: {changes[method]:.2f} × data's", 0.98, 0.02)

@@ -254,7 +254,7 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     refined.plot(counts, [100 * jumps[n] for n in counts], color="#222222", marker="o", ms=3.5)
     halved = [100 * jumps[counts[0]] * (counts[0] - 1) / (n - 1) for n in counts]
     refined.plot(
-        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="twice the codes, half of it", zorder=1
+        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="half of it at twice the codes", zorder=1
     )
     refined.set(
         xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest distance of neighbours"
