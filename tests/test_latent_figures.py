@@ -188,7 +188,7 @@ def test_the_note_of_figure_10_covers_no_torques() -> None:
     figure = ten()
     figure.canvas.draw()
     for ax in figure.axes[1:]:
-        lowest = min(line.get_ydata().min() for line in ax.lines)
+        lowest = min(np.min(line.get_ydata()) for line in ax.lines)
         assert ax.texts[0].get_window_extent().y1 < ax.transData.transform((0, lowest))[1]
 
 
