@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from tsmlib import figures, statistics
+from tsmlib.figures import style
 from tsmlib.study import zoo
 from tsmlib.study.zoo import method
 
@@ -164,6 +165,29 @@ def test_time_stands_below_the_lowest_panels_of_torques_and_not_beside_the_stamp
     figure = figures.torque_gallery(noise(8, 20, 2), 0.02)
     assert [ax.get_xlabel() for ax in figure.axes] == [""] * 4 + ["time (s)"] * 4
     assert not figure.get_supxlabel()
+
+
+def test_a_state_that_hardly_varies_has_logarithmic_heights_and_says_so() -> None:
+    states = noise(50, 20, 6)
+    states[:45, :, 2] = 0
+    axes = figures.state_histograms(states, NAMES, UNITS).axes
+    assert [ax.get_yscale() for ax in axes] == ["linear", "linear", "log", "linear", "linear", "linear"]
+    assert axes[2].get_xlabel() == "shoulder velocity (rad/s)\nheights logarithmic"
+
+
+def test_a_legend_has_no_column_that_its_rows_leave_almost_empty() -> None:
+    for count, columns in {6: 3, 9: 5, 11: 4, 3: 3}.items():
+        figure = plt.figure()
+        style.legend(figure, [style.entry(str(i), color="k") for i in range(count)], 5)
+        assert figure.legends[0]._ncols == columns
+        plt.close(figure)
+
+
+def test_a_dot_of_predicted_and_executed_returns_is_named() -> None:
+    legend = figures.predicted_vs_true(returns()).legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "one target, mean over training seeds", "executed as predicted", "gap",
+    ]  # fmt: skip
 
 
 def test_figure6_names_the_marks_it_draws() -> None:

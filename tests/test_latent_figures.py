@@ -110,6 +110,16 @@ def test_a_row_has_the_mean_over_seeds_of_each_model() -> None:
     assert marks(left, OURS) == [(2.0, 1)]
 
 
+def test_labels_of_spread_and_error_do_not_run_into_each_other() -> None:
+    grown = np.geomspace(0.01, 0.3, 10)
+    figure = figures.spread_against_error(
+        {word: dict.fromkeys(METHODS, (grown, 2 * grown)) for word in ("wall", "arm")}
+    )
+    figure.canvas.draw()
+    left, right = (ax.xaxis.label.get_window_extent() for ax in figure.axes)
+    assert left.x1 + 10 < right.x0
+
+
 def test_a_panel_of_codes_names_the_models_without_values_in_it() -> None:
     values = {"KL": {"Push": {TSM: np.array([1.0])}}, "spread": {"Push": dict.fromkeys(METHODS, np.array([1.0]))}}
     left, right = figures.code_use(values, {"KL": "nats", "spread": "share"}, {}).axes
@@ -172,6 +182,14 @@ def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
     assert mains == [method(word).look.colour for word in ("data", "prior", "tsm", "tsm")]
     assert [bool(ax.texts) for ax in figure.axes] == [False, True, True, True]  # the data need no comparison
     assert "0.25" in figure.axes[1].texts[0].get_text()
+
+
+def test_the_note_of_figure_10_covers_no_torques() -> None:
+    figure = ten()
+    figure.canvas.draw()
+    for ax in figure.axes[1:]:
+        lowest = min(np.min(line.get_ydata()) for line in ax.lines)
+        assert ax.texts[0].get_window_extent().y1 < ax.transData.transform((0, lowest))[1]
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -69,7 +69,8 @@ def spell(value: float) -> str:
     return text.replace("-", "−")
 
 
-STATES = {"joint0": "shoulder", "joint1": "elbow", "tip": "fingertip", "block": "object", "vel": "velocity"}
+STATES = {"joint0": "shoulder", "joint1": "elbow", "tip": "fingertip", "block": "object", "vel": "velocity",
+          "vx": "velocity x", "vy": "velocity y"}  # fmt: skip
 
 
 def dimension(word: str) -> str:

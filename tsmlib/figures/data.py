@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import NullLocator
 
 from tsmlib.figures import style
 from tsmlib.figures.axes import dimension, log_axis, wrapped
@@ -57,15 +58,23 @@ def torque_gallery(actions: np.ndarray, dt: float) -> Figure:
 
 @styled
 def state_histograms(states: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
-    """Distribution of the data: one histogram per state dimension of ``states`` (..., dx), lengths in cm."""
+    """Distribution of the data: one histogram per state dimension of ``states`` (..., dx), lengths in cm.
+
+    Where one bin holds most states, heights are logarithmic."""
     flat = shaped("states", np.asarray(states, float).reshape(-1, np.shape(states)[-1]), f"n {len(names)}")
     if len(units) != len(names):
         raise ValueError(f"{len(names)} names and {len(units)} units, expected one of each per state dimension")
     figure, axes = panels(len(names), 5 if len(names) > 6 else 3, 1.05)
     for ax, values, word, unit in zip(axes, flat.T, names, units, strict=True):
         values, unit = (100 * values, "cm") if unit == "m" else (values, unit)
-        ax.hist(values, bins=int(np.clip(len(values) ** 0.5, 10, 60)), color=DARK, alpha=0.75, linewidth=0)
-        ax.set(xlabel=f"{dimension(word)} ({unit})", yticks=(), ylim=(0, None))
+        bins = int(np.clip(len(values) ** 0.5, 10, 60))
+        ax.hist(values, bins=bins, color=DARK, alpha=0.75, linewidth=0)
+        label, ylim = f"{dimension(word)} ({unit})", (0.0, None)
+        if np.histogram(values, bins)[0].max() > len(values) / 2:  # else it would hide all others
+            ax.set_yscale("log")
+            ax.yaxis.set_minor_locator(NullLocator())
+            label, ylim = f"{label}\nheights logarithmic", (0.5, None)
+        ax.set(xlabel=label, yticks=(), ylim=ylim)
         style.rows_only(ax)
         ax.locator_params(axis="x", nbins=5)
     return figure
@@ -76,14 +85,15 @@ def workspace_coverage(tip: np.ndarray, reach: float | None = None) -> Figure:
     """Visits of the fingertip: ``tip`` (..., 2) in m, with the circle of radius ``reach`` (m) that it cannot leave;
     drawn in cm."""
     flat = 100 * shaped("tip", np.asarray(tip, float).reshape(-1, np.shape(tip)[-1]), "n 2")
-    figure, ax = plt.subplots(figsize=(3.3, 2.8))
+    figure, ax = plt.subplots(figsize=(3.3, 2.95))
     edge = 1.08 * (100 * reach if reach else np.abs(flat).max())
     shades = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.18, 1, 256)))  # one visit is not white
     bins = ax.hexbin(*flat.T, gridsize=60, mincnt=1, norm=LogNorm(), cmap=shades, linewidths=0.1, edgecolors="face",
                      extent=(-edge, edge, -edge, edge))  # fmt: skip
     if reach:
         ax.add_patch(Circle((0, 0), 100 * reach, fill=False, ec=DARK, lw=0.7, ls="--"))
-    ax.plot(0, 0, "+", color="black", ms=5, mew=0.8)
+    (shoulder,) = ax.plot(0, 0, "+", color="black", ms=5, mew=0.8, label="shoulder")
+    legend(figure, [*([entry("reach of the arm", color=DARK, lw=0.7, ls="--")] if reach else []), shoulder])
     ax.set(xlabel="fingertip x (cm)", ylabel="fingertip y (cm)", aspect="equal", xlim=(-edge, edge), ylim=(-edge, edge))
     bar = figure.colorbar(bins, ax=ax, label="states per cell", shrink=0.8, aspect=25)
     bar.outline.set_visible(False)

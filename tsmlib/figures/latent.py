@@ -103,8 +103,8 @@ def spread_against_error(curves: Mapping[str, Mapping[Method, tuple[np.ndarray, 
     """Error against spread: title -> method -> spread (g,) and error (g,) of segments, grouped by spread.
 
     On the diagonal the mean of the samples is as far from the truth as the samples are from it."""
-    width = min(WIDTH, 2.35 * len(curves) + 0.3)
-    figure, axes = panels(len(curves), len(curves), 2.2, width=width, head=0, layout="compressed")
+    width = min(WIDTH, 2.2 * len(curves) + 0.3)
+    figure, axes = panels(len(curves), len(curves), 2.5, width=width, head=0, layout="compressed")
     look_of = looks(curves)
     for ax, (title, panel) in zip(axes, curves.items(), strict=True):
         every = np.concatenate([part for pair in panel.values() for part in pair])
@@ -115,15 +115,15 @@ def spread_against_error(curves: Mapping[str, Mapping[Method, tuple[np.ndarray, 
             spread, error = (finite(f"{title}, {method.label}", part, str(len(pair[0]))) for part in pair)
             ax.plot(spread, error, **{**look_of[method], "ms": 3.5})
         ax.set(xscale="log", yscale="log", xlim=limits, ylim=limits, aspect="equal", title=title,
-               xlabel="spread of the samples (data's s.d.)")  # fmt: skip
+               xlabel="spread of samples (data's s.d.)")  # fmt: skip
     axes[0].set_ylabel("error of their mean (data's s.d.)")
-    legend(figure, entries(look_of, ms=3.5))
+    legend(figure, [*entries(look_of, ms=3.5), entry("as far off as spread", color="#999999", lw=0.7)])
     return figure
 
 
 @styled
 def figure9(draw: Draw, starts: np.ndarray, true: np.ndarray, samples: Mapping[Method, np.ndarray]) -> Figure:
-    """Sampled ways of the object after a push (paper, figure 9): one column per episode, one row per method.
+    """Sampled paths of the object after a push (paper, figure 9): one column per episode, one row per method.
 
     draw paints the scene; starts (E, dx): the last observed states; true (E, T, 2): where the object went, in m;
     samples: method -> (S, E, T, 2), under the true actions.
@@ -144,7 +144,7 @@ def figure9(draw: Draw, starts: np.ndarray, true: np.ndarray, samples: Mapping[M
             ax.plot(*truth[-1], "o", color="black", ms=3, zorder=7)
             style.scene(ax)
         row[0].set_ylabel(method.label, fontsize=7, color=main, weight="bold")
-    legend(figure, [entry("where the object went, to the end", color="black", lw=1.3, marker="o", ms=3),
+    legend(figure, [entry("true path of the object", color="black", lw=1.3, marker="o", ms=3),
                     entry("samples, in the model's colour", color="#999999", lw=0.9, marker=".", ms=3)])  # fmt: skip
     return figure
 
@@ -228,11 +228,11 @@ def deflection_intervals(found: Mapping[Method, tuple[np.ndarray, np.ndarray]], 
 
 @styled
 def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, float]) -> Figure:
-    """The object's ways under codes on a walk from one code (dark) to another (light).
+    """The object's paths under codes on a walk from one code (dark) to another (light), cos(a) first + sin(a) last.
 
-    start (dx,): the last observed state; paths (n, T, 2): the object's ways; jumps: number of codes on the same walk ->
-    the largest distance in m between the ends of two neighbours. The middle panel shows the ends of the ways from that
-    of the first code's, since all of them together may differ little.
+    start (dx,): the last observed state; paths (n, T, 2): the object's paths; jumps: number of codes on the same walk
+    -> the largest distance in m between the ends of two neighbours. The middle panel shows the ends of the paths from
+    that of the first code's, since all of them together may differ little.
     """
     paths = finite("paths", paths, "n T 2")
     shades = WALK(np.linspace(0, 0.92, len(paths)))
@@ -241,22 +241,24 @@ def walk(draw: Draw, start: np.ndarray, paths: np.ndarray, jumps: Mapping[int, f
     picture.add_collection(LineCollection(list(_from(start, paths)), colors=shades, linewidths=1, zorder=6))
     picture.scatter(paths[:, -1, 0], paths[:, -1, 1], c=shades, s=7, linewidths=0, zorder=6.2)
     style.scene(picture)
-    picture.set_title("ways of the object")
+    picture.set_title("paths of the object")
     picture.set_xlabel("dark: first code, light: last", fontsize=6.5, color=style.NOTE)
     angle, moved = np.linspace(0, 90, len(paths)), 100 * (paths[:, -1] - paths[0, -1])
     for values, word, line in zip(moved.T, "xy", ("-", style.DASHED), strict=True):
         ends.plot(angle, values, color=style.NOTE, ls=line, lw=0.9, zorder=1, label=word)
         ends.scatter(angle, values, c=shades, s=9, linewidths=0, zorder=2)
-    ends.set(xlabel="angle from the first code (degrees)", ylabel="distance (cm)", xticks=(0, 30, 60, 90),
-             title="end of a way, from the first one's")  # fmt: skip
+    ends.set(xlabel="angle from first to last code (degrees)", ylabel="distance (cm)", xticks=(0, 30, 60, 90),
+             title="end of a path, minus the first's")  # fmt: skip
     ends.legend(loc="best")
     counts = sorted(jumps)
     refined.plot(counts, [100 * jumps[n] for n in counts], color="#222222", marker="o", ms=3.5)
     halved = [100 * jumps[counts[0]] * (counts[0] - 1) / (n - 1) for n in counts]
     refined.plot(
-        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="half as far with twice as many", zorder=1
+        counts, halved, color="#AAAAAA", lw=0.8, ls=style.DASHED, label="half of it at twice the codes", zorder=1
     )
-    refined.set(xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest jump of the end")
+    refined.set(
+        xscale="log", xlabel="codes on the walk", ylabel="distance (cm)", title="largest distance of neighbours"
+    )
     log_axis(refined, 50 * min(jumps.values()), 200 * max(jumps.values()))
     refined.set_xticks(counts, [str(n) for n in counts])
     refined.minorticks_off()

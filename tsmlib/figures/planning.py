@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from tsmlib.figures import style
-from tsmlib.figures.axes import YOURS, diamonds, foot, reference_look, references, yours_entry
+from tsmlib.figures.axes import YOURS, diamonds, finish, foot, reference_look, references, yours_entry
 from tsmlib.figures.checks import finite, shaped
 from tsmlib.figures.method import PLANNERS, Method
-from tsmlib.figures.style import DARK, WIDTH, Props, entry, legend, panels, styled, tint
+from tsmlib.figures.style import DARK, PALE, WIDTH, Props, entry, legend, panels, styled, tint
 from tsmlib.statistics import interval
 
 Results = Mapping[str, Mapping[Method, Mapping[str, np.ndarray | None]]]  # task -> method -> {"true", "predicted"}
@@ -195,7 +195,7 @@ def _title(ax: Axes, method: Method) -> None:
 
 @styled
 def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
-    """Predicted against executed returns, one dot per target; the line to the diagonal is the gap.
+    """Predicted against executed returns, one dot per target (mean over seeds); the line to the diagonal is the gap.
 
     results and yours as in ``figure6``; methods without predictions are left out.
     """
@@ -235,9 +235,10 @@ def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
                    xlabel="executed return (m)" if i + columns >= len(rows) else "",
                    ylabel="" if i % columns else f"{task.capitalize()}: predicted return (m)")  # fmt: skip
             ax.locator_params(nbins=5)
-    if any(own.values()):
-        legend(figure, yours_entry(own))
-    return figure
+    dot = entry("one target, mean over training seeds", color=DARK, ls="", marker="o", ms=2.6, mew=0)
+    diagonal = entry("executed as predicted", color="#999999", lw=0.7)
+    gap = entry("gap", color=PALE, ls="", marker="|", ms=7)
+    return finish(figure, [], [dot, diagonal, gap, *yours_entry(*own.values())], 4)
 
 
 @styled
@@ -371,13 +372,15 @@ def plan_actions(data: np.ndarray, latent: np.ndarray, direct: np.ndarray, metho
 
     The number is the mean change from step to step; method: that planned."""
     figure, axes = panels(3, 3, 1.6, head=0, sharey=True)
-    shown = {"training data": data, "latent plan": latent, "direct plan": direct}
+    shown = {"training data": data} | {f"{method.look.name}\n{word} plan": torques
+                                       for word, torques in (("latent", latent), ("direct", direct))}  # fmt: skip
     limit = max(float(np.abs(actions).max()) for actions in shown.values()) or 1.0
     for ax, (title, actions) in zip(axes, shown.items(), strict=True):
         actions = shaped(title, actions, "T 2")
         style.torques(ax, actions, dt, DARK if title == "training data" else method.look.colour, limit=limit)
         change = np.abs(np.diff(actions, axis=0)).mean() if len(actions) > 1 else 0.0
-        ax.set(title=title, xlabel="time (s)")
+        ax.set_title(title, fontsize=7)
+        ax.set_xlabel("time (s)")
         ax.set_title(f"mean |Δu| {change:.3f}", loc="right", fontsize=6.5, color="#555555")
     axes[0].set_ylabel("torque (share of full)")
     style.joint_legend(figure)

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from tsmlib.figures import axes
 from tsmlib.figures.checks import finite, known
 from tsmlib.figures.method import SEARCH_SPACES, Method
-from tsmlib.figures.style import DARK, DASHED, GRID, NOTE, WIDTH, Props, entry, styled
+from tsmlib.figures.style import DARK, DASHED, GRID, WIDTH, Props, entry, note, styled
 
 Curves = dict[str, np.ndarray]
 LearningCurves = Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]]  # task -> method -> Curves
@@ -155,11 +155,9 @@ def _panel(
             at, mean, half = (part[at >= 1] for part in (at, mean, half))
         if method in points:
             if method is points[0]:
-                late = at[-1] > far / 2
                 ax.axvline(at[-1], color="#CCCCCC", lw=0.6, zorder=1)
-                ax.annotate(f"data of the models: {_spelled(at[-1], far)}", (at[-1], 0), (-2 if late else 2, 2),
-                            xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=6.5, color=NOTE,
-                            ha="right" if late else "left", va="bottom")  # fmt: skip
+                told = f"line: data of the models, {_spelled(at[-1], far)}\nright of it, side by side: their policies"
+                note(ax, told, 0.02 if at[-1] > far / 2 else 0.98, 0.02)  # where no curve begins
             at, mean, half = at[-1:] + 0.018 * far * (1 + points.index(method)), mean[-1:], half[-1:]
             ax.plot([at[0], far], [mean[0]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
             ax.vlines(at, mean - half, mean + half, color=look["color"], lw=0.7, alpha=0.5, zorder=3)

@@ -83,8 +83,9 @@ def entry(label: str, **look: Any) -> Line2D:
 
 
 def legend(figure: Figure, handles: Sequence[Line2D], columns: int = 8) -> None:
-    """A legend above all panels, where it covers nothing."""
-    figure.legend(handles=handles, loc="outside upper left", ncols=min(columns, len(handles)))
+    """A legend above all panels, where it covers nothing; of no more columns than its rows need."""
+    rows = -(-len(handles) // columns)
+    figure.legend(handles=handles, loc="outside upper left", ncols=-(-len(handles) // max(rows, 1)) or 1)
 
 
 def stamp(figure: Figure, text: str) -> Figure:

@@ -187,10 +187,10 @@ def return_panels(
 ) -> dict[str, dict[Method, dict[str, np.ndarray | None]]]:
     """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
     every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
-    return {task: {m: rows[m] for m in methods or _ordered(rows) if m in rows} for task, rows in every.items()}
+    return {task: {m: rows[m] for m in methods or ordered(rows) if m in rows} for task, rows in every.items()}
 
 
-def _ordered(rows: Iterable[Method]) -> list[Method]:
+def ordered(rows: Iterable[Method]) -> list[Method]:
     """Methods in the order of the zoo's models."""
     order = [*zoo.ZOO, *zoo.LOOKS]
     return sorted(rows, key=lambda method: order.index(method.model))

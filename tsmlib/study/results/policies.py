@@ -14,7 +14,7 @@ import pandas as pd
 from tsmlib.figures.method import Method
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.study.results import table
-from tsmlib.study.results.planning import ARRIVED
+from tsmlib.study.results.planning import ARRIVED, ordered
 from tsmlib.study.results.table import PolicyHeader, Row
 
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration of learning (A.3)
@@ -119,7 +119,7 @@ def _records(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
-    """The input of ``figures.figure7``: task -> method -> curves, from rows of policies; others are passed over.
+    """The input of ``figures.figure7``: task -> method -> curves, from rows of policies, in the order of the zoo.
 
     Copies and seeds of a method are its k lines. Seconds are the CPU's where a table has them, else the clock's, which
     are more on a busy machine; training of the model is counted. ValueError where lines were not measured at the same
@@ -131,7 +131,7 @@ def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
             curves.setdefault(task, {})[method] = _curves(own)
         except ValueError as error:
             raise ValueError(f"{task}, {method.label}: {error}") from None
-    return curves
+    return {task: {method: rows[method] for method in ordered(rows)} for task, rows in curves.items()}
 
 
 def _curves(own: pd.DataFrame) -> Curves:
