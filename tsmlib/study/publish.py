@@ -16,10 +16,10 @@ from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, EnvSpec
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import drawings, needed, notebooks, runs, zoo
+from tsmlib.study import drawings, needed, notebooks, plans, runs, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
-from tsmlib.study.claims.claim import DEFINITIONAL
+from tsmlib.study.claims.claim import DEFINITIONAL, VERDICTS
 from tsmlib.study.drawings import Drawing
 from tsmlib.study.notebooks import require
 from tsmlib.study.results import exploration as exploration_results
@@ -43,8 +43,8 @@ ASKED = {  # parameters for these cells: without the plain arm, and plans for fe
 }  # fmt: skip
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
-README_MODELS = (PAPERS, OURS, "onestep", "lstm")
-README_CLAIMS = ("C27", "C32", "C53")  # what the paper says of predictions, plans and prior
+README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
+README_CLAIMS = ("C02", "C27", "C32", "C53")  # what the paper says of predictions, plans and prior
 POOLED = (
     "03_predict",
     "04_latent",
@@ -231,7 +231,7 @@ def drawings_of_rows() -> Iterator[Drawing]:
 
 
 def readme_results() -> str:
-    """Four models by four numbers: on pushing, or on reaching as long as pushing has no rows of the paper's model."""
+    """Five models by four numbers: on pushing, or on reaching as long as pushing has no rows of the paper's model."""
     predict, control = _shipped("03_predict"), _shipped("05_control")
     pushed = all(len(table.select(rows, env=PUSH, model=PAPERS)) for rows in (predict, control))
     env = PUSH if pushed else REACH
@@ -280,11 +280,16 @@ def _seeds(rows: pd.DataFrame) -> str:
 
 def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
     """Three sentences: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
-    carrying = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
-    said = "; ".join(f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" for verdict in carrying)
+    carrying = [verdict for verdict in papers if verdict.claim.headline]
+    given = ", ".join(
+        f"{len(same)} {word.lower()} ({', '.join(verdict.claim.id for verdict in same)})"
+        for word in VERDICTS if (same := [verdict for verdict in carrying if verdict.word == word])
+    )  # fmt: skip
+    named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
+    said = "; ".join(f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" for verdict in named)
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
 With `{OURS}` in its place, {claims_report.counts(ours)}.
-What carries the paper, with its own model: {said}."""
+Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
 
 
 # Pages of docs/ ------------------------------------------------------------------------------------------------------
@@ -372,6 +377,11 @@ over steps. A candidate is judged by the mode of the model; of an ensemble, as `
 sorts the candidates and the best quarter is judged by the mean over all members (`cem(screened=)`).
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
+
+By gradients, as the paper plans (Adam, {plans.ITERATIONS['adam']['paper']} iterations from zero); training seeds that have such
+rows:
+
+{planning_results.plans_table(control[control["metric"] != "plan_seconds"], planner="adam")}
 
 ## Pushing, target by target
 
