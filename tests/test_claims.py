@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ from tsmlib.study.claims.query import (
     log,
 )  # fmt: skip
 from tsmlib.study.claims.shown import FIGURE5
-from tsmlib.study.runs import NOTEBOOKS, ROOT
+from tsmlib.study.runs import NOTEBOOKS, ROOT, RunError, resolve
 from tsmlib.study.zoo import OURS, PAPERS
 
 Rows = list[dict[str, Any]]
@@ -362,6 +363,14 @@ def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows(
     assert {c.subject for c in questions} == {"rtsm"}
     rows = evaluate.tables(questions)
     assert "NOT TESTABLE" not in {evaluate.judge(question, rows).word for question in questions}
+
+
+@pytest.mark.parametrize("table", ["03_predict", "03_ablation", "05_control_rows"])
+def test_a_table_that_cells_wrote_by_hand_judges_no_claim(table: str, tmp_path: Path) -> None:
+    run = resolve("08_claims", scale="paper", run_dir=str(tmp_path))
+    tables_storage.save(run.metrics / f"{table}.csv", [dict(metric="return_true", value=0.0, seed=0, scale="paper")])
+    with pytest.raises(RunError, match=f"{table[:3]}[a-z]* in .* is not run, expected complete"):
+        evaluate.tables(LEDGER, run)
 
 
 @pytest.mark.parametrize("claim", [*LEDGER, *ledger.questions()], ids=lambda c: c.id)

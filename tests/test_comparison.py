@@ -15,7 +15,7 @@ from tsmlib import figures, study
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
 from tsmlib.storage.files import StoreError
-from tsmlib.study import predictions
+from tsmlib.study import comparison
 from tsmlib.study.results import latent, planning, prediction, table
 from tsmlib.study.runs import Run
 
@@ -40,7 +40,7 @@ def plans(n: int = 8, *, env: str = REACH, model: str = "tsm", planner: str = "c
 @pytest.fixture
 def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of published results: TSM at reaching, training seed 0, 100 targets."""
-    monkeypatch.setattr(predictions, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(comparison, "RESULTS", tmp_path / "results")
     means, targets = plans(100, seed=0, scale="paper")
     tables.save(tmp_path / "results" / "05_control.csv", means)
     tables.save(tmp_path / "results" / "05_control_rows.csv", targets)

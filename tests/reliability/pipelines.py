@@ -81,12 +81,12 @@ def killed_runs(trials: int) -> Outcome:
 
 
 def cells_out_of_order(trials: int) -> Outcome:
-    """R12: each cell of a notebook alone, and its cells in random order: no table that is then taken for a result.
+    """R12: each cell of a notebook alone, and its cells in random order: a table is said not to be the notebook's.
 
-    A table that comes about in this way may say anything, and so counts for nothing: without a complete run in
-    a status nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
+    A table that comes about in this way may say anything: the cell that writes it says so, and without a complete run
+    in a status nothing downstream reads it. What a cell needs and does not find is a NameError or an error of ours.
     """
-    from reliability.training import answer, kernel
+    from reliability.training import kernel, printed
 
     found, tables = Outcome(), 0
     for word, notebook in runs.notebooks().items():
@@ -96,9 +96,12 @@ def cells_out_of_order(trials: int) -> Outcome:
             for order in [[index] for index in range(len(cells))] + mixed:
                 with folder() as place:
                     anew = f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"
-                    answer(client, client.execute(anew))
+                    printed(client, anew)
                     for index in order:
-                        reply = answer(client, client.execute(cells[index], stop_on_error=False))  # nor the next one
+                        before = written(place)
+                        reply, said = printed(client, cells[index])
+                        if new := written(place) - before:
+                            found.count("may differ from the notebook's" in said, f"{word}, cell {index}: {new}")
                         ours = ("NameError", "StoreError", "ParameterError", "RunError")
                         known = reply["status"] == "ok" or reply["ename"] in ours
                         found.count(
@@ -108,8 +111,13 @@ def cells_out_of_order(trials: int) -> Outcome:
                     run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
                     said = refusal(lambda: notebooks.require(run, notebook.stem), RunError)  # noqa: B023
                     found.count(f"python -m tsmlib run {word} --scale smoke" in said, f"{word}: {said}")
-    found.note = f"{tables} tables came about; none is taken for a result"
+    found.note = f"{tables} tables came about; each is said, none taken for a result"
     return found
+
+
+def written(place: Path) -> set[tuple[str, int]]:
+    """Each table below a folder, and when it was written."""
+    return {(path.name, path.stat().st_mtime_ns) for path in place.rglob("metrics/*.csv")}
 
 
 def notebooks_in_any_order(trials: int) -> Outcome:

@@ -454,6 +454,18 @@ def answer(client: Any, request: str) -> dict[str, Any]:
             return reply["content"]
 
 
+def printed(client: Any, cell: str) -> tuple[dict[str, Any], str]:
+    """The reply to a cell, and what it prints."""
+    found: list[str] = []
+
+    def hook(message: dict[str, Any]) -> None:
+        if message["msg_type"] == "stream":
+            found.append(message["content"]["text"])
+
+    reply = client.execute_interactive(cell, output_hook=hook, timeout=3600, stop_on_error=False)  # nor the next one
+    return reply["content"], "".join(found)
+
+
 def run(client: Any, cell: str) -> str:
     """The value that a cell shows."""
     shown: list[str] = []

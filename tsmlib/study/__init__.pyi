@@ -2,6 +2,7 @@ from .comparison import evidence as evidence
 from .comparison import evidence_of as evidence_of
 from .comparison import published as published
 from .comparison import save_evidence as save_evidence
+from .comparison import table as table
 from .data import SPLITS as SPLITS
 from .data import TASK_SEED as TASK_SEED
 from .data import dataset as dataset
@@ -37,7 +38,6 @@ from .predictions import pooled_rows as pooled_rows
 from .predictions import score_all as score_all
 from .predictions import score_rows as score_rows
 from .predictions import scores as scores
-from .predictions import table as table
 from .robots import model_rows as model_rows
 from .robots import reference_rows as reference_rows
 from .runs import RESULTS as RESULTS

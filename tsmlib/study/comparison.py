@@ -6,8 +6,9 @@ import pandas as pd
 
 from tsmlib.storage import tables
 from tsmlib.study import predictions
+from tsmlib.study.notebooks import require
 from tsmlib.study.results.table import PUBLISHED, YOURS
-from tsmlib.study.runs import Run
+from tsmlib.study.runs import RESULTS, Run, RunError
 
 
 def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "") -> pd.DataFrame:
@@ -23,7 +24,7 @@ def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], tabl
 
 def published(table: str) -> pd.DataFrame:
     """A table that ships; without rows where there is none."""
-    path = predictions.RESULTS / f"{table}.csv"
+    path = RESULTS / f"{table}.csv"
     return tables.load(path) if tables.stored(path) else tables.frame([])
 
 
@@ -34,9 +35,25 @@ def save_evidence(run: Run, rows: Iterable[Mapping[str, object]]) -> pd.DataFram
 
 
 def evidence_of(run: Run, notebook: str) -> pd.DataFrame:
-    """``evidence`` of another notebook's table; of this run's rows those of this seed, where it ran there."""
-    own, published = run.metrics / f"{notebook}.csv", predictions.RESULTS / f"{notebook}.csv"
-    return _sourced(*(tables.load(path) if tables.stored(path) else tables.frame([]) for path in (published, own)))
+    """``evidence`` of another notebook's table; of this run's rows those of this seed.
+
+    Where that notebook did not come to its end in this run, or its table was changed since, they are left out, and it
+    is said.
+    """
+    own, path = tables.frame([]), run.dir / "metrics" / f"{notebook}.csv"
+    if path.exists():
+        try:
+            require(run, notebook)
+            own = tables.load(path)
+        except RunError as error:
+            print(f"your rows are left out: {error}")
+    return _sourced(published(notebook), own)
+
+
+def table(run: Run, name: str) -> pd.DataFrame:
+    """A benchmark's table, which no notebook writes: this run's, else the published one; ``source`` says which."""
+    none, path = tables.frame([]), run.dir / "metrics" / f"{name}.csv"
+    return _sourced(none, tables.load(path)) if path.exists() else _sourced(published(name), none)
 
 
 def _sourced(published: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:

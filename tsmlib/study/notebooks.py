@@ -98,7 +98,7 @@ def require(run: Run, notebook: str) -> Mapping[str, Json]:
     from tsmlib.storage import manifest
 
     name = next((each.name for each in notebooks().values() if each.stem == notebook), "all")
-    command = f"python -m tsmlib run {name} --scale {run.scale} --seed {run.seed}"
+    command = run.command(name)
     entries = manifest.statuses(run.dir)
     entry = entries.get(notebook, {"state": "not run"})
     state = entry.get("state") if isinstance(entry, dict) else "damaged"

@@ -22,9 +22,9 @@ from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, le
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
 from tsmlib.storage import artifacts, tables
 from tsmlib.storage.files import Json
+from tsmlib.study.comparison import table
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
-from tsmlib.study.predictions import table
 from tsmlib.study.results.policies import EPISODES, finished, learning_curves, learning_rows, plateau_rows
 from tsmlib.study.results.table import PolicyHeader, Row, of_task
 from tsmlib.study.runs import Run
@@ -155,7 +155,7 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
         )  # fmt: skip
     if run.scale == "laptop":
         return rows
-    free = finished(table(run, "model_free.csv"))
+    free = finished(table(run, "model_free").drop(columns="source"))
     curves = learning_curves(tables.frame(pd.concat([tables.frame(rows), free[free["seed"] == run.seed]])))
     for task in {task.env: task for task, *_ in wanted}.values():
         compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}

@@ -18,7 +18,7 @@ from tsmlib.study.data import dataset
 from tsmlib.study.models import load_or_train
 from tsmlib.study.notebooks import require
 from tsmlib.study.results import prediction as prediction_results
-from tsmlib.study.runs import RESULTS, Run, RunError
+from tsmlib.study.runs import Run, RunError
 from tsmlib.trajectory import Segment
 
 
@@ -101,14 +101,6 @@ def pooled_rows(
                 continue
             parts.append(tables.load(path))
     return tables.frame(pd.concat(parts))
-
-
-def table(run: Run, name: str) -> pd.DataFrame:
-    """A run's table, else the published one; without rows where neither is there."""
-    for path in (run.metrics / name, RESULTS / name):
-        if tables.stored(path):
-            return tables.load(path)
-    return tables.frame([])
 
 
 def _unpacked(tensors: dict[str, torch.Tensor]) -> prediction.Scores:

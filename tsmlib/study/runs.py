@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from tsmlib.study import parameters
+from tsmlib.study import live, parameters
 from tsmlib.study.parameters import ParameterError, Value
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -57,7 +57,16 @@ class Run:
 
     @property
     def metrics(self) -> Path:
-        """Tables: ``<notebook>.csv`` and ``<notebook>_rows.csv``."""
+        """Tables: ``<notebook>.csv`` and ``<notebook>_rows.csv``, to be written; ``notebooks.require`` before reading.
+
+        A live kernel whose cells did not run as the notebook's do says so.
+        """
+        own = [each for each in notebooks().values() if each.stem == self.notebook]
+        if own and (how := live.deviation(own[0].path)):
+            print(
+                f"{how}: a table that this cell writes may differ from the notebook's, and nothing else reads it. Run "
+                f"all cells from the first, or: {self.command(own[0].name)}"
+            )
         return self.folder("metrics")
 
     @property
@@ -86,6 +95,10 @@ class Run:
         texts = (folder.name.removeprefix("seed") for folder in self.dir.parent.glob("seed*"))
         seeds = sorted(int(text) for text in texts if text.isdecimal())
         return [replace(self, seed=seed, dir=self.dir.with_name(f"seed{seed}")) for seed in seeds]
+
+    def command(self, name: str) -> str:
+        """The command line that executes a notebook in this run."""
+        return f"python -m tsmlib run {name} --scale {self.scale} --seed {self.seed}"
 
     def folder(self, name: str = ".") -> Path:
         """A folder of this run, made if need be."""
@@ -133,7 +146,8 @@ def resolve(
     others: the notebook's other parameters. All are checked here and nowhere else, whichever way they came.
     Raises ParameterError naming the value and what is allowed.
     """
-    if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()):
+    if shell := live.shell():
+        live.watch(shell)
         parameters.require_declared(shell.user_ns.get("In", []), notebook)
         _record_written()
     parameters.check("seed", seed)

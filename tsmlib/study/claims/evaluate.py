@@ -173,13 +173,13 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
     names = sorted(files | {f"{file}_rows" for file in files})
     paths = {name: tables_storage.stored(RESULTS / f"{name}.csv") for name in names}
     rows = {name: tables_storage.load(path) for name, path in paths.items() if path}
-    stems = {notebook.stem for notebook in notebooks().values()}
+    stems = {notebook.stem[:3]: notebook.stem for notebook in notebooks().values()}  # 03_ablation is 03_predict's
     runs = run.seeds() if run and run.scale == "paper" else []
     for one, name in itertools.product(runs, names):
         if not (path := one.dir / "metrics" / f"{name}.csv").exists():
             continue
-        if name in stems:
-            require(one, name)
+        if name[:3] in stems:
+            require(one, stems[name[:3]])
         own = tables_storage.load(path)
         shipped = rows.get(name, own[:0])
         rows[name] = pd.concat([shipped[~shipped["seed"].isin(own["seed"])], own], ignore_index=True)
