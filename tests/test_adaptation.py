@@ -108,11 +108,10 @@ def _check_priors(rows: pd.DataFrame) -> None:
 
 
 def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_one_never_gets_there() -> None:
-    start = dict(env_steps=900, env=PUSH, data=results.PLANNED)
     better = {results.FIRST_PRIOR: [-9, -5, -5], results.LAST_PRIOR: [-4, -3, -2]}
     worse = {results.FIRST_PRIOR: [-9, -6, -5], results.LAST_PRIOR: [-9, -8, -7]}
     for curves, needed, said in ((better, [1, 0], "0.0"), (worse, [2], "> 2")):
-        rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, **start))
+        rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, env_steps=900, env=PUSH, data=results.PLANNED))
         assert table.select(rows, metric="iterations_to_same_return")["value"].tolist() == needed
         cells = [cell.strip() for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")]
         assert cells[4:] == [f"{needed[0]:.1f}", said, "25"]
@@ -124,6 +123,7 @@ def test_the_map_has_as_many_episodes_of_each_source() -> None:
     assert [*found] == ["fingertip: few", "fingertip: many", "object: few", "object: many"]
     assert {points.shape for points in found.values()} == {(2 * (rounds.HORIZON + 1), 2)}
     np.testing.assert_array_equal(found["object: few"], seen["few"].states[..., 6:8].reshape(-1, 2))
+    assert {ax.get_aspect() for ax in figures.visited(found, ("x", "y"), {}, equal=True).axes} == {1.0}
 
 
 def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
