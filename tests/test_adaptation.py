@@ -11,7 +11,7 @@ from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
-from tsmlib.storage import tables
+from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, publish, rounds, runs
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
@@ -48,7 +48,7 @@ def test_a_fine_tuned_model_of_the_standard_arm_predicts_the_weak_one_better_tha
 
 @pytest.mark.parametrize(("word", "lacks"), [("lstm", set()), ("ensemble+mse", {"highest"})])  # what a prior does
 def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lacks: set[str]) -> None:
-    rows = tables.frame(rounds.loop(RUN, word))
+    rows = tables.frame(rounds.loop(RUN, word).rows)
     assert set(rows["metric"]) == set(results.ROUNDS[PENDULUM]) - lacks
     assert rows["env_steps"].unique().tolist() == [400, 600]
     titles = ["executed return", "size of the gap"]
@@ -63,7 +63,8 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
 def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) -> None:
     sizes = rounds.WORLDS[PUSH].sizes["smoke"]
     found = [rounds.loop(RUN, "lstm", env=PUSH, data=data, folder=tmp_path) for data in results.DATA]
-    rows = tables.frame([row for part in found for row in part])
+    everything = tables.frame([row for part in found for row in part.rows])
+    rows = table.select(everything, execution="closed loop")
     assert set(rows["metric"]) == set(results.ROUNDS[PUSH])
     assert set(rows["sim"]) == {"mujoco"}
     first, last = 100 * sizes.first, 100 * (sizes.first + sizes.episodes)
@@ -77,10 +78,56 @@ def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) 
     assert results.round_panels(rows, ["share within 5 cm"]) == {}  # of the pendulum, nothing
     assert "share within 5 cm" in results.rounds_table(rows, PUSH)
     assert f"`{PUSH}`, `lstm` on {results.NONE}, round 0 -> 1: executed return" in results.sentences(rows)
+    _check_episodes(everything, found, [first, last])
+    _check_priors(everything)
+
+
+def _check_episodes(rows: pd.DataFrame, loops: list[rounds.Loop], steps: list[int]) -> None:
+    """Contacts are counted in the episodes of each round, and none where none were collected."""
+    contacts = table.select(rows, metric="contacts_per_episode")
+    for data, at, loop in zip(results.DATA, (steps, steps, steps[:1]), loops, strict=True):
+        own = table.select(contacts, configuration=data)
+        assert own["env_steps"].tolist() == at
+        assert own["value"].tolist() == [rounds.met(each)["contacts_per_episode"] for each in loop.episodes if each]
+        assert own["n"].tolist() == [len(each) for each in loop.episodes if each]
+    assert "contacts per episode" in results.rounds_table(rows, PUSH)
+    assert "contacts per episode" not in results.rounds_table(table.select(rows, execution="closed loop"), PUSH)
+
+
+def _check_priors(rows: pd.DataFrame) -> None:
+    """Both priors are searched as long, and the search of the first comes to its own return."""
+    curves = table.select(rows, execution="open loop", metric="return_true")
+    assert curves.groupby(["configuration", "subset"])["iteration"].max().tolist() == [2] * 6
+    first = table.select(curves, subset=results.FIRST_PRIOR)
+    assert first.groupby("iteration")["value"].nunique().tolist() == [1, 1, 1]  # of one prior
+    needed = table.select(rows, metric="iterations_to_same_return", subset=results.FIRST_PRIOR)
+    assert len(needed) == 3
+    assert needed["value"].max() <= 2
+    assert results.ways_table(rows) == ""  # which are open loop as well
+    assert "iterations of the last prior" in results.priors_table(rows)
+
+
+def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_one_never_gets_there() -> None:
+    better = {results.FIRST_PRIOR: [-9, -5, -5], results.LAST_PRIOR: [-4, -3, -2]}
+    worse = {results.FIRST_PRIOR: [-9, -6, -5], results.LAST_PRIOR: [-9, -8, -7]}
+    for curves, needed, said in ((better, [1, 0], "0.0"), (worse, [2], "> 2")):
+        rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, env_steps=900, env=PUSH, data=results.PLANNED))
+        assert table.select(rows, metric="iterations_to_same_return")["value"].tolist() == needed
+        cells = [cell.strip() for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")]
+        assert cells[4:] == [f"{needed[0]:.1f}", said, "25"]
+
+
+def test_the_map_has_as_many_episodes_of_each_source() -> None:
+    seen = {"few": rounds.world(PUSH).random(2, 0), "many": rounds.world(PUSH).random(5, 1)}
+    found = rounds.places(seen)
+    assert [*found] == ["fingertip: few", "fingertip: many", "object: few", "object: many"]
+    assert {points.shape for points in found.values()} == {(2 * (rounds.HORIZON + 1), 2)}
+    np.testing.assert_array_equal(found["object: few"], seen["few"].states[..., 6:8].reshape(-1, 2))
+    assert {ax.get_aspect() for ax in figures.visited(found, ("x", "y"), {}, equal=True).axes} == {1.0}
 
 
 def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = rounds.loop(RUN, "rtsm", env=PUSH)
+    whole = rounds.loop(RUN, "rtsm", env=PUSH).rows
 
     def killed(*given: object, **named: object) -> None:
         raise KeyboardInterrupt
@@ -89,9 +136,10 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
         patched.setattr(rounds, "explore", killed)
         with pytest.raises(KeyboardInterrupt):
             rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path)
-    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path) == whole
-    monkeypatch.setattr(rounds, "measure", lambda *given: killed)  # without any work
-    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path) == whole
+    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
+    for name in ("measure", "search"):  # without any work
+        monkeypatch.setattr(rounds, name, lambda *given: killed)
+    assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
 
 
 @pytest.mark.parametrize(("given", "said"), [
@@ -157,6 +205,24 @@ def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monke
         "executed return"
     ].items()
     assert (method.model, at.tolist()) == ("pets", [75_000])
+
+
+def test_every_loop_of_one_call_is_published_beside_those_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = dict(env=PUSH, metric="return_true", value=-9.0, seed=0, scale="smoke", iteration=0, env_steps=600)
+    (tmp_path / "results").mkdir()
+    tables.save(tmp_path / "results" / "10_explore.csv", [row | dict(model="pets", configuration="own plans")])
+    manifest.write_manifest(tmp_path)  # from now on a table that is not as it says is refused
+    monkeypatch.setattr(runs, "RESULTS", tmp_path / "results")
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path / "runs"))
+    monkeypatch.setattr(
+        rounds, "loop", lambda run, word, *, data, **_: rounds.Loop([row | dict(model=word, configuration=data)], [])
+    )
+    options = ["rounds", "--scale", "smoke", "--envs", PUSH, "--models", "rtsm", "lstm"]
+    run_script(ROOT / "benchmarks" / "settings" / "rows.py", *options)
+    found = tables.load(tmp_path / "results" / "10_explore.csv")
+    assert found["model"].tolist() == ["pets", "rtsm", "rtsm", "lstm", "lstm"]
 
 
 def test_every_variant_changes_the_pushing_arm_and_those_of_the_mass_no_reacher() -> None:

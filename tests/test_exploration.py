@@ -65,6 +65,7 @@ def test_every_round_adds_its_episodes_and_trains_model_and_prior() -> None:
     assert len(found.train) == 6 + 2 * (EPISODES - 1)
     assert len(found.held_out) == 2 + 2
     assert [record["env_steps"] for record in found.records] == [EPISODES * HORIZON, 2 * EPISODES * HORIZON]
+    assert [each and len(each) for each in found.episodes] == [EPISODES, EPISODES]
     for record in found.records:
         assert record.keys() >= {
             "executed_return", "success", "final_distance", "predicted_return", "gap", "validation", "prior_validation",
@@ -134,6 +135,7 @@ def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> N
     found = explored(*learned, tasks=unasked, episodes=given, folder=tmp_path)
     assert (len(found.train), len(found.held_out)) == (6 + EPISODES - 1, 2 + 1)
     assert [record["env_steps"] for record in found.records] == [EPISODES * HORIZON] * 2
+    assert [each and len(each) for each in found.episodes] == [EPISODES, None]
     again = learners()
     assert explored(*again, tasks=unasked, episodes=given, folder=tmp_path).records == found.records
     assert bits(*again) == bits(*learned)

@@ -90,7 +90,7 @@ class ExplorationOptions:
 
 @dataclass
 class Exploration:
-    """What ``explore`` leaves: all data, and a record of each round.
+    """What ``explore`` leaves: all data, the episodes of each round (None: it had no new ones), and its record.
 
     records: ``round``; ``env_steps`` executed up to and with it; ``executed_return`` and, by the task's measures,
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
@@ -101,6 +101,7 @@ class Exploration:
     train: Trajectories
     held_out: Trajectories
     records: list[dict[str, float]] = field(default_factory=list)
+    episodes: list[Trajectories | None] = field(default_factory=list)
 
 
 def explore(
@@ -156,6 +157,7 @@ def explore(
                 _collected(k, model, prior, train, tasks, options, seed, place)
                 if episodes is None else (episodes(k), dict[str, float]())
             )  # fmt: skip
+            found.episodes.append(new)
             before = found.records[-1]["env_steps"] if found.records else 0
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))

@@ -18,7 +18,9 @@ gradients: their errors (02_train). collect and latent execute 01_collect and 04
 and --models, as far as these ask for them, and publish what their tables then say.
 
 rounds: of exploration on --envs, by default the pendulum, by each of --data: own plans, as many random episodes, or no
-new ones (the same training alone). What was trained stays in the run's folder, where a loop that was killed goes on.
+new ones (the same training alone); of pushing also contacts in each round's episodes, and how soon a search through
+the true simulator returns as much in codes of the last prior as in those of the first. What was trained stays in the
+run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
 reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
 beside them, in the files that are named: mbrl-lib's loop (benchmarks/peers) in 10_explore, policies without a model
@@ -74,10 +76,11 @@ def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
 
 
 def publish(name: str, rows: pd.DataFrame | Iterable[Row]) -> None:
-    """Merge rows into a table of data/results."""
+    """Merge rows into a table of data/results, and its new checksum into the manifest."""
     path = RESULTS / f"{name}.csv"
     table = merged(tables.load(path) if tables.stored(path) else tables.frame([]), rows)
     tables.ship(path, table)
+    manifest.write_manifest(Path(RESULTS).parent)
     print(f"{path.name}: {len(table)} rows")
 
 
@@ -150,6 +153,7 @@ def published_peers(files: list[Path]) -> None:
         publish("10_explore", loops)
     if len(policies):  # whole: a learner's steps may have been others before
         tables.save(RESULTS / "10_model_free.csv", policies)
+        manifest.write_manifest(Path(RESULTS).parent)
 
 
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
@@ -186,7 +190,6 @@ def main() -> None:
         parser.error(f"peers, and nothing else, takes tables that are there; got {missing or given.files or 'none'}")
     if given.part == "peers":
         published_peers(given.files)
-        manifest.write_manifest(Path(RESULTS).parent)
         return
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
@@ -207,7 +210,7 @@ def main() -> None:
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":
         for env, word, data in wanted_rounds(parser, given):
-            publish(notebook, rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds")))
+            publish(notebook, rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds")).rows)
     elif given.part == "adaptation":
         for env in wanted_arms(parser, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))
@@ -229,7 +232,6 @@ def main() -> None:
         rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)
         publish(f"{notebook}_rows", targets)
-    manifest.write_manifest(Path(RESULTS).parent)
 
 
 if __name__ == "__main__":

@@ -92,11 +92,15 @@ def _checked(word: str, at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray,
 
 
 @styled
-def visited(states: Mapping[str, np.ndarray], labels: tuple[str, str], notes: Mapping[str, str]) -> Figure:
-    """States on a plane, a panel for each source: title -> (n, 2); labels: of both axes; notes: below a title."""
+def visited(
+    states: Mapping[str, np.ndarray], labels: tuple[str, str], notes: Mapping[str, str], *, equal: bool = False
+) -> Figure:
+    """States on a plane, a panel for each source: title -> (n, 2); labels: of both axes; notes: below a title; equal:
+    axes of one scale."""
     figure, grid = panels(len(states), len(states), 1.75, head=0, sharex=True, sharey=True)
     for ax, (title, points) in zip(grid, states.items(), strict=True):
         ax.plot(*shaped(title, points, "n 2").T, ".", ms=1.6, mew=0, alpha=0.5, color=DARK)
         ax.set(title="\n".join(filter(None, (title, notes.get(title, "")))), xlabel=labels[0])
+        ax.set_aspect("equal" if equal else "auto")
     grid[0].set_ylabel(labels[1])
     return figure

@@ -477,4 +477,11 @@ fewest of rounds are their random episodes:
 
 {beside}
 """
+    if priors := exploration_results.priors_table(rows):
+        page += f"""
+A search through the true simulator, which favours no prior, in codes of the prior before the first round and of the
+last, from the first n frozen starts: returns that it ends with, and iterations to that of the first prior:
+
+{priors}
+"""
     return page

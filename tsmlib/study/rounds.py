@@ -11,7 +11,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from tsmlib.collection import collect, collect_random, open_loop
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import make_simulation
 from tsmlib.envs.symmetry import symmetric
+from tsmlib.evaluation.data import contact_counts, shares
 from tsmlib.exploration import ExplorationOptions, Measure, Trainable, explore
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
@@ -28,14 +29,16 @@ from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.planning.base import Planner, SearchSpace
 from tsmlib.planning.execution import mpc
 from tsmlib.planning.planners import cem
+from tsmlib.planning.predictors import simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
+from tsmlib.rewards import BLOCK, TIP
 from tsmlib.storage import files
 from tsmlib.storage.files import Json
 from tsmlib.study import zoo
 from tsmlib.study.data import random_data
 from tsmlib.study.results import exploration as results
-from tsmlib.study.results.exploration import HORIZON, PENDULUM, PLANNED, PUSH, RANDOM
+from tsmlib.study.results.exploration import FIRST_PRIOR, HORIZON, LAST_PRIOR, PENDULUM, PLANNED, PUSH, RANDOM
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 from tsmlib.study.tasks import draw_task, load_task
@@ -44,6 +47,8 @@ from tsmlib.trajectory import Trajectories
 
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans
 TESTED = 1000  # seed of the pendulum's starts that measure, of no round
+SEARCHED = 25  # starts of the searches in which two priors are compared, at most
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,8 @@ class Sizes:
     """Of a loop: random episodes before it, rounds, episodes of each, updates of each training, starts that measure.
 
     candidates, elites, iterations: of every plan; one is made every ten steps. before: updates of the model before the
-    first round; prior: updates of each training of the prior; 0: as many as the model has in a round.
+    first round; prior: updates of each training of the prior; 0: as many as the model has in a round. searches:
+    iterations of the search in which the first prior and the last are compared (``search``); 0: they are not.
     """
 
     first: int
@@ -64,6 +70,7 @@ class Sizes:
     iterations: int
     before: int = 0
     prior: int = 0
+    searches: int = 0
 
     def training(self, past_len: int, future_len: int, *, updates: int = 0, muon: float = 0.0) -> TrainingOptions:
         """Of a model or a prior, by default in a round."""
@@ -130,6 +137,36 @@ def plane(data: Trajectories) -> np.ndarray:
     """Angle from upright (rad) and angular velocity (rad/s) of every state (n, 2)."""
     cos, sin, speed = np.concatenate([x[: n + 1] for x, n in zip(data.states, data.steps, strict=True)]).T
     return np.stack([np.arctan2(sin, cos), speed], axis=1)
+
+
+def met(data: Trajectories) -> dict[str, float]:
+    """Contacts of arm and object, ``results.EPISODES``: share of the episodes that have one, and mean number."""
+    return {
+        "contact_share": shares(data.states, data.env)["contact_share"],
+        "contacts_per_episode": float(contact_counts(data.states, data.env).mean()),
+    }
+
+
+def places(seen: Mapping[str, Trajectories], n: int = 24) -> dict[str, np.ndarray]:
+    """Where fingertip and object are (m) in up to ``n`` episodes of each, as many of all: title -> (states, 2)."""
+    n = min(n, *map(len, seen.values()))
+    return {
+        f"{body}: {title}": data.states[:n, :, where].reshape(-1, 2)
+        for body, where in (("fingertip", TIP), ("object", BLOCK)) for title, data in seen.items()
+    }  # fmt: skip
+
+
+def search(prior: ActionPrior, sizes: Sizes, seed: int, env: str) -> list[float]:
+    """Return of the best plan so far after each iteration of a search in codes of the prior; mean over starts.
+
+    The true simulator judges, the one model that favours no prior: a learned one is right where the episodes of one of
+    them were, and a search also finds its errors. So predicted return is executed return.
+    """
+    task = world(env).tested(min(sizes.starts, SEARCHED))
+    plan = planner(replace(sizes, iterations=sizes.searches), seed)(
+        simulator_predictor(task, task.start), task.reward, space_of(prior, env), len(task)
+    )
+    return [float(value) for value in plan.curve.mean(1)]
 
 
 def planner(sizes: Sizes, seed: int) -> Planner:
@@ -200,8 +237,9 @@ WORLDS = {
     # the model-free learners take. Hidden sizes are those that make an update of both models equally long.
     PUSH: World(
         {
-            "smoke": Sizes(6, 1, 3, 2, 2, 4, 2, 1), "laptop": Sizes(100, 2, 10, 300, 10, 48, 6, 3, 600, 200),
-            "paper": Sizes(500, 5, 50, 2500, 100, 64, 8, 3, 6000, 500),
+            "smoke": Sizes(6, 1, 3, 2, 2, 4, 2, 1, searches=2),
+            "laptop": Sizes(100, 2, 10, 300, 10, 48, 6, 3, 600, 200, searches=10),
+            "paper": Sizes(500, 5, 50, 2500, 100, 64, 8, 3, 6000, 500, searches=10),
         },
         {"rtsm": {"hidden": 96}, "lstm": {}},
         tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
@@ -224,6 +262,13 @@ def require(env: str, word: str) -> World:
     if word not in here.learners:
         raise ValueError(f"{word!r:.80} does not explore {env}; there are {', '.join(here.learners)}")
     return here
+
+
+class Loop(NamedTuple):
+    """What a loop leaves: rows, and the episodes of each round, the random ones first; None: it had no new ones."""
+
+    rows: list[Row]
+    episodes: list[Trajectories | None]
 
 
 class Learner(NamedTuple):
@@ -255,8 +300,8 @@ def learner(word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Pat
 def loop(
     run: Run, word: str, *, env: str = PENDULUM, data: str = PLANNED, sizes: Sizes | None = None,
     folder: Path | None = None,
-) -> list[Row]:  # fmt: skip
-    """Rows of a learner's rounds, round 0 before them.
+) -> Loop:  # fmt: skip
+    """A learner's rounds, round 0 before them.
 
     data: its own plans, or one of the other ``results.DATA`` in their place. sizes: by default the world's at the run's
     scale. Given a ``folder``, a loop that was killed goes on from there with the same bits, and loops of the same
@@ -274,19 +319,32 @@ def loop(
     def new(k: int) -> Trajectories | None:
         return here.random(sizes.episodes, _seed(seed, k)) if data == RANDOM else None
 
-    zero = _once(None if own is None else own / "round-0.json", {"sizes": asdict(sizes), "seed": seed},
-                 lambda: dict(measured(model, prior)))  # fmt: skip
+    made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed}
+    slug, curves = data.replace(" ", "-"), dict[str, list[float]]()
+    zero = _once(own and own / "round-0.json", made_from, lambda: dict(measured(model, prior)))
+    if prior and sizes.searches:
+        curves[FIRST_PRIOR] = _once(own and own / "prior-0.json", made_from, lambda: search(prior, sizes, seed, env))
     found = explore(
         model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
         options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
         progress=f"{env} {word}: {data}", measure=measured, augmented=here.augmented,
-        episodes=None if data == PLANNED else new, folder=None if own is None else own / data.replace(" ", "-"),
+        episodes=None if data == PLANNED else new, folder=own and own / slug,
     )  # fmt: skip
     records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **zero}, *found.records]
-    return results.round_rows(
+    rows = results.round_rows(
         run, word, records, sizes.starts, first=began * HORIZON, env=env, data=data,
         space="direct" if prior is None else "latent",
     )  # fmt: skip
+    episodes = [train.joined(held_out), *found.episodes]
+    if env == PUSH:
+        counted = [(k, len(each), met(each)) for k, each in enumerate(episodes) if each is not None]
+        rows += results.episode_rows(run, word, counted, env=env, data=data)
+    if prior and sizes.searches:
+        last = own and own / f"{slug}.prior.json"
+        curves[LAST_PRIOR] = _once(last, made_from, lambda: search(prior, sizes, seed, env))
+        n, steps = min(sizes.starts, SEARCHED), began * HORIZON + int(records[-1]["env_steps"])
+        rows += results.prior_rows(run, word, curves, n, env_steps=steps, env=env, data=data)
+    return Loop(rows, episodes)
 
 
 def _seed(seed: int, k: int) -> int:
@@ -294,15 +352,12 @@ def _seed(seed: int, k: int) -> int:
     return 100_000 * (seed + 1) + 1000 * k
 
 
-def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], dict[str, float]]) -> dict[str, float]:
+def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], T]) -> T:
     """What ``make`` gives, kept in a file: the same the next time, if it was made from the same."""
     if path is None:
         return make()
-    if (
-        path.exists()
-        and (kept := cast("dict[str, dict[str, float]]", files.loads(path.read_bytes())))["made from"] == made_from
-    ):
-        return kept["found"]
+    if path.exists() and (kept := cast(dict[str, Json], files.loads(path.read_bytes())))["made from"] == made_from:
+        return cast(T, kept["found"])
     found = make()
     files.write_bytes(path, files.dumps(path, {"made from": made_from, "found": cast(Json, found)}).encode())
     return found

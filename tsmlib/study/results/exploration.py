@@ -1,8 +1,12 @@
 """Results of 10_explore: rows of rounds of exploration and of adapted models; panels, tables and sentences from rows.
 
 Rounds are ``closed loop``; ``iteration`` is the round, ``env_steps`` were executed until then, random ones included,
-and ``configuration`` says whose episodes were learned from (DATA). Adapted models are ``open loop``; ``env_steps`` are
-those of the changed arm that they know, and ``configuration`` is the way (``study.adaptation``).
+and ``configuration`` says whose episodes were learned from (DATA). Rows of a round's episodes themselves (EPISODES)
+have the subset ``data`` and no execution. Returns of searches through the true simulator, in codes of the prior before
+round 1 (subset FIRST_PRIOR) and of the last (LAST_PRIOR), are ``open loop``; ``iteration`` is the planner's.
+
+Adapted models are ``open loop``, without a planner; ``env_steps`` are those of the changed arm that they know, and
+``configuration`` is the way (``study.adaptation``).
 """
 
 from __future__ import annotations
@@ -32,6 +36,8 @@ ROUNDS = {
     PENDULUM: {**_BOTH, "success": "share upright", "highest": "highest by random codes"},
     PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
 }
+EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
+FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
 SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
 WAYS = {
@@ -53,12 +59,7 @@ def round_rows(
 
     first: environment steps before round 1; data: one of DATA; space: that is searched.
     """
-    common = dict(
-        env=env, task=TASKS[env], model=word, planner="cem", horizon=HORIZON, execution=CLOSED, n=n, search_space=space,
-        configuration=data, seed=run.seed, scale=run.scale,
-    )  # fmt: skip
-    if env != PENDULUM:
-        common["sim"] = EnvSpec.parse(env).simulator
+    common = _of_loop(run, word, env, data) | dict(planner="cem", execution=CLOSED, n=n, search_space=space)
     return [
         common | dict(
             iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
@@ -66,6 +67,43 @@ def round_rows(
         )
         for record in records for metric in ROUNDS[env] if metric in record
     ]  # fmt: skip
+
+
+def episode_rows(
+    run: Run, word: str, found: Sequence[tuple[int, int, Mapping[str, float]]], *, env: str, data: str
+) -> list[Row]:
+    """EPISODES of each round that had any: the round, how many they are, and what was measured."""
+    rows, steps = list[Row](), 0
+    for k, n, numbers in found:
+        steps += HORIZON * n
+        common = _of_loop(run, word, env, data) | dict(planner="none", subset="data", n=n, env_steps=steps, iteration=k)
+        rows += [common | dict(metric=metric, value=value) for metric, value in numbers.items()]
+    return rows
+
+
+def prior_rows(
+    run: Run, word: str, curves: Mapping[str, Sequence[float]], n: int, *, env_steps: int, env: str, data: str
+) -> list[Row]:
+    """Return after each iteration of the search in codes of both priors, and of each the iterations to the return that
+    the first prior's search ends with; none where that is not reached."""
+    common = _of_loop(run, word, env, data) | dict(
+        planner="cem", execution=OPEN, search_space="latent", env_steps=env_steps, n=n
+    )  # fmt: skip
+    rows, level = list[Row](), curves[FIRST_PRIOR][-1]
+    for which, curve in curves.items():
+        each = common | dict(subset=which)
+        rows += [each | dict(iteration=i, metric="return_true", value=value) for i, value in enumerate(curve)]
+        there = next((i for i, value in enumerate(curve) if value >= level), None)
+        rows += [] if there is None else [each | dict(metric="iterations_to_same_return", value=float(there))]
+    return rows
+
+
+def _of_loop(run: Run, word: str, env: str, data: str) -> Row:
+    """The columns that all rows of a loop have in common."""
+    sim = {} if env == PENDULUM else {"sim": EnvSpec.parse(env).simulator}
+    return sim | dict(
+        env=env, task=TASKS[env], model=word, horizon=HORIZON, configuration=data, seed=run.seed, scale=run.scale
+    )  # fmt: skip
 
 
 def adapted_rows(
@@ -126,14 +164,40 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 @table.sourced
 def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
-    """A line for each learner and round."""
+    """A line for each learner and round, with the contacts of its episodes where they were counted."""
     lines = []
     keys = ["model", "configuration", "iteration"]
+    collected = table.select(rows, env=env, subset="data")
     for (word, data, k), own in table.groups(table.select(rows, env=env, execution=CLOSED), keys):
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{int(own['env_steps'].max()):,}"}
         for metric, title in ROUNDS[env].items():
             values = table.select(own, metric=metric)["value"]
             line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+        for metric, title in EPISODES.items() if len(collected) else ():
+            values = table.select(collected, model=word, configuration=data, iteration=k, metric=metric)["value"]
+            line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+        lines.append({**line, "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+@table.sourced
+def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
+    """A line for each learner: returns that a search through the true simulator ends with in codes of the first prior
+    and of the last, and the iterations of both to the former, "> 10" where a seed's search of ten does not reach it."""
+    lines = []
+    here = table.select(rows, env=env, execution=OPEN, subset=[FIRST_PRIOR, LAST_PRIOR])
+    for (word, data), own in table.groups(here, ["model", "configuration"]):
+        line: Row = {"model": f"`{word}`", "what": data}
+        returns, last = table.select(own, metric="return_true"), int(own["iteration"].max())
+        needed = table.select(own, metric="iterations_to_same_return")
+        for which in (FIRST_PRIOR, LAST_PRIOR):
+            ends = table.select(returns, subset=which, iteration=last)["value"]
+            line[f"return by the {which}"] = table.spell(ends, "{:.2f} ± {:.2f}")
+        for which in (FIRST_PRIOR, LAST_PRIOR):
+            found = table.select(needed, subset=which)["value"]
+            line[f"iterations of the {which}"] = (
+                table.spell(found, "{:.1f} ± {:.1f}") if len(found) == own["seed"].nunique() else f"> {last}"
+            )
         lines.append({**line, "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
@@ -175,7 +239,7 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
     """A line for each arm, model, way and number of episodes: both scores, and CPU seconds of training."""
     lines = []
     keys = ["env", "model", "configuration", "env_steps"]
-    for (env, word, way, steps), own in table.groups(table.select(rows, execution=OPEN), keys):
+    for (env, word, way, steps), own in table.groups(table.select(rows, execution=OPEN, planner="none"), keys):
         line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name, "episodes": int(steps) // 100}
         for metric, title in SCORES.items():
             for ahead, part in table.groups(table.select(own, metric=metric), "steps_ahead"):
