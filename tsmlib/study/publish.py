@@ -44,7 +44,7 @@ ASKED = {  # parameters for these cells: without the plain arm, and plans for fe
 MARKS = ("<!-- results -->", "<!-- end of results -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
-README_CLAIMS = ("C02", "C27", "C32", "C53")  # what the paper says of predictions, plans and prior
+README_CLAIMS = ("C02", "C32")  # what the paper says of predictions and plans
 POOLED = (
     "03_predict",
     "04_latent",
@@ -252,10 +252,10 @@ def readme_results() -> str:
     narrow = re.sub(r":-+", "---", re.sub(" +", " ", table.markdown(pd.DataFrame(lines))))  # README is to be short
     return f"""{narrow}
 
-*Published rows of `{env}`; means over training seeds (of predicting / of planning), half the 95 % t interval; -: no
-rows yet. Predicting: {episodes:,} test episodes, 90 steps open loop; error as a share of the data's deviation (nRMSE);
-energy score of 32 samples (the order by likelihood turns with its protocol). Planning: {targets} targets, CEM, codes;
-share: 1 for plans through the simulator, 0 for doing nothing; gap: mean size of predicted minus executed return.*
+*Published rows of `{env}`; means over training seeds (of predicting / of planning) ± half the 95 % t interval.
+Predicting: {episodes:,} test episodes, 90 steps open loop; error over the data's deviation (nRMSE), energy score of 32
+samples. Planning: {targets} targets, CEM over codes; share: 1 by the simulator, 0 for doing nothing; gap: mean size of
+predicted minus executed return.*
 {readme_loops(env)}"""
 
 
@@ -268,7 +268,7 @@ def readme_loops(env: str) -> str:
         f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
         "decoders, each trained as long as a baseline; on 50 validation targets one is level with the LSTM, and two "
         "LSTMs, or three baselines, judging together [plan as well](benchmarks/settings/README.md). "
-        "Costs: [target by target](docs/results.md#pushing-target-by-target)."
+        "[Target by target](docs/results.md#pushing-target-by-target)."
     )
 
 
@@ -282,7 +282,8 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
     """Three sentences: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
     carrying = [verdict for verdict in papers if verdict.claim.headline]
     given = ", ".join(
-        f"{len(same)} {word.lower()} ({', '.join(verdict.claim.id for verdict in same)})"
+        f"{len(same)} {word.lower()}"
+        + f" ({', '.join(verdict.claim.id for verdict in same)})" * (word in claims_report.DECIDED)
         for word in VERDICTS if (same := [verdict for verdict in carrying if verdict.word == word])
     )  # fmt: skip
     named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
@@ -378,8 +379,7 @@ sorts the candidates and the best quarter is judged by the mean over all members
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
-By gradients, as the paper plans (Adam, {plans.ITERATIONS['adam']['paper']} iterations from zero); training seeds that have such
-rows:
+By gradients, as the paper plans (Adam, {plans.ITERATIONS["adam"]["paper"]} iterations from zero), where there are rows:
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"], planner="adam")}
 
