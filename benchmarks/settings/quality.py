@@ -15,8 +15,9 @@ all lines are of one network. Nothing is taken from the test split:
     gap             mean size of predicted minus executed return, predicted by 32 samples that had no part in planning
     violations      share of those samples' steps that violate physics
 
-table prints the lines as Markdown, with what a doubling of the time buys: the slope of log value over log time between
-the last two lines of a model. figure draws them into figures/training_time.
+table prints the lines as Markdown, with the cost of the recurrent TSM minus that of each model trained as long, paired
+by target with half the 95 % t interval over targets, and what a doubling of the time buys, from each line of a model
+to the next. figure draws them into figures/training_time.
 """
 
 from __future__ import annotations
@@ -133,9 +134,16 @@ def doublings(lines: pd.DataFrame) -> pd.DataFrame:
 def tables(lines: pd.DataFrame) -> str:
     """Both tables, as Markdown."""
     values, changes = lines.sort_values(["env", "model", "seconds"], kind="stable"), doublings(lines)
+    costs = {
+        (line.env, line.model, line.seconds): np.array(str(line.costs).split(), float) for line in values.itertuples()
+    }
+    minus = [
+        "" if model == zoo.OURS or (ours := costs.get((env, zoo.OURS, seconds))) is None
+        else table.spell(ours - own, "{:+.2f} ± {:.2f}") for (env, model, seconds), own in costs.items()
+    ]  # fmt: skip
     spelled = values[["model", "seconds", "cpu_seconds", "updates", "muon"]].assign(
         **{title: values[name].map("{:.3g}".format) for name, title in MEASURES.items()},
-        **{"within 5 cm": values["within"].map("{:.0%}".format)},
+        **{"within 5 cm": values["within"].map("{:.0%}".format), f"cost of {zoo.OURS} minus this": minus},
     )
     if changes.empty:
         return table.markdown(spelled)
