@@ -52,7 +52,7 @@ FRESH_SEED = 2_000_004  # of episodes that no training, choice or published scor
 MEASURES = {  # column -> title and unit; of each a smaller value is better
     "energy_10": "energy score, 10 steps", "energy_80": "energy score, 80 steps", "energy": "energy score, mean",
     "nrmse_10": "nRMSE, 10 steps", "nrmse_80": "nRMSE, 80 steps", "cost": "cost of plans (m)", "gap": "gap (m)",
-    "violations": "physical violations (share of steps)",
+    "violations": "violations (share of steps)",
 }  # fmt: skip
 KEY = ["env", "model", "seed", "seconds", "muon"]
 
@@ -185,7 +185,7 @@ def main() -> None:
             }
             for name, title in MEASURES.items()
         }
-        style.save(drawings.training_time(curves), runs.ROOT / "figures" / "training_time")
+        style.save(drawings.training_time(curves, ships=zoo.BUDGET["ReacherPush"]), runs.ROOT / "figures" / "training_time")
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from tsmlib.study.zoo import OURS, PAPERS
 README, FIGURES = ROOT / "README.md", ROOT / "figures"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 FULL_PAGE = ROOT / "docs" / "claims_in_full.md"  # claim by claim
+QUALITY = ROOT / "benchmarks" / "settings" / "quality.csv"  # of trained models, against the time of training
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship
 ASKED = {  # parameters for these cells: without the plain arm, and plans for few targets
@@ -266,9 +267,27 @@ def readme_loops(env: str) -> str:
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
         f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
-        "decoders, each trained as long as a baseline; on 50 validation targets one is level with the LSTM, and two "
-        "LSTMs, or three baselines, judging together [plan as well](benchmarks/settings/README.md). "
-        "[Target by target](docs/results.md#pushing-target-by-target)."
+        "decoders; two LSTMs, or three baselines, judging together "
+        "[plan as well](benchmarks/settings/README.md#6-three-decoders). "
+        f"{readme_training(env)}"
+    )
+
+
+def readme_training(env: str) -> str:
+    """One sentence: what plans cost through single networks that were trained for longer; empty without such lines."""
+    lines = pd.read_csv(QUALITY) if QUALITY.exists() else pd.DataFrame(columns=["env"])
+    lines = lines[lines["env"] == env]
+    if not len(lines):
+        return ""
+    costs = lines.pivot(index="model", columns="seconds", values="cost")[
+        [zoo.BUDGET[EnvSpec.parse(env).name], lines["seconds"].max()]
+    ]
+    said = ", ".join(f"`{model}` {short:.1f} → {long:.1f} m" for model, (short, long) in costs.dropna().iterrows())
+    shipped, longest = map(float, costs.columns)
+    times, page = longest / shipped, "benchmarks/settings/README.md#7-quality-against-training-time"
+    return (
+        f"Single networks trained [{times:g} times as long]({page}) (one seed, validation targets) plan at a cost of "
+        f"{said}."
     )
 
 
