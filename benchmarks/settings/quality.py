@@ -185,7 +185,8 @@ def main() -> None:
             }
             for name, title in MEASURES.items()
         }
-        style.save(drawings.training_time(curves, ships=zoo.BUDGET["ReacherPush"]), runs.ROOT / "figures" / "training_time")
+        figure = drawings.training_time(curves, ships=zoo.BUDGET["ReacherPush"])
+        style.save(figure, runs.ROOT / "figures" / "training_time")
 
 
 if __name__ == "__main__":

@@ -267,8 +267,7 @@ def readme_loops(env: str) -> str:
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
         f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
-        "decoders; two LSTMs, or three baselines, judging together "
-        "[plan as well](benchmarks/settings/README.md#6-three-decoders). "
+        "decoders; two LSTMs, or three baselines, judging together plan as well. "
         f"{readme_training(env)}"
     )
 
