@@ -439,7 +439,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(
 
 @pytest.mark.parametrize("n", [0, -3])
 def test_a_number_of_episodes_that_is_not_positive_is_refused(n: int) -> None:
-    with pytest.raises(ValueError, match=rf"num_envs is {n}; expected at least 1"):
+    with pytest.raises(ValueError, match=rf"n is {n}, .* expected a positive number of episodes"):
         study.random_data(REACHER, n, seed=0)
     with pytest.raises(ValueError, match=rf"num_envs is {n}; expected at least 1"):
         study.draw_task(REACHER, seed=0, n=n)
