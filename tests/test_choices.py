@@ -219,6 +219,14 @@ def test_a_doubling_of_the_training_time_is_read_from_neighbouring_lines_of_a_mo
     assert np.allclose(found[list(quality.MEASURES)], -0.5)
 
 
+def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as_long() -> None:
+    trained = [("tsm", 580, 0.3), ("lstm", 580, 0.4), ("onestep", 580, 0.2), ("tsm", 2320, 0.1), ("lstm", 2320, 0.2)]
+    about = [{"env": "e", "model": model, "seconds": s} | dict.fromkeys(quality.SCORES, x) for model, s, x in trained]
+    found = quality.over_the_best(pd.DataFrame(about))
+    for name in quality.SCORES:
+        assert found[quality.MEASURES[name]].tolist() == ["1.50 (onestep)", "0.50 (lstm)"]
+
+
 def test_a_shipped_model_gets_one_line_of_quality_however_often_it_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

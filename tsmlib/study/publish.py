@@ -261,13 +261,13 @@ predicted minus executed return.*
 
 
 def readme_loops(env: str) -> str:
-    """One sentence: how often closed loops of each model bring the object home; and the longer training of OURS."""
+    """How often closed loops of each model bring the object home, several models that judge together, training time."""
     closed = planning_results.plans_of(_shipped("05_control"), env=env, execution=planning_results.CLOSED)
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
         f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
-        "decoders; two LSTMs, or three baselines, judging together plan as well. "
+        "decoders; two LSTMs, or three baselines, judging together [plan as well](benchmarks/settings/README.md). "
         f"{readme_training(env)}"
     )
 
@@ -283,10 +283,9 @@ def readme_training(env: str) -> str:
     ]
     said = ", ".join(f"`{model}` {short:.1f} → {long:.1f} m" for model, (short, long) in costs.dropna().iterrows())
     shipped, longest = map(float, costs.columns)
-    times, page = longest / shipped, "benchmarks/settings/README.md#7-quality-against-training-time"
     return (
-        f"Single networks trained [{times:g} times as long]({page}) (one seed, validation targets) plan at a cost of "
-        f"{said}."
+        f"Single networks trained {longest / shipped:g} times as long ({_seeds(lines)}, {lines['targets'].max()} validation "
+        f"targets; same page) plan at a cost of {said}."
     )
 
 
