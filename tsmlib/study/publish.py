@@ -283,10 +283,8 @@ def readme_training(env: str) -> str:
     ]
     said = ", ".join(f"`{model}` {short:.1f} → {long:.1f} m" for model, (short, long) in costs.dropna().iterrows())
     shipped, longest = map(float, costs.columns)
-    return (
-        f"Single networks trained {longest / shipped:g} times as long ({_seeds(lines)}, {lines['targets'].max()} validation "
-        f"targets; same page) plan at a cost of {said}."
-    )
+    scale = f"{_seeds(lines)}, {lines['targets'].max()} validation targets; same page"
+    return f"Single networks trained {longest / shipped:g} times as long ({scale}) plan at a cost of {said}."
 
 
 def _seeds(rows: pd.DataFrame) -> str:
