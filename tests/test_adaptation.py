@@ -12,7 +12,7 @@ from scripts import run_script
 import tsmlib
 from tsmlib import figures
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, publish, rounds, runs
+from tsmlib.study import adaptation, pages, rounds, runs
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
 from tsmlib.study.results.exploration import PENDULUM, PUSH
@@ -88,7 +88,9 @@ def _check_episodes(rows: pd.DataFrame, loops: list[rounds.Loop], steps: list[in
     for data, at, loop in zip(results.DATA, (steps, steps, steps[:1]), loops, strict=True):
         own = table.select(contacts, configuration=data)
         assert own["env_steps"].tolist() == at
-        assert own["value"].tolist() == [rounds.met(each)["contacts_per_episode"] for each in loop.episodes if each]
+        assert own["value"].tolist() == [
+            rounds.contacts(each)["contacts_per_episode"] for each in loop.episodes if each
+        ]
         assert own["n"].tolist() == [len(each) for each in loop.episodes if each]
     assert "contacts per episode" in results.rounds_table(rows, PUSH)
     assert "contacts per episode" not in results.rounds_table(table.select(rows, execution="closed loop"), PUSH)
@@ -252,10 +254,10 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
 
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
-    assert publish.exploration_page(tables.frame([])) == ""
+    assert pages.exploration_page(tables.frame([])) == ""
     published = ROOT / "data" / "results" / "10_explore.csv"
     if published.exists():
-        assert publish.exploration_page(tables.load(published)) in (ROOT / "docs" / "results.md").read_text()
+        assert pages.exploration_page(tables.load(published)) in (ROOT / "docs" / "results.md").read_text()
 
 
 def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_path: Path) -> None:

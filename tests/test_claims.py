@@ -18,7 +18,7 @@ from scripts import run_script
 from tsmlib import figures
 from tsmlib.statistics import holm, interval, random_effects
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import publish
+from tsmlib.study import pages, publish
 from tsmlib.study.claims import evaluate, ledger, report
 from tsmlib.study.claims.claim import (
     DEFINITIONAL,
@@ -315,11 +315,11 @@ def test_a_changed_rule_makes_older_verdicts_void() -> None:
 
 
 def test_what_is_written_and_what_is_stored_are_what_the_shipped_rows_say() -> None:
-    papers, ours = publish.shipped_verdicts(PAPERS), publish.shipped_verdicts(OURS)
+    papers, ours = pages.shipped_verdicts(PAPERS), pages.shipped_verdicts(OURS)
     again = "what is written of the claims is not what data/results says; run: python -m tsmlib publish --claims"
-    assert publish.readme_claims(papers, ours) in publish.README.read_text(), again
-    assert publish.claims_page(papers, ours) in publish.CLAIMS_PAGE.read_text(), again
-    assert publish.full_page(papers, ours) in publish.FULL_PAGE.read_text(), again
+    assert pages.readme_claims(papers, ours) in publish.README.read_text(), again
+    assert pages.claims_page(papers, ours) in publish.CLAIMS_PAGE.read_text(), again
+    assert pages.full_page(papers, ours) in publish.FULL_PAGE.read_text(), again
     shipped = tables_storage.load(evaluate.RESULTS / "08_claims.csv")
     stored = set(shipped[["model", "claim", "verdict", "sha256"]].itertuples(index=False, name=None))
     assert stored == {(v.claim.subject, v.claim.id, v.word, v.claim.sha256) for v in papers + ours}, again

@@ -12,7 +12,7 @@ import yaml
 
 import tsmlib
 from tsmlib.storage import tables
-from tsmlib.study import publish
+from tsmlib.study import pages, publish
 from tsmlib.study.runs import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
@@ -81,8 +81,8 @@ def test_a_search_finds_a_how_to(asked: str) -> None:
 
 def test_written_results_are_those_of_the_shipped_tables() -> None:
     again = "what is written of the results is not what data/results says; run: python -m tsmlib publish --claims"
-    assert publish.readme_results() in README.read_text(), again
-    assert publish.results_page() in publish.RESULTS_PAGE.read_text(), again
+    assert pages.readme_results() in README.read_text(), again
+    assert pages.results_page() in publish.RESULTS_PAGE.read_text(), again
 
 
 @pytest.mark.skipif(not BUILT.exists(), reason="make docs was not run")

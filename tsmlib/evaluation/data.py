@@ -5,7 +5,7 @@ import numpy as np
 from tsmlib.envs.geometry import ELBOW_LIMIT, closest_gap
 from tsmlib.envs.spec import EnvSpec
 
-MET = 0.001  # m between arm and block, below which they are in contact
+CONTACT_GAP = 0.001  # m between arm and block
 
 
 def cells_visited(points: np.ndarray, *, inner: float, outer: float, cells: int = 20) -> float:
@@ -35,7 +35,7 @@ def autocorrelation(series: np.ndarray, lag: int) -> np.ndarray:
 
 def contact_counts(states: np.ndarray, env: str) -> np.ndarray:
     """Contacts of each episode of ``states`` (N, T + 1, dx): (N,), how often the arm comes within 1 mm of the block."""
-    near = closest_gap(states, env) < MET
+    near = closest_gap(states, env) < CONTACT_GAP
     return near[:, 0] + (near[:, 1:] & ~near[:, :-1]).sum(1)
 
 
@@ -44,7 +44,7 @@ def shares(states: np.ndarray, env: str) -> dict[str, float]:
     spec = EnvSpec.parse(env)
     found = {"limit_share": (np.abs(states[:, 1:, 1]) > ELBOW_LIMIT - 0.02).mean()}
     if spec.has_block:
-        found["contact_share"] = (closest_gap(states, env).min(1) < MET).mean()
+        found["contact_share"] = (closest_gap(states, env).min(1) < CONTACT_GAP).mean()
     if spec.task == "push":
         way = np.linalg.norm(states[..., 6:8] - states[:, :1, 6:8], axis=-1)
         found["moved_share"] = (way.max(1) > 0.005).mean()

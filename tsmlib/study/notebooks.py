@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 from tsmlib.storage.files import STATUS, Json, StoreError, alive, writer_lock
 from tsmlib.study import parameters
 from tsmlib.study.parameters import Value
-from tsmlib.study.runs import Notebook, Run, RunError, home, notebooks, resolve
+from tsmlib.study.runs import Notebook, Run, RunError, find, home, resolve
 
 TOOLS = ("papermill", "ipykernel", "pandas", "tabulate", "sklearn", "ipywidgets", "imageio_ffmpeg")  # extra "study"
 
@@ -97,8 +97,8 @@ def require(run: Run, notebook: str) -> Mapping[str, Json]:
     """
     from tsmlib.storage import manifest
 
-    name = next((each.name for each in notebooks().values() if each.stem == notebook), "all")
-    command = run.command(name)
+    own = find(notebook)
+    command = run.command(own.name if own else "all")
     entries = manifest.statuses(run.dir)
     entry = entries.get(notebook, {"state": "not run"})
     state = entry.get("state") if isinstance(entry, dict) else "damaged"

@@ -139,7 +139,7 @@ def plane(data: Trajectories) -> np.ndarray:
     return np.stack([np.arctan2(sin, cos), speed], axis=1)
 
 
-def met(data: Trajectories) -> dict[str, float]:
+def contacts(data: Trajectories) -> dict[str, float]:
     """Contacts of arm and object, ``results.EPISODES``: share of the episodes that have one, and mean number."""
     return {
         "contact_share": shares(data.states, data.env)["contact_share"],
@@ -337,7 +337,7 @@ def loop(
     )  # fmt: skip
     episodes = [train.joined(held_out), *found.episodes]
     if env == PUSH:
-        counted = [(k, len(each), met(each)) for k, each in enumerate(episodes) if each is not None]
+        counted = [(k, len(each), contacts(each)) for k, each in enumerate(episodes) if each is not None]
         rows += results.episode_rows(run, word, counted, env=env, data=data)
     if prior and sizes.searches:
         last = own and own / f"{slug}.prior.json"

@@ -61,11 +61,10 @@ class Run:
 
         A live kernel whose cells did not run as the notebook's do says so.
         """
-        own = [each for each in notebooks().values() if each.stem == self.notebook]
-        if own and (how := live.deviation(own[0].path)):
+        if (own := find(self.notebook)) and (how := live.deviation(own.path)):
             print(
                 f"{how}: a table that this cell writes may differ from the notebook's, and nothing else reads it. Run "
-                f"all cells from the first, or: {self.command(own[0].name)}"
+                f"all cells from the first, or: {self.command(own.name)}"
             )
         return self.folder("metrics")
 
@@ -83,8 +82,9 @@ class Run:
         """The value of another parameter of the notebook: as it was given, else its default there."""
         if name in self.parameters:
             return self.parameters[name]
-        path = next(each.path for each in notebooks().values() if each.stem == self.notebook)
-        return parameters.declared(path)[name]  # type: ignore[return-value]  # literals
+        own = find(self.notebook)
+        assert own
+        return parameters.declared(own.path)[name]  # type: ignore[return-value]  # literals
 
     def pick(self, *, smoke: T, laptop: T, paper: T) -> T:
         """The value for this run's scale."""
@@ -130,6 +130,11 @@ def notebooks() -> dict[str, Notebook]:
     return {path.stem[3:]: Notebook(path.stem[3:], path) for path in sorted(NOTEBOOKS.glob("[0-9][0-9]_*.ipynb"))}
 
 
+def find(stem: str) -> Notebook | None:
+    """The notebook of a file's stem, such as 05_control."""
+    return next((notebook for notebook in notebooks().values() if notebook.stem == stem), None)
+
+
 def home() -> Path:
     """The folder that ``runs`` lies in: the repository, or the working directory where the package is installed."""
     return Path.cwd() if INSTALLED else ROOT
@@ -154,8 +159,8 @@ def resolve(
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
     base = home() / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
-    known = [each.path for each in notebooks().values() if each.stem == notebook] if others else []
-    defaults = parameters.declared(known[0]) if known else {}
+    own = find(notebook) if others else None
+    defaults = parameters.declared(own.path) if own else {}
     for name, value in others.items():
         parameters.check(name, value, default=defaults.get(name, value))
     try:

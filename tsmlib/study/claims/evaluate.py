@@ -26,7 +26,7 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Claim
 from tsmlib.study.claims.query import Check, Term
 from tsmlib.study.notebooks import require
-from tsmlib.study.runs import RESULTS, Run, notebooks
+from tsmlib.study.runs import RESULTS, Run, find, notebooks
 
 TRIALS = ("target", "copy")  # columns that number the trials inside a seed
 MADE_BY = {  # table -> what to run where it lacks rows; of the others, their notebook
@@ -68,10 +68,17 @@ class Effect:
 
     @property
     def beyond(self) -> np.ndarray:
-        """How far estimate, ends of the interval and seeds (3 + seeds,) lie beyond the margin: negative on the wrong
-        side, or NaN."""
-        ends = np.array([np.nan if end is None else end for end in (self.value, self.low, self.high, *self.by_seed)])
-        return (ends - self.check.margin) * (-1 if self.check.op[0] == "<" else 1)
+        """How far estimate and ends of the interval (3,) lie beyond the margin: negative on the wrong side, or NaN."""
+        return self._beyond(self.value, self.low, self.high)
+
+    @property
+    def seeds_beyond(self) -> np.ndarray:
+        """The same of each training seed (seeds,)."""
+        return self._beyond(*self.by_seed)
+
+    def _beyond(self, *numbers: float | None) -> np.ndarray:
+        found = np.array([np.nan if number is None else number for number in numbers])
+        return (found - self.check.margin) * (-1 if self.check.op[0] == "<" else 1)
 
     @property
     def right_side(self) -> bool:
@@ -81,7 +88,7 @@ class Effect:
     @property
     def ease(self) -> tuple[int, float]:
         """Sorts checks by how far they are from holding, the furthest first."""
-        value, low, high = self.beyond[:3]
+        value, low, high = self.beyond
         if np.isnan(low):  # of what has no interval the side alone is known
             return STATES.index(self.state), -1.0 if value < 0 else 0.0
         return STATES.index(self.state), float(value / (abs(high - low) + 1e-300))
@@ -232,7 +239,8 @@ def _effect(claim: Claim, check: Check, rows: Tables) -> Effect:
     try:
         return measure(check, rows)
     except ClaimError as error:
-        word = next((each.name for each in notebooks().values() if each.stem == error.table), "all")
+        notebook = find(error.table)
+        word = notebook.name if notebook else "all"
         command = MADE_BY.get(error.table, f"python -m tsmlib run {word} --scale paper")
         return Effect(check, "missing", why=f"{claim.id}: {error}. Run: {command}")
 

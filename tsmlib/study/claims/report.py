@@ -115,7 +115,7 @@ HALF = 18  # characters on either side of the margin
 
 def _strip(effect: Effect) -> str:
     """A check as one line: seeds o, estimate x and interval - against the margin |, then in words."""
-    beyond = effect.beyond
+    beyond = np.concatenate([effect.beyond, effect.seeds_beyond])
     places: list[str] = [" "] * (2 * HALF + 1)
     if not np.isnan(beyond[0]):
         at = HALF + np.rint(HALF * np.nan_to_num(beyond / max(np.nanmax(np.abs(beyond)), 1e-300))).astype(int)
@@ -152,7 +152,7 @@ def change(verdict: Verdict) -> str:
         return "to know what the paper means: the readings above differ."
     if key.low is None:
         return "another training seed, since one has no interval."
-    away, low, high = key.beyond[:3]
+    away, low, high = key.beyond
     if verdict.word in (REPLICATED, FAILED):
         side, half = "right" if away > 0 else "wrong", max(abs(high - low) / 2, 1e-300)
         return (
@@ -193,6 +193,6 @@ def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, np.ndarray
     for verdict in verdicts:
         effects = sorted(verdict.effects[""], key=lambda effect: effect is verdict.key)
         if any(effect.value is not None for effect in effects):
-            beyond = np.array([e.beyond[:3] for e in effects if e.value is not None or e is verdict.key])
-            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond, verdict.key.beyond[3:]))
+            beyond = np.array([e.beyond for e in effects if e.value is not None or e is verdict.key])
+            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond, verdict.key.seeds_beyond))
     return found

@@ -1,0 +1,318 @@
+"""What README and the pages of docs/ say of the shipped rows, as Markdown."""
+
+from __future__ import annotations
+
+import re
+
+import pandas as pd
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.planning.tasks import HORIZON
+from tsmlib.storage import tables as tables_storage
+from tsmlib.study import plans, zoo
+from tsmlib.study.claims import evaluate, ledger
+from tsmlib.study.claims import report as claims_report
+from tsmlib.study.claims.claim import DEFINITIONAL, VERDICTS
+from tsmlib.study.comparison import published
+from tsmlib.study.results import exploration as exploration_results
+from tsmlib.study.results import planning as planning_results
+from tsmlib.study.results import policies as policies_results
+from tsmlib.study.results import prediction as prediction_results
+from tsmlib.study.results import robots as robots_results
+from tsmlib.study.results import table
+from tsmlib.study.results.planning import PUSH, REACH
+from tsmlib.study.runs import ROOT
+from tsmlib.study.zoo import OURS, PAPERS
+
+QUALITY = ROOT / "benchmarks" / "settings" / "quality.csv"  # of trained models, against the time of training
+METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
+README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
+README_CLAIMS = ("C02", "C32")  # what the paper says of predictions and plans
+
+
+def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
+    """The verdicts that follow from the tables that ship. subject: the model in place of the paper's own."""
+    claims = ledger.claims(subject)
+    rows = evaluate.tables(claims)
+    return [evaluate.judge(claim, rows) for claim in claims]
+
+
+def shipped_answers() -> list[evaluate.Verdict]:
+    """What the tables that ship say of the questions of the paper's outlook."""
+    questions = ledger.questions()
+    rows = evaluate.tables(questions)
+    return [evaluate.judge(question, rows) for question in questions]
+
+
+# README --------------------------------------------------------------------------------------------------------------
+
+
+def readme_results() -> str:
+    """Five models by four numbers: on pushing, or on reaching as long as pushing has no rows of the paper's model."""
+    predict, control = published("03_predict"), published("05_control")
+    pushed = all(len(table.select(rows, env=PUSH, model=PAPERS)) for rows in (predict, control))
+    env = PUSH if pushed else REACH
+    plans = table.select(planning_results.plans_of(control, env=env, planners=["cem"]), search_space="latent")
+    found = {
+        "prediction error ↓": prediction_results.values(predict, "nrmse", env=env),
+        "energy score ↓": prediction_results.values(predict, "energy_score_noise", env=env),
+        "share of oracle's gain ↑": table.values(table.select(plans, metric="gain_share")),
+        "gap (m) ↓": table.values(table.select(plans, metric="gap_absolute")),
+    }
+    first, *_, last = found.values()
+    lines = []
+    for model in README_MODELS:
+        cells = {title: table.spell(values[model]) if model in values else "-" for title, values in found.items()}
+        seeds = f"{len(first.get(model, ()))} / {len(last.get(model, ()))}"
+        lines.append({"model": f"`{model}`", **cells, "seeds": seeds})
+    episodes, targets = prediction_results.select(predict, "nrmse", env=env)["n"].max(), plans["n"].max()
+    narrow = re.sub(r":-+", "---", re.sub(" +", " ", table.markdown(pd.DataFrame(lines))))  # README is to be short
+    return f"""{narrow}
+
+*Published rows of `{env}`; means over training seeds (of predicting / of planning) ± half the 95 % t interval.
+Predicting: {episodes:,} test episodes, 90 steps open loop; error over the data's deviation (nRMSE), energy score of 32
+samples. Planning: {targets} targets, CEM over codes; share: 1 by the simulator, 0 for doing nothing; gap: mean size of
+predicted minus executed return.*
+{readme_loops(env)}"""
+
+
+def readme_loops(env: str) -> str:
+    """How often closed loops of each model bring the object home, several models that judge together, training time."""
+    closed = planning_results.plans_of(published("05_control"), env=env, execution=planning_results.CLOSED)
+    hits = table.values(table.select(closed, metric="success"))
+    loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
+    return (
+        f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
+        "decoders; two LSTMs, or three baselines, judging together [plan as well](benchmarks/settings/README.md). "
+        f"{readme_training(env)}"
+    )
+
+
+def readme_training(env: str) -> str:
+    """One sentence: what plans cost through single networks that were trained for longer; empty without such lines."""
+    lines = pd.read_csv(QUALITY) if QUALITY.exists() else pd.DataFrame(columns=["env"])
+    lines = lines[lines["env"] == env]
+    if not len(lines):
+        return ""
+    costs = lines.pivot(index="model", columns="seconds", values="cost")[
+        [zoo.BUDGET[EnvSpec.parse(env).name], lines["seconds"].max()]
+    ]
+    said = ", ".join(f"`{model}` {short:.1f} → {long:.1f} m" for model, (short, long) in costs.dropna().iterrows())
+    shipped, longest = map(float, costs.columns)
+    scale = f"{_seeds(lines)}, {lines['targets'].max()} validation targets; same page"
+    return f"Single networks trained {longest / shipped:g} times as long ({scale}) plan at a cost of {said}."
+
+
+def _seeds(rows: pd.DataFrame) -> str:
+    """Seeds of rows in words: seed 0, or seeds 0, 1."""
+    found = [str(seed) for seed in sorted(rows["seed"].dropna().unique())]
+    return f"seed{'s' * (len(found) > 1)} {', '.join(found)}"
+
+
+def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Three sentences: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
+    carrying = [verdict for verdict in papers if verdict.claim.headline]
+    given = ", ".join(
+        f"{len(same)} {word.lower()}"
+        + f" ({', '.join(verdict.claim.id for verdict in same)})" * (word in claims_report.DECIDED)
+        for word in VERDICTS if (same := [verdict for verdict in carrying if verdict.word == word])
+    )  # fmt: skip
+    named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
+    said = "; ".join(f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" for verdict in named)
+    return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
+With `{OURS}` in its place, {claims_report.counts(ours)}.
+Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
+
+
+# Pages of docs/ ------------------------------------------------------------------------------------------------------
+
+
+def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Every claim with its verdict, those that carry the paper first."""
+    pairs = sorted(zip(papers, ours, strict=True), key=lambda pair: not pair[0].claim.headline)
+    headlines = sum(verdict.claim.headline for verdict in papers)
+    carry, others = (
+        claims_report.table([first for first, _ in part], [second for _, second in part], root="../")
+        for part in (pairs[:headlines], pairs[headlines:])
+    )
+    by_definition = ", ".join(verdict.claim.id for verdict in papers if verdict.word == DEFINITIONAL)
+    return f"""Written by `python -m tsmlib publish --claims` from the rows in `data/results`.
+
+- The paper's model: {claims_report.counts(papers)}.
+- `{OURS}` in its place: {claims_report.counts(ours)}.
+- Not counted, since they hold by definition: {by_definition}.
+
+## The {headlines} claims that carry the paper
+
+{carry}
+
+## The others
+
+{others}
+
+## Questions of its outlook
+
+The paper ends on what it leaves to future work (section 6). These questions and their thresholds are ours, asked
+of `{OURS}`, and are not counted above.
+
+{claims_report.answers(shipped_answers(), root="../")}"""
+
+
+def full_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
+    """Every claim in full, in the order of the paper."""
+    return "\n\n".join(
+        claims_report.in_full(first, second, root="../") for first, second in zip(papers, ours, strict=True)
+    )
+
+
+def results_page() -> str:
+    """Every published table of predictions, plans and policies, from the shipped rows alone."""
+    control, by_target, free = published("05_control"), published("05_control_rows"), published("model_free")
+    predict = tables_storage.frame(pd.concat([published("03_predict"), published("peers_pets")]))
+    learned = tables_storage.frame(pd.concat([control, policies_results.finished(free)]))
+    seeds = {env: own["seed"].nunique() for env, own in table.groups(predict, "env")}
+    scores = "\n\n".join(
+        f"`{env}`, {n} training seed{'s' * (n > 1)}{' unless said' * (n > 1)}:\n\n"
+        + prediction_results.scores_table(predict, METRICS, env=env)
+        for env, n in seeds.items()
+    )
+    planned = ", ".join(f"{_seeds(planning_results.plans_of(control, env=env))} for {task}" for env, task in
+                        ((REACH, "reaching"), (PUSH, "pushing")))  # fmt: skip
+    peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
+        "pets" in set(predict["model"])
+    )
+    pages = robots_page(published("09_your_own")), exploration_page(published("10_explore"), published("10_model_free"))
+    later = "\n\n".join(filter(None, pages))
+    n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
+    return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
+
+## Prediction
+
+{n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
+observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
+seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
+of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`), but `{OURS}` of
+pushing, which has three decoders, each trained that long. Pushing is trained by Muon; elsewhere `{OURS}` is, and all
+other models by Adam.{peers}
+
+{scores}
+
+Pushing, seed by seed: the energy score of `{OURS}` over that of the best other model (in brackets):
+
+{table.markdown(prediction_results.over_the_best(predict, OURS, "energy_score_noise", env=PUSH, steps_ahead=(10, 80)))}
+
+## Planning
+
+Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
+pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
+over steps. A candidate is judged by the mode of the model; of an ensemble, as `{OURS}` of pushing is, the first member
+sorts the candidates and the best quarter is judged by the mean over all members (`cem(screened=)`).
+
+{planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
+
+By gradients, as the paper plans (Adam, {plans.ITERATIONS["adam"]["paper"]} iterations from zero), where there are rows:
+
+{planning_results.plans_table(control[control["metric"] != "plan_seconds"], planner="adam")}
+
+## Pushing, target by target
+
+The cross-entropy method over codes; the cost of `{OURS}` and its size of the gap minus those of each other method on
+the same targets, means over the training seeds above; half the 95 % t interval is over targets, and says nothing of
+other training seeds:
+
+{table.markdown(planning_results.paired_table(by_target, PUSH, OURS))}
+
+## Planning again every ten steps, pushing
+
+{planning_results.loops_table(control)}
+
+Target by target, as above:
+
+{table.markdown(planning_results.paired_table(by_target, PUSH, OURS, execution=planning_results.CLOSED))}
+
+## Policies
+
+Learned inside the models, and model-free ones in the environment; means of the last record
+over k copies or seeds, with half the 95 % t interval.
+
+{policies_results.policies_table(policies_results.learning_curves(learned))}
+
+{later}"""
+
+
+def robots_page(rows: pd.DataFrame) -> str:
+    """Scores and plans of the robots of 09_your_own; empty without rows."""
+    if not len(rows):
+        return ""
+    seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    return f"""## Robots of Gymnasium
+
+Written from the rows that `python -m tsmlib run your_own --scale paper` made, training seed {seeds};
+`python -m tsmlib publish --table your_own` copies them. Data are smooth random actions, collected by the package:
+no data set of Minari's was downloaded, and `load_minari` reads one in their place. Training aimed at the same
+CPU time for all models of a robot, at scale paper 24 s, and took what the column says. Energy score and nRMSE are open
+loop after ten observed steps, in standardised units, lower is better.
+
+{robots_results.scores_table(rows)}
+
+{robots_results.sentences(rows)}
+
+Plans, closed loop, by the environment's own reward; the oracle is the same planner through the true simulator, from
+the first n of the same starts, which may be harder or easier than all. Success is to end upright, within 18 degrees;
+the hopper's episodes end where it falls, after the steps that are said:
+
+{robots_results.plans_table(rows)}
+
+Model-free learners as [RL Baselines3 Zoo]({robots_results.SOURCE}) published them, one run each, on version 3 of the
+MuJoCo robots and over whole episodes; they were not run here:
+
+{robots_results.model_free_table()}"""
+
+
+def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> str:
+    """Rounds of exploration and adapted models of 10_explore; empty without rows. free: model-free learners, beside."""
+    if not len(rows):
+        return ""
+    seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    return f"""## Exploration and adaptation
+
+Written from the rows that `python -m tsmlib run explore --scale paper` or `python
+benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every ten steps, from n
+starts that no round trains on; steps count the random episodes before the first round.
+
+{exploration_results.rounds_table(rows)}
+{_pushing_rounds(rows, free)}
+The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque. n test episodes, open loop after ten
+observed steps, in units of the standard arm.
+Seeds are of the few episodes and of the updates on them: all begin from the one model that ships.
+
+{exploration_results.ways_table(rows)}
+
+{exploration_results.sentences(rows)}"""
+
+
+def _pushing_rounds(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
+    """The part of that page on the arm that pushes; empty without rows."""
+    if not (found := exploration_results.rounds_table(rows, exploration_results.PUSH)):
+        return ""
+    page = f"""
+The arm that pushes, planned again every ten steps, to the first n frozen targets; "{exploration_results.NONE}" is the
+same training on the first random episodes alone:
+
+{found}
+"""
+    if free is not None and (beside := exploration_results.steps_table(rows, free)):
+        page += f"""
+Environment steps to the same return, means over seeds (of the policy / of the rounds), on the frozen targets; the
+fewest of rounds are their random episodes:
+
+{beside}
+"""
+    if priors := exploration_results.priors_table(rows):
+        page += f"""
+A search through the true simulator, which favours no prior, in codes of the prior before the first round and of the
+last, from the first n frozen starts: returns that it ends with, and iterations to that of the first prior:
+
+{priors}
+"""
+    return page
