@@ -152,7 +152,7 @@ def published_peers(files: list[Path]) -> None:
     if len(loops):
         publish("10_explore", loops)
     if len(policies):  # whole: a learner's steps may have been others before
-        tables.save(RESULTS / "10_model_free.csv", policies)
+        tables.ship(RESULTS / "10_model_free.csv", policies)
         manifest.write_manifest(Path(RESULTS).parent)
 
 
