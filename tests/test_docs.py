@@ -59,6 +59,18 @@ def test_the_program_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pyt
     run(page, tmp_path, monkeypatch)
 
 
+def test_a_plan_made_from_logs_alone_takes_the_cart_to_its_goal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(OPTIONAL["own_data"])
+    names = run(DOCS / "howto" / "own_data.md", tmp_path, monkeypatch)
+    place, speed = names["past"].states[0, -1].tolist()
+    for force in names["plan"].actions[0, :, 0].tolist():  # the cart of the page's data
+        speed += 0.1 * force
+        place += 0.05 * speed
+    assert abs(place - 0.2) < 0.1
+
+
 @pytest.mark.parametrize(
     "page",
     [README, *sorted(DOCS.glob("[!_]*.md")), *sorted(DOCS.glob("[!_]*/*.md")), ROOT / "CONTRIBUTING.md"],

@@ -111,3 +111,26 @@ def test_a_second_backward_pass_finds_what_the_first_found(name: str) -> None:
 def test_a_past_of_one_step_says_nothing_of_what_was_before(name: str) -> None:
     net, past, actions, z = setting(name, (0, 1), torch.float64)
     torch.testing.assert_close(fast(net, past.last(1), actions, z), plain(net, past.last(1), actions, z))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_autocast_rounds_products_and_nothing_else(name: str) -> None:
+    net, past, actions, z = setting(name, (0, 1), torch.float32)
+    whole = [part.requires_grad_() for part in (*past, actions, z)] + list(net.parameters())
+    found = []
+    for enabled in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            states = fast(net, past, actions, z)
+        gradients = torch.autograd.grad(states.sin().sum(), whole, allow_unused=True)
+        found.append([states, *(d for d in gradients if d is not None)])
+    for exact, rounded in zip(*found, strict=True):
+        assert rounded.dtype == torch.float32
+        assert 0 < (rounded - exact).norm() < 0.03 * exact.norm()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_autocast_leaves_float64_alone(name: str) -> None:
+    net, past, actions, z = setting(name, (0, 1), torch.float64)
+    with torch.autocast("cpu", torch.bfloat16):
+        under = fast(net, past, actions, z)
+    assert torch.equal(under, fast(net, past, actions, z))

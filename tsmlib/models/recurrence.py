@@ -6,8 +6,9 @@
     x_{t+1}    = x_t + V [s_t, u_t, 1, h_t]               or V [silu(U [s_t, u_t, 1, h_t]), 1]
 
 The inputs of a step lie side by side in one row, from which each product takes what it needs, so that nothing is
-concatenated, and the gradient of a weight is one product over all steps at the end. ``tests/test_recurrence.py`` holds
-it to the same written plainly.
+concatenated, and the gradient of a weight is one product over all steps at the end. Under ``torch.autocast`` the products
+with W and U (or V where there is no U), forward and backward, are in its type, bfloat16 for example; gates, memory and
+states are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
 
 Letters in shapes: B batch, T steps, n hidden size, dz code size, F features, dx state size.
 """
@@ -73,7 +74,8 @@ class Recurrent:
         cell = self.cell[len(self.cell) - n - given.shape[2] :]
         h = c = past.states.new_zeros(len(past.states), n)
         keep = torch.is_grad_enabled()
-        _, h, c = Recurrence.apply(keep, self.features, None, h, c, given[..., :0], given, cell, None, None)
+        kind = _product_type(h)
+        _, h, c = Recurrence.apply(keep, kind, self.features, None, h, c, given[..., :0], given, cell, None, None)
         return h, c
 
     def begin(self, past: Segment, code: Callable[[], Tensor] | None = None) -> Step:
@@ -94,6 +96,7 @@ class Recurrent:
         given = torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
         states, h, c = Recurrence.apply(
             torch.is_grad_enabled(),
+            _product_type(x),
             self.features,
             x if order == sorted(order) else x[:, order],
             *memory,
@@ -110,20 +113,24 @@ class Recurrent:
 class Recurrence(torch.autograd.Function):
     """All steps. Arguments and results as in ``Recurrent``, but that in x the angles come first.
 
-    keep: what the backward pass needs. Without x nothing is predicted, and ``given`` holds the features as well.
+    keep: what the backward pass needs. kind: number type of the products with W and U, and of the rows. Without x nothing
+    is predicted, and ``given`` holds the features as well.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, keep: bool, features: Features, x: Tensor | None, h: Tensor, c: Tensor, codes: Tensor, given: Tensor,
-        cell: Tensor, hidden: Tensor | None, out: Tensor | None,
+        ctx: Any, keep: bool, kind: torch.dtype, features: Features, x: Tensor | None, h: Tensor, c: Tensor,
+        codes: Tensor, given: Tensor, cell: Tensor, hidden: Tensor | None, out: Tensor | None,
     ) -> tuple[Tensor | None, Tensor, Tensor]:  # fmt: skip
         (steps, batch, dz), n, after = codes.shape, h.shape[1], len(cell)
         kept, inner = steps if keep else min(1, steps), 0 if hidden is None else hidden.shape[1]
         sizes = [dz, n, after - dz - n - given.shape[2], given.shape[2], n]  # [z, h_{t-1}, s, [u, 1], h_t]
-        rows, gates = h.new_empty(kept, batch, sum(sizes)), h.new_empty(kept, batch, 4 * n)
+        rows, gates = h.new_empty(kept, batch, sum(sizes), dtype=kind), h.new_empty(kept, batch, 4 * n)
+        cell, hidden = cell.to(kind), None if hidden is None else hidden.to(kind)
+        out = out.to(kind) if hidden is None and out is not None else out
         tanhs, cells = h.new_empty(2, kept, batch, n).unbind(0)
         sigmoids, active = h.new_empty(kept, batch, inner), h.new_ones(kept, batch, inner + 1)
+        same, piece = kind == h.dtype, torch.empty_like(h)
         states, start, minus = None if x is None else x.new_empty(steps, *x.shape), (x, c), h.new_full((), -1.0)
         _, row_h, row_s, _, row_out = _each(rows, sizes)
         qs, places, outputs = gates.unbind(0), sigmoids.unbind(0), active.unbind(0)
@@ -134,21 +141,23 @@ class Recurrence(torch.autograd.Function):
             row_h[k].copy_(h)
             if x is not None:
                 _see(features, x, row_s[k])
-            q, (forget, write, read, new) = torch.mm(ins[k], cell, out=qs[k]), (part[k] for part in parts)
+            q, (forget, write, read, new) = _product(ins[k], cell, qs[k]), (part[k] for part in parts)
             new.mul_(2)  # tanh(q) = 2 sigmoid(2 q) - 1, which processors compute faster
             q.sigmoid_()
             torch.add(minus, new, alpha=2, out=new)
             c = torch.mul(forget, c, out=cells[k]).addcmul_(write, new)
             tanh = torch.mul(c, 2, out=tanhs[k]).sigmoid_()
             torch.add(minus, tanh, alpha=2, out=tanh)
-            h = torch.mul(read, tanh, out=row_out[k])
+            h = torch.mul(read, tanh, out=row_out[k] if same else piece)
+            if not same:
+                row_out[k].copy_(h)
             if x is None or states is None or out is None:
                 continue
             tail = tails[k]
             if hidden is not None:
-                s, tail = torch.mm(tail, hidden, out=outputs[k][:, :-1]), outputs[k]
+                s, tail = _product(tail, hidden, outputs[k][:, :-1]), outputs[k]
                 s.mul_(torch.sigmoid(s, out=places[k]))
-            x = torch.addmm(x, tail, out, out=states[t])
+            x = _added(x, tail, out, states[t])
         if keep:
             ctx.save_for_backward(*start, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active)
             ctx.features, ctx.sizes = features, sizes
@@ -159,15 +168,15 @@ class Recurrence(torch.autograd.Function):
     def backward(ctx: Any, dstates: Tensor, dh: Tensor, dc: Tensor) -> tuple[Tensor | None, ...]:
         x, c, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active = ctx.saved_tensors
         (steps, batch, width), n = rows.shape, dh.shape[1]
-        of_codes, of_given = ctx.needs_input_grad[5:7]
+        of_codes, of_given = ctx.needs_input_grad[6:8]
         dz, seen, after = ctx.sizes[0], sum(ctx.sizes[:2]), len(cell)
         first, last = 0 if of_codes else dz, after if of_given else sum(ctx.sizes[:3])  # columns that have a gradient
         dh, dc, piece, back = dh.clone(), dc.clone(), torch.empty_like(dh), cell[first:last].T
-        drow, dq, ds = rows.new_zeros(batch, width), torch.empty_like(gates), torch.empty_like(sigmoids)
+        drow, dq, ds = dh.new_zeros(batch, width), torch.empty_like(gates), torch.empty_like(sigmoids)
         row_z, row_h, row_s, row_given, row_out = drow.split(ctx.sizes, dim=1)
         front, tail, products = drow[:, :seen], drow[:, seen:], drow[:, first:last]
-        dcodes = rows.new_empty(steps, batch, dz) if of_codes else None
-        dgiven = rows.new_empty(steps, *row_given.shape) if of_given else None
+        dcodes = dh.new_empty(steps, batch, dz) if of_codes else None
+        dgiven = dh.new_empty(steps, *row_given.shape) if of_given else None
         parts, dparts = _each(gates, [n] * 4), _each(dq, [n] * 4)
         if x is not None:
             dx = torch.cat([torch.zeros_like(x)[None], dstates])  # of x_0 .. x_T
@@ -182,12 +191,12 @@ class Recurrence(torch.autograd.Function):
             if x is None:
                 tail.zero_()
             elif hidden is None:
-                torch.mm(dx[t + 1], out.T, out=tail)
+                _product(dx[t + 1], out.T, tail)
             else:
                 a, s = active[t, :, :-1], sigmoids[t]
                 torch.mm(dx[t + 1], out[:-1].T, out=da)
                 torch.addcmul(a, a, s, value=-1, out=ds[t]).add_(s).mul_(da)
-                torch.mm(ds[t], hidden.T, out=tail)
+                _product(ds[t], hidden.T, tail)
             dh += row_out
             (forget, write, read, new), tanh = (part[t] for part in parts), tanhs[t]
             dforget, dwrite, dread, dnew = (part[t] for part in dparts)
@@ -198,7 +207,7 @@ class Recurrence(torch.autograd.Function):
             tanh_backward(torch.mul(dc, write, out=piece), new, grad_input=dnew)
             dc *= forget
             front.zero_()
-            torch.addmm(products, dq[t], back, out=products)
+            _added(products, dq[t], back, products)
             dh.copy_(row_h)
             if dcodes is not None:
                 dcodes[t] = row_z
@@ -209,13 +218,36 @@ class Recurrence(torch.autograd.Function):
                 dx[t] += dx[t + 1]
                 dx_angles[t].add_(cos).add_(sin)
                 dx_others[t].add_(rest)
-        flat = rows.flatten(0, 1)
-        dcell = flat[:, :after].T @ dq.flatten(0, 1)
+        flat = rows.flatten(0, 1).T
+        dcell = _gradient(flat[:after], dq)
         if x is None:
-            return None, None, None, dh, dc, dcodes, dgiven, dcell, None, None
-        dhidden = None if hidden is None else flat[:, seen:].T @ ds.flatten(0, 1)
-        dout = (flat[:, seen:] if hidden is None else active.flatten(0, 1)).T @ dx[1:].flatten(0, 1)
-        return None, None, dx[0], dh, dc, dcodes, dgiven, dcell, dhidden, dout
+            return None, None, None, None, dh, dc, dcodes, dgiven, dcell, None, None
+        dhidden = None if hidden is None else _gradient(flat[seen:], ds)
+        dout = _gradient(flat[seen:] if hidden is None else active.flatten(0, 1).T, dx[1:])
+        return None, None, None, dx[0], dh, dc, dcodes, dgiven, dcell, dhidden, dout
+
+
+def _product_type(x: Tensor) -> torch.dtype:
+    """Number type of the products: that of ``x``, or of ``torch.autocast`` where it is on and ``x`` is float32."""
+    kind = x.device.type
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) and x.dtype == torch.float32 else x.dtype
+
+
+def _product(a: Tensor, b: Tensor, out: Tensor) -> Tensor:
+    """a b in the type of b, written into ``out``, which may be of another."""
+    return torch.mm(a, b, out=out) if out.dtype == b.dtype else out.copy_(torch.mm(a.to(b.dtype), b))
+
+
+def _added(x: Tensor, a: Tensor, b: Tensor, out: Tensor) -> Tensor:
+    """x + a b, the product in the type of b, written into ``out``."""
+    return (
+        torch.addmm(x, a, b, out=out) if x.dtype == b.dtype else torch.add(x, torch.mm(a.to(b.dtype), b), out=out)
+    )
+
+
+def _gradient(rows: Tensor, d: Tensor) -> Tensor:
+    """Of a weight: rows (k, T B) times gradients (T, B, m) in the type of the rows, as (k, m) in that of d."""
+    return (rows @ d.flatten(0, 1).to(rows.dtype)).to(d.dtype)
 
 
 def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
@@ -227,7 +259,11 @@ def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
 def _see(features: Features, x: Tensor, s: Tensor) -> None:
     """Write the features of x (B, dx), whose angles come first, into s (B, F)."""
     angles, others = len(features.angles), len(features.others)
-    (angle, other), (cos, sin, rest) = x.split([angles, others], 1), s.split([angles, angles, others], 1)
+    angle, other = x.split([angles, others], 1)
+    if s.dtype != x.dtype:
+        s.copy_(torch.cat([angle.cos(), angle.sin(), other], 1).sub_(features.mean).div_(features.std))
+        return
+    cos, sin, rest = s.split([angles, angles, others], 1)
     torch.cos(angle, out=cos)
     torch.sin(angle, out=sin)
     rest.copy_(other)

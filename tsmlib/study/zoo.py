@@ -153,9 +153,9 @@ def _slower(*stages: Stage) -> tuple[Stage, ...]:
 TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
 LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10)
 RECURRENT = (  # the mode first, since a sample costs less than two; at last over longer windows
-    replace(_free("point_loss", 17, 0.5), muon=0.006, span=(0.0, 0.5)),
-    replace(_free("loss", 11, 0.35), muon=0.006, span=(0.5, 0.85)),
-    replace(_free("loss", 7.5, 0.15), muon=0.006, span=(0.85, 1.0), future_len=30),
+    replace(_free("point_loss", 17, 0.5), muon=0.006, bf16=True, span=(0.0, 0.5)),
+    replace(_free("loss", 11, 0.35), muon=0.006, bf16=True, span=(0.5, 0.85)),
+    replace(_free("loss", 7.5, 0.15), muon=0.006, bf16=True, span=(0.85, 1.0), future_len=30),
 )
 PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
 
@@ -228,8 +228,8 @@ _MODELS = (
         pushing=(_muon(Stage("multi_step_loss", 21)),),
     ),
     ModelSpec(
-        "lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5, bf16=False),), planned=True,
-        pushing=(_muon(Stage("loss", 14.5, bf16=False)),),
+        "lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5),), planned=True,
+        pushing=(_muon(Stage("loss", 14.5)),),
     ),
     ModelSpec(
         "ensemble", Look("ensemble (Gaussian)", "#CC79A7", "P"), _ENSEMBLE, (Stage("loss", 33.3),),
