@@ -6,9 +6,9 @@
     x_{t+1}    = x_t + V [s_t, u_t, 1, h_t]               or V [silu(U [s_t, u_t, 1, h_t]), 1]
 
 The inputs of a step lie side by side in one row, from which each product takes what it needs, so that nothing is
-concatenated, and the gradient of a weight is one product over all steps at the end. Under ``torch.autocast`` the products
-with W and U (or V where there is no U), forward and backward, are in its type, bfloat16 for example; gates, memory and
-states are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
+concatenated, and the gradient of a weight is one product over all steps at the end. Under ``torch.autocast`` the
+products with W and U (or V where there is no U), forward and backward, are in its type, bfloat16 for example; gates,
+memory and states are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
 
 Letters in shapes: B batch, T steps, n hidden size, dz code size, F features, dx state size.
 """
@@ -113,8 +113,8 @@ class Recurrent:
 class Recurrence(torch.autograd.Function):
     """All steps. Arguments and results as in ``Recurrent``, but that in x the angles come first.
 
-    keep: what the backward pass needs. kind: number type of the products with W and U, and of the rows. Without x nothing
-    is predicted, and ``given`` holds the features as well.
+    keep: what the backward pass needs. kind: number type of the products with W and U, and of the rows. Without x
+    nothing is predicted, and ``given`` holds the features as well.
     """
 
     @staticmethod
@@ -240,9 +240,7 @@ def _product(a: Tensor, b: Tensor, out: Tensor) -> Tensor:
 
 def _added(x: Tensor, a: Tensor, b: Tensor, out: Tensor) -> Tensor:
     """x + a b, the product in the type of b, written into ``out``."""
-    return (
-        torch.addmm(x, a, b, out=out) if x.dtype == b.dtype else torch.add(x, torch.mm(a.to(b.dtype), b), out=out)
-    )
+    return torch.addmm(x, a, b, out=out) if x.dtype == b.dtype else torch.add(x, torch.mm(a.to(b.dtype), b), out=out)
 
 
 def _gradient(rows: Tensor, d: Tensor) -> Tensor:
