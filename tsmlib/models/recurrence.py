@@ -7,8 +7,8 @@
 
 The inputs of a step lie side by side in one row, from which each product takes what it needs, so that nothing is
 concatenated, and the gradient of a weight is one product over all steps at the end. Under ``torch.autocast`` the
-products with W and U (or V where there is no U), forward and backward, are in its type, bfloat16 for example; gates,
-memory and states are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
+products with W and U, forward and backward, are in its type, bfloat16 for example; gates, memory, states and the
+product with V are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
 
 Letters in shapes: B batch, T steps, n hidden size, dz code size, F features, dx state size.
 """
@@ -127,7 +127,6 @@ class Recurrence(torch.autograd.Function):
         sizes = [dz, n, after - dz - n - given.shape[2], given.shape[2], n]  # [z, h_{t-1}, s, [u, 1], h_t]
         rows, gates = h.new_empty(kept, batch, sum(sizes), dtype=kind), h.new_empty(kept, batch, 4 * n)
         cell, hidden = cell.to(kind), None if hidden is None else hidden.to(kind)
-        out = out.to(kind) if hidden is None and out is not None else out
         tanhs, cells = h.new_empty(2, kept, batch, n).unbind(0)
         sigmoids, active = h.new_empty(kept, batch, inner), h.new_ones(kept, batch, inner + 1)
         same, piece = kind == h.dtype, torch.empty_like(h)
@@ -157,7 +156,7 @@ class Recurrence(torch.autograd.Function):
             if hidden is not None:
                 s, tail = _product(tail, hidden, outputs[k][:, :-1]), outputs[k]
                 s.mul_(torch.sigmoid(s, out=places[k]))
-            x = _added(x, tail, out, states[t])
+            x = torch.addmm(x, tail.to(x.dtype), out, out=states[t])
         if keep:
             ctx.save_for_backward(*start, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active)
             ctx.features, ctx.sizes = features, sizes
@@ -191,7 +190,7 @@ class Recurrence(torch.autograd.Function):
             if x is None:
                 tail.zero_()
             elif hidden is None:
-                _product(dx[t + 1], out.T, tail)
+                torch.mm(dx[t + 1], out.T, out=tail)
             else:
                 a, s = active[t, :, :-1], sigmoids[t]
                 torch.mm(dx[t + 1], out[:-1].T, out=da)
@@ -223,7 +222,7 @@ class Recurrence(torch.autograd.Function):
         if x is None:
             return None, None, None, None, dh, dc, dcodes, dgiven, dcell, None, None
         dhidden = None if hidden is None else _gradient(flat[seen:], ds)
-        dout = _gradient(flat[seen:] if hidden is None else active.flatten(0, 1).T, dx[1:])
+        dout = (flat[seen:].to(dx.dtype) if hidden is None else active.flatten(0, 1).T) @ dx[1:].flatten(0, 1)
         return None, None, None, dx[0], dh, dc, dcodes, dgiven, dcell, dhidden, dout
 
 

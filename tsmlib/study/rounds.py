@@ -234,8 +234,8 @@ WORLDS = {
         muon={},
     ),
     # All episodes of a loop, 950, are less than a tenth of the steps that the model-free learners take. It begins with
-    # few, so that a round brings enough that is new (benchmarks/exploration). Hidden sizes make an update of both models
-    # equally long.
+    # few, so that a round brings enough that is new (benchmarks/exploration). Hidden sizes make updates of both models
+    # take as long.
     PUSH: World(
         {
             "smoke": Sizes(6, 1, 3, 2, 2, 4, 2, 1, searches=2),
