@@ -9,12 +9,9 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 import tsmlib as tsm
-from tsmlib.envs.render import render_array
-from tsmlib.figures import side_by_side
 from tsmlib.storage.files import write_bytes
 from tsmlib.study.results.planning import by_final_distance
 
@@ -29,20 +26,13 @@ def frames(env: str, targets: int, model: Path | None) -> np.ndarray:
     predict = tsm.model_predictor(net, task.past(net.past_len))
     trial = tsm.execute(task, tsm.cem(predict, task.reward, space, targets, candidates=96, progress="planning"))
     order = by_final_distance(task, trial)
-    target = order[len(order) // 2]
-    with torch.no_grad():
-        predicted = predict(trial.actions[None])[0, 0, target]
-    goal = task.target[target].numpy()
-    rollouts = {"predicted": predicted, "executed": trial.states[target, 1:]}
-    return side_by_side({
-        word: np.stack([render_array(state.numpy(), env, goal, size=360) for state in states])
-        for word, states in rollouts.items()
-    })  # fmt: skip
+    return tsm.film(task, trial, order[len(order) // 2])
 
 
 def save_webp(film: np.ndarray, path: Path, *, milliseconds: int = 40) -> None:
     """Write ``film`` (T, H, W, 3) uint8 as an animation that repeats, its last frame held for a second and a half."""
-    images = [Image.fromarray(frame) for frame in film]
+    size = (720, round(720 * film.shape[1] / film.shape[2]))
+    images = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in film]
     held = [milliseconds] * (len(images) - 1) + [1500]
     made = BytesIO()
     images[0].save(made, "WEBP", save_all=True, append_images=images[1:], duration=held, loop=0, quality=70, method=4)

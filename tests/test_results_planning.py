@@ -12,6 +12,7 @@ import torch
 
 from tsmlib import study
 from tsmlib.envs import imperfect
+from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import DELAY, NOISE
 from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial, execute
@@ -313,6 +314,21 @@ def test_a_film_of_an_arm_behind_noisy_sensors_shows_what_they_say_beside_what_i
     seen, again = np.split(media.film(noisy, perfect, 1), 2, axis=2)
     np.testing.assert_array_equal(seen[:, 40:], again[:, 40:])
     np.testing.assert_array_equal(again, done)
+
+
+def test_a_film_says_the_time_of_each_frame_and_how_far_the_target_is() -> None:
+    task = dataclasses.replace(some_task(REACHER, 1), horizon=3)
+    start = torch.from_numpy(task.start)[:, None].expand(-1, 3, -1)
+    still = foreseen(task, zero_torques(task))
+    still = dataclasses.replace(still, states=torch.cat([start[:, :1], start], 1))  # an arm that never moves
+    _, frames = np.split(media.film(task, still, 0), 2, axis=2)
+    away = np.linalg.norm(task.start[0, 4:6] - task.target[0].numpy())
+    where = np.s_[440:470]  # the line of text, in pixels
+    for k, frame in enumerate(frames):
+        told = f"{0.02 * (k + 1):.2f} s,  {1000 * away:.0f} mm away"
+        drawn = render_array(task.start[0], task.env, task.target[0].numpy(), note=told)
+        np.testing.assert_array_equal(frame[-480:][where], drawn[where])
+    assert (frames[0] != frames[1]).any()
 
 
 def test_a_film_of_late_actions_that_nobody_planned_is_refused() -> None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 import torch
-from gymnasium import make_vec
 from gymnasium.spaces import Box
 from IPython.display import Markdown, display
 from matplotlib.axes import Axes
@@ -19,8 +18,9 @@ from torch import Tensor
 
 from tsmlib import figures, rewards
 from tsmlib.envs import drawing
-from tsmlib.envs.arm import ArmVectorEnv
-from tsmlib.envs.render import draw_scene
+from tsmlib.envs.geometry import DT
+from tsmlib.envs.render import draw_scene, render_array
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.evaluation import latent
 from tsmlib.evaluation.futures import Coded
@@ -80,18 +80,18 @@ def film(task: Task, trial: Trial, target: int) -> np.ndarray:
     """
     if task.begins_by_seed and not drawing.drawable(task.env):
         return figures.side_by_side({"executed": _rendered(task, trial, target)})
-    titles = "predicted", "executed"
+    titles, first = ("predicted", "executed"), 1
     if trial.plan is None and trial.observed is not None:
-        titles = "observed", "true"
+        titles, first = ("observed", "true"), 0
         predicted, executed = trial.observed[target].numpy(), trial.states[target].numpy()
     else:
         predicted, executed = _rollouts(trial, target)
-    return figures.side_by_side(dict(zip(titles, _filmed(task, target, predicted, executed), strict=True)))
+    return figures.side_by_side(dict(zip(titles, _filmed(task, target, predicted, executed, first=first), strict=True)))
 
 
 def episode_film(data: Trajectories, episode: int) -> np.ndarray:
     """Frames (T + 1, height, width, 3) of one episode, without a target."""
-    return _frames(data.env, data.states[episode], np.full(2, 9.0))  # where no camera sees it
+    return _frames(data.env, data.states[episode], None, first=0)
 
 
 def compared_film(task: Task, trials: Mapping[Method, Trial], target: int) -> np.ndarray:
@@ -137,17 +137,21 @@ def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: in
     return figures.plan_strip(draw, rollouts, task.target[target].numpy(), times, notes=notes)
 
 
-def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
-    """A film of each rollout (T, dx)."""
+def _filmed(task: Task, target: int, *rollouts: np.ndarray, first: int = 1) -> list[np.ndarray]:
+    """A film of each rollout (T, dx). first: the step of its first state."""
     if task.begins_by_seed:  # not an arm
         return [drawing.frames(task.env, states) for states in rollouts]
-    return [_frames(task.env, states, task.target[target].numpy()) for states in rollouts]
+    return [_frames(task.env, states, task.target[target].numpy(), first=first) for states in rollouts]
 
 
-def _frames(env_id: str, states: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Each of the states (T, dx) of an arm drawn."""
-    with closing(cast(ArmVectorEnv, make_vec(env_id, num_envs=1).unwrapped)) as arm:
-        return np.stack([arm.image(state, target) for state in states])
+def _frames(env_id: str, states: np.ndarray, target: np.ndarray | None, *, first: int) -> np.ndarray:
+    """Each of the states (T, dx) of an arm drawn, with the way so far, the time and how far the target is."""
+    mover, frames = rewards.BLOCK if EnvSpec.parse(env_id).task == "push" else rewards.TIP, []
+    for k, state in enumerate(states):
+        away = "" if target is None else f",  {1000 * float(np.linalg.norm(state[mover] - target)):.0f} mm away"
+        note = f"{(first + k) * DT:.2f} s{away}"
+        frames.append(render_array(state, env_id, target, path=states[: k + 1, mover], note=note))
+    return np.stack(frames)
 
 
 def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:
