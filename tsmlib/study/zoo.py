@@ -32,9 +32,10 @@ class Stage:
 
     rate: updates per second on one core of the machine that the published models were trained on, on the plain arm and
     where there is a block. future_len: steps ahead, 2 H. lr: the best of 1e-3, 2e-3 and 4e-3 for every baseline, on
-    validation. bf16: whether products in bfloat16 are faster, on a processor that has them (``training.precision``;
-    elsewhere float32) and train as well: not where a gated stack is run step by step, nor for the LSTM. muon, weight_decay, patience and span: of
-    ``TrainingOptions``; stages that share one schedule have spans that follow each other, as (0, 0.6) and (0.6, 1) do.
+    validation. bf16: whether products in bfloat16 are faster and teach as much, on a processor that has them
+    (``training.precision``; elsewhere float32): not where a gated stack is run step by step, nor of the LSTM. muon,
+    weight_decay, patience and span: of ``TrainingOptions``; stages that share one schedule have spans that follow each
+    other, as (0, 0.6) and (0.6, 1) do.
     """
 
     loss: str
