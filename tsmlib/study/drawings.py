@@ -19,7 +19,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.study import zoo
-from tsmlib.study.results import latent, planning, policies, prediction, robustness, table
+from tsmlib.study.results import exploration, latent, planning, policies, prediction, robustness, table
 
 SCORES = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance", "energy_score_noise": "energy score"}
 FEW = (zoo.PAPERS, zoo.OURS, "onestep", "lstm", "ensemble+mse")  # models whose scores are drawn step by step
@@ -161,3 +161,23 @@ def advantage_map(
         yield Drawing(
             figures.advantage_map(maps, zoo.method(subject), unit="nats per step", yours=yours), "06_map", rows
         )
+
+
+# 10_explore ----------------------------------------------------------------------------------------------------------
+
+
+def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Drawing]:
+    """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles."""
+    rows = table.select(found, execution=planning.CLOSED, env=env)
+    curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
+    if curves:
+        stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
+        yield Drawing(figures.rounds(curves, "", yours=yours), stem, rows)
+
+
+def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:
+    """Energy scores of models that were adapted to a changed arm, way by way."""
+    rows = table.select(found, execution=planning.OPEN, env=env)
+    curves, yours = table.pair(rows, partial(exploration.way_curves, steps_ahead=steps_ahead))
+    if curves:
+        yield Drawing(figures.adapted(curves, f"energy score, {steps_ahead} steps", yours=yours), "10_ways", rows)

@@ -89,18 +89,22 @@ def readme_loops(env: str) -> str:
 
 
 def readme_training(env: str) -> str:
-    """One sentence: what plans cost through single networks that were trained for longer; empty without such lines."""
+    """One sentence: single networks, as trained as the shipped ones and for longer; empty without such lines."""
     lines = pd.read_csv(QUALITY) if QUALITY.exists() else pd.DataFrame(columns=["env"])
     lines = lines[lines["env"] == env]
     if not len(lines):
         return ""
-    costs = lines.pivot(index="model", columns="seconds", values="cost")[
-        [zoo.BUDGET[EnvSpec.parse(env).name], lines["seconds"].max()]
-    ]
-    said = ", ".join(f"`{model}` {short:.1f} → {long:.1f} m" for model, (short, long) in costs.dropna().iterrows())
-    shipped, longest = map(float, costs.columns)
-    scale = f"{_seeds(lines)}, {lines['targets'].max()} validation targets; same page"
-    return f"Single networks trained {longest / shipped:g} times as long ({scale}) plan at a cost of {said}."
+    shipped, longest = zoo.BUDGET[EnvSpec.parse(env).name], float(lines["seconds"].max())
+    both = lines.pivot(index="model", columns="seconds")[["energy_80", "cost"]].dropna()
+    said = ", ".join(
+        f"`{model}` {found['energy_80', shipped]:.2f} → {found['energy_80', longest]:.2f} "
+        f"({found['cost', shipped]:.1f} → {found['cost', longest]:.1f})"
+        for model, found in both.iterrows()
+    )
+    return (
+        f"Energy score 80 steps ahead (and cost of plans, m) of single networks trained {longest / shipped:g} times as "
+        f"long ({_seeds(lines)}; same page): {said}."
+    )
 
 
 def _seeds(rows: pd.DataFrame) -> str:
@@ -280,11 +284,15 @@ Written from the rows that `python -m tsmlib run explore --scale paper` or `pyth
 benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every ten steps, from n
 starts that no round trains on; steps count the random episodes before the first round.
 
+![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)
+
 {exploration_results.rounds_table(rows)}
 {_pushing_rounds(rows, free)}
 The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque. n test episodes, open loop after ten
 observed steps, in units of the standard arm.
 Seeds are of the few episodes and of the updates on them: all begin from the one model that ships.
+
+![Energy scores of adapted models against the episodes that they know](../figures/10_ways.png)
 
 {exploration_results.ways_table(rows)}
 
@@ -298,6 +306,8 @@ def _pushing_rounds(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
     page = f"""
 The arm that pushes, planned again every ten steps, to the first n frozen targets; "{exploration_results.NONE}" is the
 same training on the first random episodes alone:
+
+![Executed return and share within 5 cm of the arm that pushes against environment steps](../figures/10_pushing.png)
 
 {found}
 """

@@ -20,8 +20,8 @@ from tsmlib.study.claims import report as claims_report
 from tsmlib.study.comparison import published
 from tsmlib.study.drawings import Drawing
 from tsmlib.study.notebooks import require
+from tsmlib.study.results import exploration, table
 from tsmlib.study.results import policies as policies_results
-from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
 from tsmlib.study.runs import RESULTS, ROOT, Notebook, Run, RunError
 from tsmlib.study.tasks import load_task
@@ -175,9 +175,9 @@ def drawn_by_cells(notebook: Notebook, folder: Path) -> list[Path]:
 
 def drawings_of_rows() -> Iterator[Drawing]:
     """Every figure of the tables in data/results, as the run at scale paper draws it whose rows they are."""
-    predict, codes, control, by_target, imperfect = (
+    predict, codes, control, by_target, imperfect, explored = (
         published(name).assign(source=table.YOURS)
-        for name in ("03_predict", "04_latent", "05_control", "05_control_rows", "06_robustness")
+        for name in ("03_predict", "04_latent", "05_control", "05_control_rows", "06_robustness", "10_explore")
     )
     tasks = [load_task(env) for env in (REACH, PUSH)]
     yield drawings.figure5(predict, MUJOCO_IDS)
@@ -196,3 +196,6 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
     subject = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
     yield from drawings.advantage_map(imperfect, subject, asked.rivals, asked.noises, asked.delays)
+    for env, titles in exploration.DRAWN.items():
+        yield from drawings.rounds(explored, env, titles)
+    yield from drawings.ways(explored, exploration.WEAK_ARM)

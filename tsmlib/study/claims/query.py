@@ -107,7 +107,9 @@ class Term(NamedTuple):
         return f"{self.metric}({', '.join(word for word in words if word not in ('', 'none'))})"
 
 
-TOLD = ("planner", "search_space", "steps_ahead", "subset", "lag", "configuration")  # what tells a term from its like
+TOLD = (  # what tells a term from its like
+    "planner", "search_space", "steps_ahead", "subset", "lag", "configuration", "iteration",
+)  # fmt: skip
 INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}
 NAMES = {"absolute": "abs", "negative": "-"}
 COMPARED = {"greater": ">", "greater_equal": ">=", "less": "<", "less_equal": "<="}
@@ -305,6 +307,16 @@ class Query:
         """Of rounds of exploration after so many steps, or of an adapted model; configuration: by which data or how."""
         return self._ask("10_explore", metric, model.word, place, configuration=configuration, env_steps=env_steps,
                          steps_ahead=steps_ahead)  # fmt: skip
+
+    def pushed(self, configuration: str, *, after: int) -> Number:
+        """Executed return after so many rounds of exploration on the arm that pushes."""
+        return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration=configuration, iteration=after,
+                         execution="closed loop")  # fmt: skip
+
+    def searched(self, prior: str) -> Number:
+        """Return that a search of ten iterations through the true simulator ends with, in codes of a prior."""
+        return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration="own plans", subset=prior,
+                         iteration=10, execution="open loop")  # fmt: skip
 
     def gradient_error(self) -> Number:
         return self._ask("02_train", "gradient_error", PAPERS, PUSH)
