@@ -33,7 +33,7 @@ from tsmlib.study.rounds import Sizes
 from tsmlib.trajectory import Trajectories
 
 SETTINGS = {  # bound: of the actions, random ones included; every: steps between plans; trained: episodes between fits
-    PENDULUM: {"bound": 1.0, "every": 1, "trained": 1}, PUSH: {"bound": 0.2, "every": 10, "trained": 50},
+    PENDULUM: {"bound": 1.0, "every": 1, "trained": 1}, PUSH: {"bound": 0.2, "every": 10, "trained": 150},
 }  # fmt: skip
 PLANNING = {"smoke": (20, 2, 5, 5), "laptop": (100, 5, 5, 30), "paper": (100, 5, 5, 30)}
 # candidates, iterations, particles (a multiple of the 5 members), steps ahead; README.md says what other numbers return
