@@ -21,7 +21,9 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LOADED = re.compile(r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=[\"'](?:https?:)?//[^>]*>")
 WRITTEN = [page for page in sorted(DOCS.rglob("*.md")) if "_build" not in page.parts]
 OPTIONAL = {"mbrl_lib": "mbrl.models", "own_data": "minari"}  # page -> what its program needs that may be missing
-PAGES = [page for page in WRITTEN if BLOCK.search(page.read_text())]
+PAGES = [
+    page for page in WRITTEN if BLOCK.search(page.read_text()) and page.stem != "own_data"
+]  # which has its own test
 
 
 def run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
@@ -68,7 +70,7 @@ def test_a_plan_made_from_logs_alone_takes_the_cart_to_its_goal(
     for force in names["plan"].actions[0, :, 0].tolist():  # the cart of the page's data
         speed += 0.1 * force
         place += 0.05 * speed
-    assert abs(place - 0.2) < 0.1
+    assert abs(place - 0.2) < 0.05
 
 
 @pytest.mark.parametrize(

@@ -331,6 +331,16 @@ def test_a_film_says_the_time_of_each_frame_and_how_far_the_target_is() -> None:
     assert (frames[0] != frames[1]).any()
 
 
+def test_a_film_says_no_distance_where_the_reward_knows_none() -> None:
+    own = Task.from_env(REACHER, n=1, horizon=2, reward=lambda x, u: -x[..., 3].abs())
+    slow = some_task(REACHER, 1).with_reward("slow", lambda x, u: -x[..., 3].abs(), horizon=2)
+    for task, goal in ((own, None), (slow, slow.target[0].numpy())):
+        trial = foreseen(task, zero_torques(task))
+        _, frames = np.split(media.film(task, trial, 0), 2, axis=2)
+        drawn = render_array(trial.states[0, 1].numpy(), task.env, goal, note="0.02 s")
+        np.testing.assert_array_equal(frames[0, -480:][440:470], drawn[440:470])
+
+
 def test_a_film_of_late_actions_that_nobody_planned_is_refused() -> None:
     task = dataclasses.replace(some_task(REACHER, 2), env=imperfect(REACHER, delay=DELAY))
     with pytest.raises(ValueError, match="not planned"):

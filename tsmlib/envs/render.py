@@ -85,13 +85,13 @@ def render_array(
     target: np.ndarray | None = None,
     size: int = 480,
     *,
-    path: np.ndarray | None = None,
+    tip_path: np.ndarray | None = None,
+    block_path: np.ndarray | None = None,
     note: str = "",
 ) -> np.ndarray:
     """The scene as a uint8 image (size, size, 3). Needs neither a display nor OpenGL.
 
-    path (T, 2): the way so far of what the task is about, the object where it is pushed, else the fingertip. note: a
-    line of text at the lower left.
+    tip_path, block_path: as of ``draw_scene``. note: a line of text at the lower left.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -100,8 +100,8 @@ def render_array(
         raise ValueError(f"size is {size}; expected at least 1 pixel")
     figure = Figure(figsize=(4.0, 4.0), dpi=size / 4.0)
     canvas = FigureCanvasAgg(figure)
-    ax, pushed = figure.add_axes((0.0, 0.0, 1.0, 1.0)), EnvSpec.parse(env_id).task == "push"
-    draw_scene(ax, state, env_id, target, tip_path=None if pushed else path, block_path=path if pushed else None)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_scene(ax, state, env_id, target, tip_path=tip_path, block_path=block_path)
     if note:
         ax.text(0.02 - WALL, 0.02 - WALL, note, color=INK, fontsize=11, family="DejaVu Sans", zorder=6)
     canvas.draw()

@@ -6,9 +6,9 @@
     x_{t+1}    = x_t + V [s_t, u_t, 1, h_t]               or V [silu(U [s_t, u_t, 1, h_t]), 1]
 
 The inputs of a step lie side by side in one row, from which each product takes what it needs, so that nothing is
-concatenated, and the gradient of a weight is one product over all steps at the end. Under ``torch.autocast`` the
-products with W and U, forward and backward, are in its type, bfloat16 for example; gates, memory, states and the
-product with V are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
+concatenated, and the gradient of a weight is one product over all steps at the end. Where there is a U, the products
+with W and U, forward and backward, are in the type of ``torch.autocast``, bfloat16 for example; gates, memory, states
+and the product with V are not. ``tests/test_recurrence.py`` holds all of it to the same written plainly.
 
 Letters in shapes: B batch, T steps, n hidden size, dz code size, F features, dx state size.
 """
@@ -66,6 +66,13 @@ class Recurrent:
     def _arranged(features: Features, v: Tensor) -> Tensor:
         return (v * features.step_std)[:, features.angles + features.others]
 
+    def _product_type(self, x: Tensor) -> torch.dtype:
+        """Number type of the products with W and U: that of ``x``, or of ``torch.autocast`` where it is on."""
+        kind = x.device.type
+        if self.hidden is None or x.dtype != torch.float32 or not torch.is_autocast_enabled(kind):
+            return x.dtype
+        return torch.get_autocast_dtype(kind)
+
     def read(self, past: Segment) -> Memory:
         """The memory after a past (B, L, .), all but its last state, with z = 0 and nothing before it."""
         s, u = self.features(past.states[:, :-1]), past.actions[:, 1:]
@@ -74,8 +81,9 @@ class Recurrent:
         cell = self.cell[len(self.cell) - n - given.shape[2] :]
         h = c = past.states.new_zeros(len(past.states), n)
         keep = torch.is_grad_enabled()
-        kind = _product_type(h)
-        _, h, c = Recurrence.apply(keep, kind, self.features, None, h, c, given[..., :0], given, cell, None, None)
+        _, h, c = Recurrence.apply(
+            keep, self._product_type(h), self.features, None, h, c, given[..., :0], given, cell, None, None
+        )
         return h, c
 
     def begin(self, past: Segment, code: Callable[[], Tensor] | None = None) -> Step:
@@ -96,7 +104,7 @@ class Recurrent:
         given = torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
         states, h, c = Recurrence.apply(
             torch.is_grad_enabled(),
-            _product_type(x),
+            self._product_type(x),
             self.features,
             x if order == sorted(order) else x[:, order],
             *memory,
@@ -156,7 +164,7 @@ class Recurrence(torch.autograd.Function):
             if hidden is not None:
                 s, tail = _product(tail, hidden, outputs[k][:, :-1]), outputs[k]
                 s.mul_(torch.sigmoid(s, out=places[k]))
-            x = torch.addmm(x, tail.to(x.dtype), out, out=states[t])
+            x = torch.addmm(x, tail, out, out=states[t])
         if keep:
             ctx.save_for_backward(*start, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active)
             ctx.features, ctx.sizes = features, sizes
@@ -222,14 +230,8 @@ class Recurrence(torch.autograd.Function):
         if x is None:
             return None, None, None, None, dh, dc, dcodes, dgiven, dcell, None, None
         dhidden = None if hidden is None else _gradient(flat[seen:], ds)
-        dout = (flat[seen:].to(dx.dtype) if hidden is None else active.flatten(0, 1).T) @ dx[1:].flatten(0, 1)
+        dout = _gradient(flat[seen:] if hidden is None else active.flatten(0, 1).T, dx[1:])
         return None, None, None, dx[0], dh, dc, dcodes, dgiven, dcell, dhidden, dout
-
-
-def _product_type(x: Tensor) -> torch.dtype:
-    """Number type of the products: that of ``x``, or of ``torch.autocast`` where it is on and ``x`` is float32."""
-    kind = x.device.type
-    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) and x.dtype == torch.float32 else x.dtype
 
 
 def _product(a: Tensor, b: Tensor, out: Tensor) -> Tensor:
@@ -244,7 +246,8 @@ def _added(x: Tensor, a: Tensor, b: Tensor, out: Tensor) -> Tensor:
 
 def _gradient(rows: Tensor, d: Tensor) -> Tensor:
     """Of a weight: rows (k, T B) times gradients (T, B, m) in the type of the rows, as (k, m) in that of d."""
-    return (rows @ d.flatten(0, 1).to(rows.dtype)).to(d.dtype)
+    product = torch.mm(rows, d.flatten(0, 1).to(rows.dtype), out=rows.new_empty(len(rows), d.shape[2]))  # no autocast
+    return product.to(d.dtype)
 
 
 def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:

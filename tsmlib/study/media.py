@@ -20,7 +20,6 @@ from tsmlib import figures, rewards
 from tsmlib.envs import drawing
 from tsmlib.envs.geometry import DT
 from tsmlib.envs.render import draw_scene, render_array
-from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.evaluation import latent
 from tsmlib.evaluation.futures import Coded
@@ -75,23 +74,23 @@ def show_table(
 def film(task: Task, trial: Trial, target: int) -> np.ndarray:
     """Frames (T, height, width, 3) of one target: the predicted rollout beside the executed one.
 
+    Of an arm, with the way so far of what has to arrive, the time and, for the paper's reward, how far the target is.
     Of a trial behind noisy sensors that was not planned: the observed states beside the true ones. Of a robot that
     cannot be drawn from its observations (``envs.drawing``): the execution alone, by its own ``render``.
     """
     if task.begins_by_seed and not drawing.drawable(task.env):
         return figures.side_by_side({"executed": _rendered(task, trial, target)})
-    titles, first = ("predicted", "executed"), 1
     if trial.plan is None and trial.observed is not None:
-        titles, first = ("observed", "true"), 0
-        predicted, executed = trial.observed[target].numpy(), trial.states[target].numpy()
-    else:
-        predicted, executed = _rollouts(trial, target)
-    return figures.side_by_side(dict(zip(titles, _filmed(task, target, predicted, executed, first=first), strict=True)))
+        goal, seen = task.target[target].numpy(), {"observed": trial.observed, "true": trial.states}
+        return figures.side_by_side({title: _frames(task.env, x[target].numpy(), goal) for title, x in seen.items()})
+    return figures.side_by_side(
+        dict(zip(("predicted", "executed"), _filmed(task, target, *_rollouts(trial, target)), strict=True))
+    )
 
 
 def episode_film(data: Trajectories, episode: int) -> np.ndarray:
     """Frames (T + 1, height, width, 3) of one episode, without a target."""
-    return _frames(data.env, data.states[episode], None, first=0)
+    return _frames(data.env, data.states[episode])
 
 
 def compared_film(task: Task, trials: Mapping[Method, Trial], target: int) -> np.ndarray:
@@ -137,20 +136,30 @@ def strip(task: Task, trials: Mapping[Method, Trial], target: int, *, frames: in
     return figures.plan_strip(draw, rollouts, task.target[target].numpy(), times, notes=notes)
 
 
-def _filmed(task: Task, target: int, *rollouts: np.ndarray, first: int = 1) -> list[np.ndarray]:
-    """A film of each rollout (T, dx). first: the step of its first state."""
+def _filmed(task: Task, target: int, *rollouts: np.ndarray) -> list[np.ndarray]:
+    """A film of each rollout (T, dx), which begins with the state after the first step."""
     if task.begins_by_seed:  # not an arm
         return [drawing.frames(task.env, states) for states in rollouts]
-    return [_frames(task.env, states, task.target[target].numpy(), first=first) for states in rollouts]
+    goal, told = None if task.position is None else task.target[target].numpy(), task.is_standard
+    return [_frames(task.env, states, goal, mover=task.position, told=told, first=1) for states in rollouts]
 
 
-def _frames(env_id: str, states: np.ndarray, target: np.ndarray | None, *, first: int) -> np.ndarray:
-    """Each of the states (T, dx) of an arm drawn, with the way so far, the time and how far the target is."""
-    mover, frames = rewards.BLOCK if EnvSpec.parse(env_id).task == "push" else rewards.TIP, []
+def _frames(
+    env_id: str, states: np.ndarray, target: np.ndarray | None = None, *, mover: slice | None = None,
+    told: bool = False, first: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Each of the states (T, dx) of an arm drawn, and the time.
+
+    mover: what has to arrive, whose way so far is drawn; told: whether how far it is from the target is said. first:
+    the step of the first state.
+    """
+    way, frames = "block_path" if mover == rewards.BLOCK else "tip_path", []
     for k, state in enumerate(states):
-        away = "" if target is None else f",  {1000 * float(np.linalg.norm(state[mover] - target)):.0f} mm away"
-        note = f"{(first + k) * DT:.2f} s{away}"
-        frames.append(render_array(state, env_id, target, path=states[: k + 1, mover], note=note))
+        note = f"{(first + k) * DT:.2f} s"
+        if told and mover is not None and target is not None:
+            note += f",  {1000 * float(np.linalg.norm(state[mover] - target)):.0f} mm away"
+        paths: dict[str, Any] = {} if mover is None else {way: states[: k + 1, mover]}
+        frames.append(render_array(state, env_id, target, note=note, **paths))
     return np.stack(frames)
 
 

@@ -95,15 +95,17 @@ def readme_training(env: str) -> str:
     if not len(lines):
         return ""
     shipped, longest = zoo.BUDGET[EnvSpec.parse(env).name], float(lines["seconds"].max())
-    both = lines.pivot(index="model", columns="seconds")[["energy_80", "cost"]].dropna()
+    both = lines[lines["seconds"].isin((shipped, longest))].pivot_table(
+        index="model", columns="seconds", values=["energy_80", "cost"]
+    )
     said = ", ".join(
         f"`{model}` {found['energy_80', shipped]:.2f} → {found['energy_80', longest]:.2f} "
         f"({found['cost', shipped]:.1f} → {found['cost', longest]:.1f})"
-        for model, found in both.iterrows()
+        for model, found in both.dropna().iterrows()
     )
     return (
-        f"Energy score 80 steps ahead (and cost of plans, m) of single networks trained {longest / shipped:g} times as "
-        f"long ({_seeds(lines)}; same page): {said}."
+        f"Energy score at 80 steps (cost, m, validation targets) of single networks trained {longest / shipped:g} "
+        f"times as long ({_seeds(lines)}; same page): {said}."
     )
 
 

@@ -42,8 +42,8 @@ MODELS = {  # the first half of the segment model's training is of its mode over
     "rtsm": Recipe(
         {"hidden": 96},
         (
-            _stage("point_loss", 0.4, future_len=10, batch=128, span=(0.0, 0.4)),
-            _stage("loss", 0.6, batch=128, span=(0.4, 1.0)),
+            _stage("point_loss", 0.4, future_len=10, batch=128, bf16=False, span=(0.0, 0.4)),
+            _stage("loss", 0.6, batch=128, bf16=False, span=(0.4, 1.0)),
         ),
     ),
     "onestep": Recipe({}, (_stage("loss", lr=2e-3),)),

@@ -313,9 +313,9 @@ class Query:
         return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration=configuration, iteration=after,
                          execution="closed loop")  # fmt: skip
 
-    def searched(self, prior: str) -> Number:
+    def searched(self, prior: str, configuration: str = "own plans") -> Number:
         """Return that a search of ten iterations through the true simulator ends with, in codes of a prior."""
-        return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration="own plans", subset=prior,
+        return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration=configuration, subset=prior,
                          iteration=10, execution="open loop")  # fmt: skip
 
     def gradient_error(self) -> Number:
