@@ -74,7 +74,7 @@ def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) 
     assert len(before) == 3
     assert before.nunique() == 1  # all begin with one learner
     panels = results.round_panels(rows, ["share within 5 cm"], PUSH)["share within 5 cm"]
-    assert [method.variant for method in panels] == ["", results.RANDOM]  # those that take steps
+    assert [method.variant for method in panels] == [results.PLANNED, results.RANDOM]  # those that take steps
     assert results.round_panels(rows, ["share within 5 cm"]) == {}  # of the pendulum, nothing
     assert "share within 5 cm" in results.rounds_table(rows, PUSH)
     assert f"`{PUSH}`, `lstm` on {results.NONE}, round 0 -> 1: executed return" in results.sentences(rows)

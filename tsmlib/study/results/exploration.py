@@ -130,20 +130,18 @@ def adapted_rows(
 def round_panels(
     rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM
 ) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
-    """Title of ROUNDS -> learner -> environment steps (R,) and values (k, R), for ``figures.rounds``.
+    """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
     Without those that take no steps.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM])
     for metric, title in ROUNDS[env].items():
-        for (word, space, data), own in table.groups(
-            table.select(rounds, metric=metric), ["model", "search_space", "configuration"]
-        ):
+        for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
             if title in titles:
                 wide = own.pivot(index="seed", columns="env_steps", values="value").dropna()
-                method = zoo.method(word, space, "cem", variant="" if data == PLANNED else data)
-                found.setdefault(title, {})[method] = wide.columns.to_numpy(float), wide.to_numpy(float)
+                steps, values = wide.columns.to_numpy(float), wide.to_numpy(float)
+                found.setdefault(title, {})[zoo.method(word, variant=data)] = steps, values
     return found
 
 
