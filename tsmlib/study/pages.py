@@ -290,7 +290,8 @@ starts that no round trains on; steps count the random episodes before the first
 
 {exploration_results.rounds_table(rows)}
 {_pushing_rounds(rows, free)}
-The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque. n test episodes, open loop after ten
+The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque, of `mass0.5` the object has half its
+mass. n test episodes, open loop after ten
 observed steps, in units of the standard arm.
 Seeds are of the few episodes and of the updates on them: all begin from the one model that ships.
 

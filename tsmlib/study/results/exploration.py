@@ -255,7 +255,8 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
     what the reference takes off it."""
     keys = ["env", "model", "configuration"]
     for (env, word, data), own in table.groups(table.select(rows, execution=CLOSED), keys):
-        first, last = own["iteration"].min(), own["iteration"].max()
+        if (first := own["iteration"].min()) == (last := own["iteration"].max()):
+            continue  # another library's, of which there is the last round alone
         means = own.groupby(["metric", "iteration"])["value"].mean()
         said = [
             f"{title} {means[metric, first]:.2f} -> {means[metric, last]:.2f}"
