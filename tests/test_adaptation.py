@@ -13,6 +13,7 @@ import tsmlib
 from tsmlib import figures
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, pages, rounds, runs
+from tsmlib.study.comparison import published
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
 from tsmlib.study.results.exploration import PENDULUM, PUSH
@@ -255,9 +256,10 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
     assert pages.exploration_page(tables.frame([])) == ""
-    published = ROOT / "data" / "results" / "10_explore.csv"
-    if published.exists():
-        assert pages.exploration_page(tables.load(published)) in (ROOT / "docs" / "results.md").read_text()
+    rows = published("10_explore")
+    if len(rows):
+        page = pages.exploration_page(rows, published("10_model_free"))
+        assert page in (ROOT / "docs" / "results.md").read_text()
 
 
 def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_path: Path) -> None:
