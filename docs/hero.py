@@ -5,13 +5,12 @@ distance, at half speed, left the rollout that the model predicted, right the ex
 """
 
 import argparse
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 import tsmlib as tsm
+from tsmlib.figures import animation
 from tsmlib.storage.files import write_bytes
 from tsmlib.study.results.planning import by_final_distance
 
@@ -29,16 +28,12 @@ def frames(env: str, targets: int, model: Path | None) -> np.ndarray:
     return tsm.film(task, trial, order[len(order) // 2])
 
 
-def save_webp(film: np.ndarray, path: Path, *, milliseconds: int = 40) -> None:
+def save_webp(film: np.ndarray, path: Path) -> None:
     """Write ``film`` (T, H, W, 3) uint8 as an animation that repeats, its last frame held for a second and a half."""
-    size = (720, round(720 * film.shape[1] / film.shape[2]))
-    images = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in film]
-    held = [milliseconds] * (len(images) - 1) + [1500]
-    made = BytesIO()
-    images[0].save(made, "WEBP", save_all=True, append_images=images[1:], duration=held, loop=0, quality=70, method=4)
-    if len(made.getvalue()) > LARGEST:
-        raise ValueError(f"{path} would have {len(made.getvalue()):,} bytes, expected at most {LARGEST:,}")
-    write_bytes(path, made.getvalue())
+    made = animation(film, 25, form="WEBP", width=720, hold=1.5)
+    if len(made) > LARGEST:
+        raise ValueError(f"{path} would have {len(made):,} bytes, expected at most {LARGEST:,}")
+    write_bytes(path, made)
 
 
 if __name__ == "__main__":

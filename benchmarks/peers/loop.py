@@ -32,8 +32,9 @@ from tsmlib.study.results.exploration import HORIZON, PENDULUM, PUSH
 from tsmlib.study.rounds import Sizes
 from tsmlib.trajectory import Trajectories
 
-SETTINGS = {  # bound: of the actions, random ones included; every: steps between plans; trained: episodes between fits
-    PENDULUM: {"bound": 1.0, "every": 1, "trained": 1}, PUSH: {"bound": 0.2, "every": 10, "trained": 150},
+SETTINGS = {  # bound: of the actions, random ones included; every: steps between plans; trained: episodes between fits,
+    # those of a round where it is not said
+    PENDULUM: {"bound": 1.0, "every": 1, "trained": 1}, PUSH: {"bound": 0.2, "every": 10},
 }  # fmt: skip
 PLANNING = {"smoke": (20, 2, 5, 5), "laptop": (100, 5, 5, 30), "paper": (100, 5, 5, 30)}
 # candidates, iterations, particles (a multiple of the 5 members), steps ahead; README.md says what other numbers return
@@ -107,7 +108,7 @@ def settings(env: str, scale: str, sizes: Sizes, *, seed: int) -> Any:
             "dataset_size": sizes.first * HORIZON + planned + HORIZON, "normalize": True,
             "normalize_double_precision": True, "target_is_delta": True, "learned_rewards": False,
             "initial_exploration_steps": sizes.first * HORIZON, "num_particles": particles,
-            "freq_train_model": min(here["trained"], sizes.episodes) * HORIZON,
+            "freq_train_model": here.get("trained", sizes.episodes) * HORIZON,
             "agent": {
                 "_target_": "mbrl.planning.TrajectoryOptimizerAgent", "_recursive_": False, "action_lb": "???",
                 "action_ub": "???", "planning_horizon": ahead, "replan_freq": here["every"], "verbose": False,

@@ -1,6 +1,7 @@
 """Quality of trained models against the time that training took: predictions, plans and physical violations.
 
     python benchmarks/settings/quality.py measure runs/paper/seed0/settings/ReacherPush/*.safetensors
+    python benchmarks/settings/quality.py together benchmarks/settings/models/rtsm_*.safetensors
     python benchmarks/settings/quality.py table
     python benchmarks/settings/quality.py figure
 
@@ -14,6 +15,8 @@ all lines are of one network. Nothing is taken from the test split:
                     the prior, 96 candidates x 10, judged by the mode, open loop, planner seed 0
     gap             mean size of predicted minus executed return, predicted by 32 samples that had no part in planning
     violations      share of those samples' steps that violate physics
+
+together prints the same of recurrent TSMs whose first decoders judge and predict as those of one model.
 
 table prints the lines as Markdown, with the cost of the recurrent TSM minus that of each model trained as long, paired
 by target with half the 95 % t interval over targets, and what a doubling of the time buys, from each line of a model
@@ -119,6 +122,14 @@ def measured(path: Path, n_targets: int, n_episodes: int) -> dict[str, object]:
     return said | predicted(one, env, n_episodes) | planned(one, env, n_targets)
 
 
+def together(paths: list[Path]) -> tuple[RecurrentTSM, str]:
+    """The first decoders of several recurrent TSMs as one model, with the features of the first; its environment."""
+    nets = [artifacts.load_model(path, RecurrentTSM).alone(0) for path in paths]
+    net = RecurrentTSM(**{**nets[0].config(), "members": len(nets), "angles": tuple(nets[0].features.angles)})  # type: ignore[arg-type]
+    net.features, net.decoders = nets[0].features, torch.nn.ModuleList([each.decoders[0] for each in nets])
+    return net, str(described(paths[0])["env"])
+
+
 def doublings(lines: pd.DataFrame) -> pd.DataFrame:
     """What a doubling of the training time changes, as a share, from each line to the next of the same model."""
     found = []
@@ -175,16 +186,19 @@ def tables(lines: pd.DataFrame) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("measure", "table", "figure"))
+    parser.add_argument("what", choices=("measure", "together", "table", "figure"))
     parser.add_argument("files", nargs="*", type=Path, help="trained models")
     parser.add_argument("--targets", type=int, default=100, help="of validation (default 100)")
     parser.add_argument("--episodes", type=int, default=200, help="fresh ones, to score predictions of (default 200)")
     parser.add_argument("--out", type=Path, default=HERE / "quality.csv", help="default quality.csv beside this script")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    if given.what == "measure" and not given.files:
-        parser.error("measure wants files of trained models, such as data/pretrained/ReacherPush/lstm.safetensors")
-    for path in given.files:
+    if given.what in ("measure", "together") and not given.files:
+        parser.error(f"{given.what} wants files of models, such as data/pretrained/ReacherPush/rtsm.safetensors")
+    if given.what == "together":
+        net, env = together(given.files)
+        print({**predicted(net, env, given.episodes), **planned(net, env, given.targets), "costs": ""})
+    for path in given.files if given.what == "measure" else ():
         known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame(columns=KEY)
         said = described(path)
         if (known[KEY] == [said[name] for name in KEY]).all(axis=1).any():

@@ -97,11 +97,13 @@ def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
     return path
 
 
-def animation(frames: np.ndarray, fps: int = 25, *, form: str = "PNG", width: int = 960, colours: int = 96) -> bytes:
+def animation(
+    frames: np.ndarray, fps: int = 25, *, form: str = "PNG", width: int = 960, colours: int = 96, hold: float = 0.0
+) -> bytes:
     """``frames`` (T, H, W, 3) uint8 as a picture that moves, again and again.
 
     form: PNG, GIF or WEBP. width: wider frames are made smaller, in pixels. colours: of a PNG or GIF, all frames alike,
-    which makes them as small as a film is; a WEBP has any.
+    which makes them as small as a film is; a WEBP has any. hold: seconds that the last frame stays longer.
     """
     from PIL import Image
 
@@ -109,13 +111,14 @@ def animation(frames: np.ndarray, fps: int = 25, *, form: str = "PNG", width: in
     if (across := pictures[0].width) > width:
         size = width, round(pictures[0].height * width / across)
         pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
-    options: dict[str, int] = {"quality": 70} if form == "WEBP" else {}
+    options: dict[str, int] = {"quality": 70, "method": 4} if form == "WEBP" else {}
     if form != "WEBP":
         some = np.concatenate([np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 8)]])
         palette = Image.fromarray(some).quantize(colours, dither=Image.Dither.NONE)
         pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     written = BytesIO()
-    pictures[0].save(written, form, save_all=True, append_images=pictures[1:], duration=1000 / fps, loop=0, **options)
+    times = [1000 / fps] * (len(pictures) - 1) + [1000 / fps + 1000 * hold]
+    pictures[0].save(written, form, save_all=True, append_images=pictures[1:], duration=times, loop=0, **options)
     return written.getvalue()
 
 

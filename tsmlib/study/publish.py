@@ -17,6 +17,7 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study import drawings, needed, notebooks, pages, runs, zoo
 from tsmlib.study.claims import evaluate
 from tsmlib.study.claims import report as claims_report
+from tsmlib.study.claims.query import WEAK_MOTORS
 from tsmlib.study.comparison import published
 from tsmlib.study.drawings import Drawing
 from tsmlib.study.notebooks import require
@@ -198,4 +199,4 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield from drawings.advantage_map(imperfect, subject, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
         yield from drawings.rounds(explored, env, titles)
-    yield from drawings.ways(explored, exploration.WEAK_ARM)
+    yield from drawings.ways(explored, WEAK_MOTORS.env)

@@ -27,7 +27,6 @@ from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 
 PENDULUM, PUSH, HORIZON = "Pendulum-v1", "tsm/ReacherPush-v1", 100
-WEAK_ARM = "tsm/Reacher-gain0.7-v0"  # to which models are adapted in the notebook
 DRAWN = {PENDULUM: ("executed return", "size of the gap"), PUSH: ("executed return", "share within 5 cm")}  # of ROUNDS
 TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
