@@ -55,7 +55,7 @@ T = TypeVar("T")
 class Sizes:
     """Of a loop: random episodes before it, rounds, episodes of each, updates of each training, starts that measure.
 
-    candidates, elites, iterations: of every plan; one is made every ten steps. before: updates of the model before the
+    candidates, elites, iterations: of every plan; every: steps between plans. before: updates of the model before the
     first round; prior: updates of each training of the prior; 0: as many as the model has in a round. searches:
     iterations of the search in which the first prior and the last are compared (``search``); 0: they are not.
     """
@@ -71,6 +71,7 @@ class Sizes:
     before: int = 0
     prior: int = 0
     searches: int = 0
+    every: int = 10
 
     def training(self, past_len: int, future_len: int, *, updates: int = 0, muon: float = 0.0) -> TrainingOptions:
         """Of a model or a prior, by default in a round."""
@@ -84,14 +85,15 @@ class Sizes:
         """Of ``explore``, for a model that reads as many steps of past."""
         return ExplorationOptions(
             model=self.training(past_len, 20, muon=muon), prior=self.training(10, 10, updates=self.prior),
-            rounds=self.rounds, candidates=self.candidates, elites=self.elites, iterations=self.iterations,
+            rounds=self.rounds, every=self.every, candidates=self.candidates, elites=self.elites,
+            iterations=self.iterations,
         )  # fmt: skip
 
 
 SIZES = {  # of the pendulum, by scale
     "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
     "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
-    "paper": Sizes(6, 4, 4, 120, 8, 24, 5, 2),
+    "paper": Sizes(6, 4, 4, 1000, 8, 64, 8, 5, 1500, 300, every=5),
 }
 
 
@@ -181,7 +183,7 @@ def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
     task = world(env).tested(sizes.starts)
 
     def measured(model: DynamicsModel, prior: ActionPrior | None) -> dict[str, float]:
-        trial = mpc(task, model, space_of(prior, env), planner(sizes, seed))
+        trial = mpc(task, model, space_of(prior, env), planner(sizes, seed), every=sizes.every)
         assert trial.success is not None
         found = {
             "return_true": float(trial.executed_return.mean()), "gap_absolute": float(trial.gap.abs().mean()),
@@ -229,7 +231,7 @@ class World:
 
 WORLDS = {
     PENDULUM: World(
-        SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 64}},
+        SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 128}},
         tested=lambda n: swing_up(n, seed=TESTED), drawn=swing_up, random=random_episodes, action_dim=1, rms=0.6,
         muon={},
     ),
