@@ -283,7 +283,7 @@ def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> st
     return f"""## Exploration and adaptation
 
 Written from the rows that `python -m tsmlib run explore --scale paper` or `python
-benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every ten steps, from n
+benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every five steps, from n
 starts that no round trains on; steps count the random episodes before the first round.
 
 ![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)

@@ -1,0 +1,61 @@
+"""What a round of the pendulum needs: return on validation starts against training and planning.
+
+    python benchmarks/exploration/pendulum.py rtsm --updates 1000 --before 1500 --prior 300 --candidates 64 --elites 8 \
+        --iterations 5 --every 5
+
+The loop of notebook 10 (``study.rounds.loop``) with the numbers of ``Sizes`` that are given, of training seed 10, which
+no published row has. After every round the model plans from 16 validation starts. A line in pendulum.csv for each
+round: executed return, share upright, mean absolute gap. Lines of the same loop are replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pandas as pd
+import torch
+
+from tsmlib.study import rounds, runs
+from tsmlib.study.results.exploration import PENDULUM
+
+PLACE, SEED, STARTS, VALIDATION = Path(__file__).with_suffix(".csv"), 10, 16, 3000
+GIVEN = ("updates", "before", "prior", "candidates", "elites", "iterations", "every")
+METRICS = ("return_true", "success", "gap_absolute")
+
+
+def lines(word: str, sizes: rounds.Sizes) -> pd.DataFrame:
+    """One loop, round 0 first."""
+    here = rounds.WORLDS[PENDULUM]
+    rounds.WORLDS[PENDULUM] = replace(here, tested=lambda n: rounds.swing_up(n, seed=VALIDATION))
+    began = time.process_time()
+    rows = pd.DataFrame(rounds.loop(runs.resolve("10_explore", scale="paper", seed=SEED), word, sizes=sizes).rows)
+    table = rows[rows["metric"].isin(METRICS)].pivot(index="env_steps", columns="metric", values="value").reset_index()
+    what = {"model": word} | {name: asdict(sizes)[name] for name in GIVEN}
+    return table[["env_steps", *METRICS]].assign(**what, loop_seconds=round(time.process_time() - began))
+
+
+def main() -> None:
+    default = rounds.SIZES["paper"]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", choices=rounds.WORLDS[PENDULUM].learners)
+    for name in GIVEN:
+        parser.add_argument(f"--{name}", type=int, default=getattr(default, name), help="default %(default)s")
+    given = vars(parser.parse_args())
+    torch.set_num_threads(1)
+    word = given.pop("model")
+    new = lines(word, replace(default, starts=STARTS, **given))
+    key = ["model", *GIVEN]
+    if PLACE.exists():
+        kept = pd.read_csv(PLACE)
+        same = kept[key].eq(new[key].iloc[0]).all(axis=1)
+        new = pd.concat([kept[~same], new])
+    columns = [*key, "env_steps", *METRICS, "loop_seconds"]
+    new[columns].round(3).to_csv(PLACE, index=False)
+    print(new[columns].round(2).to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()
