@@ -59,6 +59,14 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
     assert values.shape == (1, 2)
     figures.rounds(panels, "", yours=panels)
     assert "own plans, round 0 -> 1: executed return" in results.sentences(rows)
+    assert results.rounds_table(rows) == results.rounds_table(rows.iloc[::-1]), "a line's place is that of its round"
+
+
+def test_a_pendulum_that_measures_starts_as_none_that_is_learned_from() -> None:
+    measured = rounds.swing_up(8, seed=rounds.TESTED).start
+    for seed in range(10):
+        learned = rounds.first_episodes(6, seed).states[:, 0]
+        assert np.abs(learned[:, None] - measured[None]).max(-1).min() > 1e-3
 
 
 def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) -> None:

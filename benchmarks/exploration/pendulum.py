@@ -14,6 +14,7 @@ import argparse
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pandas as pd
 import torch
@@ -28,10 +29,10 @@ METRICS = ("return_true", "success", "gap_absolute")
 
 def lines(word: str, sizes: rounds.Sizes) -> pd.DataFrame:
     """One loop, round 0 first."""
-    here = rounds.WORLDS[PENDULUM]
-    rounds.WORLDS[PENDULUM] = replace(here, tested=lambda n: rounds.swing_up(n, seed=VALIDATION))
-    began = time.process_time()
-    rows = pd.DataFrame(rounds.loop(runs.resolve("10_explore", scale="paper", seed=SEED), word, sizes=sizes).rows)
+    began, run = time.process_time(), runs.resolve("10_explore", scale="paper", seed=SEED)
+    validation = replace(rounds.WORLDS[PENDULUM], tested=lambda n: rounds.swing_up(n, seed=VALIDATION))
+    with patch.dict(rounds.WORLDS, {PENDULUM: validation}):
+        rows = pd.DataFrame(rounds.loop(run, word, sizes=sizes).rows)
     table = rows[rows["metric"].isin(METRICS)].pivot(index="env_steps", columns="metric", values="value").reset_index()
     what = {"model": word} | {name: asdict(sizes)[name] for name in GIVEN}
     return table[["env_steps", *METRICS]].assign(**what, loop_seconds=round(time.process_time() - began))

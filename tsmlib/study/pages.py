@@ -9,7 +9,7 @@ import pandas as pd
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import plans, zoo
+from tsmlib.study import plans, rounds, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL, VERDICTS
@@ -283,8 +283,9 @@ def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> st
     return f"""## Exploration and adaptation
 
 Written from the rows that `python -m tsmlib run explore --scale paper` or `python
-benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every five steps, from n
-starts that no round trains on; steps count the random episodes before the first round.
+benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every
+{rounds.SIZES["paper"].every} steps, from n starts that no round trains on; steps count the random episodes before the
+first round.
 
 ![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)
 

@@ -46,7 +46,8 @@ from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans
-TESTED = 1000  # seed of the pendulum's starts that measure, of no round
+TESTED = 1000  # seed of the pendulum's starts that measure, of no episode that is learned from
+BEGINNING = 50_000  # of its random episodes before round 1, by a training seed of 0; each next one has 1,000 more
 SEARCHED = 25  # starts of the searches in which two priors are compared, at most
 T = TypeVar("T")
 
@@ -112,6 +113,11 @@ def swing_up(n: int, seed: int) -> Task:
 def tasks(episodes: int, seed: int) -> Callable[[int], Task]:
     """Round -> its starts."""
     return lambda k: swing_up(episodes, seed=_seed(seed, k))
+
+
+def first_episodes(n: int, seed: int) -> Trajectories:
+    """Random episodes of the pendulum that a loop begins with, by training seed."""
+    return random_episodes(n, BEGINNING + 1000 * seed)
 
 
 def random_episodes(n: int, seed: int) -> Trajectories:
@@ -214,7 +220,8 @@ class World:
     """What differs between the robots that explore.
 
     learners: arguments of each model, beyond the defaults; muon: its rate, if any. tested: starts that measure;
-    drawn: (episodes, seed) -> the tasks of a round; random: (episodes, seed) -> what random torques of ``rms`` do.
+    drawn: (episodes, seed) -> the tasks of a round; random: (episodes, seed) -> what random torques of ``rms`` do;
+    first: (episodes, training seed) -> those before round 1.
     augmented: what a model is trained on, made of its training data.
     """
 
@@ -223,6 +230,7 @@ class World:
     tested: Callable[[int], Task]
     drawn: Callable[[int, int], Task]
     random: Callable[[int, int], Trajectories]
+    first: Callable[[int, int], Trajectories]
     action_dim: int
     rms: float
     muon: Mapping[str, float]
@@ -232,8 +240,8 @@ class World:
 WORLDS = {
     PENDULUM: World(
         SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 128}},
-        tested=lambda n: swing_up(n, seed=TESTED), drawn=swing_up, random=random_episodes, action_dim=1, rms=0.6,
-        muon={},
+        tested=lambda n: swing_up(n, seed=TESTED), drawn=swing_up, random=random_episodes, first=first_episodes,
+        action_dim=1, rms=0.6, muon={},
     ),
     # All episodes of a loop, 950, are less than a tenth of the steps that the model-free learners take. It begins with
     # few, so that a round brings enough that is new (benchmarks/exploration). Hidden sizes make updates of both models
@@ -246,7 +254,8 @@ WORLDS = {
         },
         {"rtsm": {"hidden": 96}, "lstm": {}},
         tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
-        random=lambda n, seed: random_data(PUSH, n, seed=seed), action_dim=2, rms=0.1,
+        random=lambda n, seed: random_data(PUSH, n, seed=seed),
+        first=lambda n, seed: random_data(PUSH, n, seed=1000 * seed), action_dim=2, rms=0.1,
         muon={"rtsm": 0.01, "lstm": 0.02}, augmented=symmetric,  # as the study trains both
     ),
 }  # fmt: skip
@@ -286,7 +295,7 @@ class Learner(NamedTuple):
 def learner(word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None) -> Learner:
     """One of a world's learners as a loop begins; a training that was stopped goes on from ``folder``."""
     here = require(env, word)
-    train, held_out = divided(here.random(sizes.first, 1000 * seed))  # the pendulum's episode i is of seed + i
+    train, held_out = divided(here.first(sizes.first, seed))
     made_for = cast(type[RecurrentTSM], zoo.find(word).load())  # what is used here of one, all have
     model = made_for.for_data(train, seed=seed, **here.learners[word])
     prior = None if word in WITHOUT_PRIOR else ActionPrior.for_data(train, seed=seed, channels=16)

@@ -166,8 +166,12 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
     """A line for each learner and round, with the contacts of its episodes where they were counted."""
     lines = []
     keys = ["model", "configuration", "iteration"]
-    collected = table.select(rows, env=env, subset="data")
-    for (word, data, k), own in table.groups(table.select(rows, env=env, execution=CLOSED), keys):
+    collected, closed = table.select(rows, env=env, subset="data"), table.select(rows, env=env, execution=CLOSED)
+    words = list(closed["model"].unique())
+    for word, data, k in sorted(
+        {key for key, _ in table.groups(closed, keys)}, key=lambda of: (words.index(of[0]), DATA.index(of[1]), of[2])
+    ):
+        own = table.select(closed, model=word, configuration=data, iteration=k)
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{int(own['env_steps'].max()):,}"}
         for metric, title in ROUNDS[env].items():
             values = table.select(own, metric=metric)["value"]
