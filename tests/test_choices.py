@@ -227,6 +227,27 @@ def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as
         assert found[quality.MEASURES[name]].tolist() == ["1.50 (onestep)", "0.50 (lstm)"]
 
 
+def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:
+    scores = {
+        ("tsm", 0): 1.0,
+        ("tsm", 1): 2.0,
+        ("lstm", 0): 2.0,
+        ("lstm", 1): 4.0,
+        ("lstm", 2): 9.0,
+        ("onestep", 0): 7.0,
+    }
+    columns = [*quality.MEASURES, "coverage80", "within"]
+    lines = quality.several(pd.DataFrame([
+        {"env": "e", "model": model, "seconds": 580, "seed": seed} | dict.fromkeys(columns, score)
+        for (model, seed), score in scores.items()
+    ]))  # fmt: skip
+    assert quality.over_seeds(lines)["seeds"].tolist() == [3, 2]  # the one-step model was trained once
+    (pair,) = quality.against_baselines(lines).to_dict("records")
+    assert (pair["model"], pair["against"], pair["seeds"]) == ("tsm", "lstm", 2)
+    assert pair["gap (m), ratio"] == "0.50"
+    assert pair["cost, difference"].startswith("-1.50 ± ")
+
+
 def test_a_shipped_model_gets_one_line_of_quality_however_often_it_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,14 @@ def test_both_ensembles_are_named_by_their_loss() -> None:
     assert {"ensemble (Gaussian)", "ensemble (squared error)"} <= set(named)
 
 
+def test_the_line_against_training_time_joins_the_means_of_trainings_that_are_all_marked() -> None:
+    seconds, values = np.array([2320.0, 580, 2320]), np.array([1.0, 4, 3])
+    (ax,) = figures.training_time({"cost": {TSM: (seconds, values)}}).axes
+    marks, line = lines(ax, TSM)
+    assert marks.get_xydata().tolist() == np.stack([seconds, values], 1).tolist()
+    assert line.get_xydata().tolist() == [[580, 4], [2320, 2]]
+
+
 def test_figure5_marks_the_mean_over_seeds_and_its_interval() -> None:
     seeds = np.array([1.0, 2.0, 4.0])
     (ax,) = figures.figure5({"": {ENVS[0]: {TSM: seeds, LSTM: seeds + 1}}}).axes

@@ -18,14 +18,17 @@ all lines are of one network. Nothing is taken from the test split:
 
 together prints the same of recurrent TSMs whose first decoders judge and predict as those of one model.
 
-table prints the lines as Markdown, with the cost of the recurrent TSM minus that of each model trained as long, paired
-by target with half the 95 % t interval over targets, and what a doubling of the time buys, from each line of a model
-to the next. figure draws them into figures/training_time.
+table prints the lines of training seed 0 as Markdown, with the cost of the recurrent TSM minus that of each model
+trained as long, paired by target with half the 95 % t interval over targets, and what a doubling of the time buys, from
+each line of a model to the next. Of a training with several seeds follow means with half the 95 % t interval over
+seeds, and each model with codes against every baseline, paired by seed. figure draws all lines into
+figures/training_time.
 """
 
 from __future__ import annotations
 
 import argparse
+from itertools import product
 from pathlib import Path
 from typing import cast
 
@@ -157,8 +160,52 @@ def over_the_best(lines: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
-def tables(lines: pd.DataFrame) -> str:
+def several(lines: pd.DataFrame) -> pd.DataFrame:
+    """The lines of those trainings that were made with more than one seed."""
+    return lines[lines.groupby(["env", "model", "seconds"])["seed"].transform("nunique") > 1]
+
+
+def over_seeds(lines: pd.DataFrame) -> pd.DataFrame:
+    """Each training as texts, mean and half the 95 % t interval over its seeds."""
+    groups = lines.groupby(["env", "model", "seconds"])
+    return pd.DataFrame([
+        {"env": env, "model": model, "seconds": seconds, "seeds": len(group)}
+        | {title: table.spell(group[name]) for name, title in MEASURES.items()}
+        | {"80 % coverage": table.spell(100 * group["coverage80"], "{:.0f} ± {:.0f} %")}
+        | {"within 5 cm": table.spell(100 * group["within"], "{:.0f} ± {:.0f} %")}
+        for (env, model, seconds), group in groups
+    ])  # fmt: skip
+
+
+def against_baselines(lines: pd.DataFrame) -> pd.DataFrame:
+    """Models with codes against each other model trained as long, paired by seed, as texts.
+
+    Ratios of energy scores and of the gap, differences of what plans cost and of violations; mean and half the 95 % t
+    interval over the seeds that both have.
+    """
+    coded, found = zoo.words(cls=zoo.CODED), []
+    for (env, seconds), group in lines.groupby(["env", "seconds"]):
+        each = {model: own.set_index("seed") for model, own in group.groupby("model")}
+        for model, other in product([word for word in each if word in coded], [w for w in each if w not in coded]):
+            own, best = each[model].align(each[other], join="inner", axis=0)
+            if len(own) > 1:
+                ratios = {
+                    f"{MEASURES[name]}, ratio": table.spell(own[name] / best[name], "{:.2f} ± {:.2f}")
+                    for name in (*SCORES, "gap")
+                }
+                found.append({
+                    "env": env, "seconds": seconds, "model": model, "against": other, "seeds": len(own), **ratios,
+                    "cost, difference": table.spell(own["cost"] - best["cost"], "{:+.2f} ± {:.2f}"),
+                    "violations, difference (%)": table.spell(
+                        100 * (own["violations"] - best["violations"]), "{:+.1f} ± {:.1f}"
+                    ),
+                })  # fmt: skip
+    return pd.DataFrame(found)
+
+
+def tables(every: pd.DataFrame) -> str:
     """All tables, as Markdown."""
+    lines = every[every["seed"] == 0]
     values, changes = lines.sort_values(["env", "model", "seconds"], kind="stable"), doublings(lines)
     costs = {
         (line.env, line.model, line.seconds): np.array(str(line.costs).split(), float) for line in values.itertuples()
@@ -172,16 +219,25 @@ def tables(lines: pd.DataFrame) -> str:
         **{"80 % coverage": values["coverage80"].map("{:.0%}".format)},
         **{"within 5 cm": values["within"].map("{:.0%}".format), f"cost of {zoo.OURS} minus this": minus},
     )
-    if changes.empty:
-        return table.markdown(spelled)
-    each = changes[["model", "from", "to"]].assign(
-        **{title: changes[name].map("{:+.0%}".format) for name, title in MEASURES.items()}
-    )
-    return (
-        f"{table.markdown(spelled)}\n\nEnergy scores over that of the best baseline trained as long, in brackets:\n\n"
-        f"{table.markdown(over_the_best(lines).drop(columns='env'))}\n\nA doubling of the time changes these by:\n\n"
-        f"{table.markdown(each)}"
-    )
+    parts = [table.markdown(spelled)]
+    if not changes.empty:
+        each = changes[["model", "from", "to"]].assign(
+            **{title: changes[name].map("{:+.0%}".format) for name, title in MEASURES.items()}
+        )
+        parts += [
+            "Energy scores over that of the best baseline trained as long, in brackets:",
+            table.markdown(over_the_best(lines).drop(columns="env")),
+            "A doubling of the time changes these by:",
+            table.markdown(each),
+        ]
+    if len(seeds := several(every)):
+        parts += [
+            "Several training seeds, mean and half the 95 % t interval over them:",
+            table.markdown(over_seeds(seeds).drop(columns="env")),
+            "Models with codes against each baseline trained as long, paired by seed:",
+            table.markdown(against_baselines(seeds).drop(columns="env")),
+        ]
+    return "\n\n".join(parts)
 
 
 def main() -> None:

@@ -76,8 +76,8 @@ def training_time(
 ) -> Figure:
     """Measures against the time that training took, one panel each, both axes logarithmic; one training a mark.
 
-    curves: title -> method -> seconds (k,) and values (k,), positive; ships: the seconds that shipped models took, a
-    dashed line.
+    curves: title -> method -> seconds (k,) and values (k,), positive; the line is that of the means where a time was
+    trained for more than once. ships: the seconds that shipped models took, a dashed line.
     """
     figure, grid = panels(len(curves), 4, 1.6)
     look_of = axes.looks(curves)
@@ -86,7 +86,10 @@ def training_time(
         for method, (seconds, values) in lines.items():
             seconds = finite(f"seconds of {title}, {method.label}", seconds, "k")
             values = finite(f"values of {title}, {method.label}", values, f"{len(seconds)}")
-            ax.plot(seconds, values, **look_of[method] | {"ms": 4}, zorder=3)
+            times, which = np.unique(seconds, return_inverse=True)
+            means = np.bincount(which, values) / np.bincount(which)
+            ax.plot(seconds, values, **look_of[method] | {"ms": 4, "ls": ""}, zorder=3)
+            ax.plot(times, means, **look_of[method] | {"marker": ""}, zorder=2)
             every, drawn = [*every, *seconds.tolist()], [*drawn, *values.tolist()]
         axes.log_axis(ax, min(drawn) / 1.15, max(drawn) * 1.15)
         ax.set(title=title, xscale="log", xlim=(min(every) / 1.3, max(every) * 1.3))
