@@ -153,6 +153,25 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
     assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
 
 
+def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    script, place, seen = ROOT / "benchmarks" / "exploration" / "pendulum.py", tmp_path / "pendulum.csv", []
+    row = dict(seed=10, iteration=0, env_steps=600)
+
+    def measured(run: Run, word: str, *, sizes: rounds.Sizes) -> rounds.Loop:
+        seen.append((run.seed, rounds.world(PENDULUM).tested(8).start))
+        return rounds.Loop([row | {"metric": m, "value": 1} for m in ("return_true", "success", "gap_absolute")], [])
+
+    monkeypatch.setattr(rounds, "loop", measured)
+    published = rounds.world(PENDULUM).tested(8).start
+    for updates in (2, 4, 2):  # the third takes the place of the first
+        run_script(script, "rtsm", "--updates", str(updates), "--out", str(place))
+    assert pd.read_csv(place)["updates"].tolist() == [4, 2]
+    assert all(seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen)
+
+
 @pytest.mark.parametrize(("given", "said"), [
     (("rtsm", {"env": "tsm/Reacher-v0"}), "no rounds are measured on 'tsm/Reacher-v0'; there are Pendulum-v1, tsm/Re"),
     (("tsm", {}), "'tsm' does not explore Pendulum-v1; there are rtsm, lstm, ensemble"),

@@ -44,17 +44,18 @@ def main() -> None:
     parser.add_argument("model", choices=rounds.WORLDS[PENDULUM].learners)
     for name in GIVEN:
         parser.add_argument(f"--{name}", type=int, default=getattr(default, name), help="default %(default)s")
+    parser.add_argument("--out", type=Path, default=PLACE, help="default pendulum.csv beside this script")
     given = vars(parser.parse_args())
     torch.set_num_threads(1)
-    word = given.pop("model")
+    word, out = given.pop("model"), given.pop("out")
     new = lines(word, replace(default, starts=STARTS, **given))
     key = ["model", *GIVEN]
-    if PLACE.exists():
-        kept = pd.read_csv(PLACE)
+    if out.exists():
+        kept = pd.read_csv(out)
         same = kept[key].eq(new[key].iloc[0]).all(axis=1)
         new = pd.concat([kept[~same], new])
     columns = [*key, "env_steps", *METRICS, "loop_seconds"]
-    new[columns].round(3).to_csv(PLACE, index=False)
+    new[columns].round(3).to_csv(out, index=False)
     print(new[columns].round(2).to_string(index=False))
 
 
