@@ -52,7 +52,7 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
     rows = tables.frame(rounds.loop(RUN, word).rows)
     assert set(rows["metric"]) == set(results.ROUNDS[PENDULUM]) - lacks
     assert rows["env_steps"].unique().tolist() == [400, 600]
-    titles = ["executed return", "size of the gap"]
+    titles = ["executed return", "size of the first plan's gap"]
     panels = results.round_panels(rows, titles)
     ((at, values),) = panels["executed return"].values()
     assert at.tolist() == [400, 600]

@@ -16,7 +16,7 @@ import pytest
 from scripts import run_script
 
 from tsmlib import figures
-from tsmlib.statistics import holm, interval, random_effects
+from tsmlib.statistics import Estimate, holm, interval, random_effects
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import pages, publish
 from tsmlib.study.claims import evaluate, ledger, report
@@ -517,6 +517,14 @@ def test_trials_that_are_a_seeds_own_leave_the_means_of_seeds_to_decide() -> Non
     mean, half = interval(values.mean(1))
     own = random_effects(values, crossed=False)
     assert (own.mean, own.half()) == pytest.approx((mean, half))
+
+
+@pytest.mark.parametrize("op", ["<", "<=", ">", ">="])
+def test_a_mean_on_its_margin_is_no_evidence_against_a_check(op: Any) -> None:
+    exact = evaluate.compared(Check(constant(0), op, 0.0), Estimate(0.0, 0.0, 2), "3 seeds")
+    assert exact.p == 1
+    wrong = 1.0 if op[0] == "<" else -1.0
+    assert evaluate.compared(Check(constant(0), op, 0.0), Estimate(wrong, 0.1, 2), "3 seeds").p < 0.01
 
 
 def test_holm_rejects_step_by_step_and_skips_what_was_not_measured() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -124,6 +125,15 @@ def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
         explored(*learners(seed=1), options=options(rounds=1), folder=tmp_path)
 
 
+def test_the_folder_of_a_model_that_is_made_otherwise_is_refused(tmp_path: Path) -> None:
+    def made(mode_weight: float) -> tsm.RecurrentTSM:
+        return tsm.RecurrentTSM.for_data(data(), hidden=8, mode_weight=mode_weight)
+
+    explored(made(0.0), learners()[1], options=options(rounds=1), folder=tmp_path)
+    with pytest.raises(StoreError, match=r"is of another exploration: configurations is "):
+        explored(made(5.0), learners()[1], options=options(rounds=1), folder=tmp_path)
+
+
 def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> None:
     def unasked(k: int) -> tsm.Task:
         raise AssertionError
@@ -166,7 +176,12 @@ def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores(
     def swings(k: int) -> tsm.Task:
         return tsm.Task.from_env("Pendulum-v1", n=3, horizon=HORIZON, reward=upright, seed=10 * k)
 
-    found = tsm.explore(model, None, train, train, swings, options(prior=None, rounds=1))
+    small, found = (
+        tsm.explore(copy.deepcopy(model), None, train, train, swings, options(prior=None, rounds=1, rms=rms))
+        for rms in (0.01, 0.6)
+    )
+    sizes = [float(np.abs(each.episodes[0].actions).mean()) for each in (small, found) if each.episodes[0]]
+    assert sizes[0] < 0.1 * sizes[1]
     assert found.train.states.shape == (10, HORIZON + 1, 3)
     assert "success" not in found.records[0]
 

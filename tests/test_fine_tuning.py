@@ -162,3 +162,10 @@ def test_what_cannot_be_fine_tuned_is_refused() -> None:
     push, net = data("tsm/ReacherPush-v1"), model("onestep")
     with pytest.raises(ValueError, match=r"states have 6 dimensions .* those of tsm/ReacherPush-v1 10 .*same robot"):
         tsm.fine_tune(net, net.loss, push, push, OPTIONS)
+
+
+@pytest.mark.parametrize(("first", "then"), [("head", "all"), ("all", "head")])
+def test_the_checkpoint_of_another_part_is_refused(tmp_path: Path, first: Any, then: Any) -> None:
+    tuned(model("rtsm"), first, checkpoint=tmp_path / "run")
+    with pytest.raises(StoreError, match="is the checkpoint of another run: .*frozen is "):
+        tuned(model("rtsm"), then, checkpoint=tmp_path / "run")

@@ -22,6 +22,7 @@ from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
+from tsmlib.training import checkpoint as checkpoints
 from tsmlib.training.callbacks import Callback, CsvCallback, Progress, TensorBoardCallback
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, optimizers, schedule
@@ -45,9 +46,9 @@ def episodes(n: int, seed: int) -> Trajectories:
 TRAIN, HELD_OUT = episodes(30, 0), episodes(5, 1)
 
 
-def new_tsm(seed: int = 0) -> TSM:
+def new_tsm(seed: int = 0, **given: float) -> TSM:
     torch.manual_seed(seed)
-    model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
+    model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2), **given)
     model.features.fit(torch.from_numpy(TRAIN.states))
     return model
 
@@ -266,16 +267,17 @@ GENERATIONS = {3: [], 6: ["000000005"], 13: ["000000005", "000000010"], 17: ["00
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     tmp_path: Path, new: Callable[..., Any], settings: dict[str, Any], at: int
 ) -> None:
-    whole, stopped, resumed = new(), new(), new(seed=0 if at <= 5 else 7)  # other weights: a checkpoint brings them
+    whole, stopped, resumed, again = new(), new(), new(), new()
     expected = train(whole, **settings)
     checkpoint = tmp_path / "run"
     with pytest.raises(Interrupted):
         train(stopped, Faulty(stopped, at, interrupt), checkpoint=checkpoint, **settings)
     assert [path.stem for path in sorted(checkpoint.glob("*.safetensors"))] == GENERATIONS[at]
-    curve = train(resumed, checkpoint=checkpoint, **settings)
+    counted = Faulty(resumed, 0, interrupt)
+    curve = train(resumed, counted, checkpoint=checkpoint, **settings)
+    assert counted.calls == 20 - max(map(int, GENERATIONS[at]), default=0)  # what was done is not done again
     assert same(weights(resumed), weights(whole))
     assert (curve.step, curve.train, curve.validation) == (expected.step, expected.train, expected.validation)
-    again = new(seed=8)
     assert asdict(train(again, checkpoint=checkpoint, **settings)) == asdict(curve)  # finished: nothing is left to do
     assert same(weights(again), weights(whole))
 
@@ -390,6 +392,18 @@ def test_a_checkpoint_of_another_run_is_refused_naming_what_differs(
     assert same(weights(model), before)
 
 
+@pytest.mark.parametrize(("other", "message"), [
+    (lambda: new_tsm(seed=7), "began with"), (lambda: new_tsm(beta=0.5), "configuration"),
+])  # fmt: skip
+def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path, other: Callable[[], TSM], message: str) -> None:
+    train(new_tsm(), checkpoint=tmp_path / "run")
+    model = other()
+    before = weights(model)
+    with pytest.raises(files.StoreError, match=f"is the checkpoint of another run: .*{message} is "):
+        train(model, checkpoint=tmp_path / "run")
+    assert same(weights(model), before)
+
+
 def folder_bytes(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -407,16 +421,16 @@ def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -
         fit(model, model.loss, elsewhere, HELD_OUT, TrainingOptions(**SIZES), checkpoint=checkpoint)
 
 
-def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path) -> None:
-    checkpoint, wider = (
-        tmp_path / "run",
-        TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2)),
-    )
-    train(new_tsm(), checkpoint=checkpoint)
+def test_an_older_checkpoint_with_weights_of_another_shape_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoints, "_differences", lambda stated, identity: [])  # it says nothing of its model
+    folder, wider = tmp_path / "run", TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2))
+    train(new_tsm(), checkpoint=folder)
     with pytest.raises(
         files.StoreError, match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew"
     ):
-        train(wider, checkpoint=checkpoint)
+        train(wider, checkpoint=folder)
 
 
 # What goes wrong -----------------------------------------------------------------------------------------------------

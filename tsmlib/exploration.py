@@ -61,7 +61,8 @@ class ExplorationOptions:
     model, prior: one round's training of each, from the weights it has; prior=None leaves it as it is. every,
     candidates, elites, iterations: of the planning (``mpc``, ``cem``). held_out: share of each round's episodes that
     join the held-out data, at least one and never all.
-    noise: standard deviation of what is added to the parameters of every plan, in those of the search space.
+    rms: of the torques that are searched where there is no prior. noise: standard deviation of what is added to the
+    parameters of every plan, in those of the search space.
     bonus: reward for each step per unit of disagreement, the standard deviation over ``samples`` predicted states, as a
     share of the data's, mean over dimensions; 0: none.
     """
@@ -74,6 +75,7 @@ class ExplorationOptions:
     elites: int = 9
     iterations: int = 4
     held_out: float = 0.1
+    rms: float = 0.1
     noise: float = 0.0
     bonus: float = 0.0
     samples: int = 4
@@ -81,6 +83,8 @@ class ExplorationOptions:
     def __post_init__(self) -> None:
         if self.rounds < 1 or self.samples < 2:
             raise ValueError(f"rounds {self.rounds}, samples {self.samples}: expected at least 1 round and 2 samples")
+        if self.rms <= 0:
+            raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
         if min(self.noise, self.bonus) < 0 or not 0 < self.held_out < 1:
             raise ValueError(
                 f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
@@ -144,6 +148,7 @@ def explore(
     weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
     identity: dict[str, Json] = {
         "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
+        "configurations": [net.config() for net in (model, prior) if net is not None],
         "data": [artifacts.trajectories_digest(data) for data in (train, held_out)],
         "episodes": "planned" if episodes is None else "given",
     }  # fmt: skip
@@ -186,7 +191,8 @@ def _collected(
         raise ValueError(f"round {k} has {len(task)} task; expected at least 2, since one episode is held out")
     bonus = partial(_with_bonus, weight=options.bonus, scale=torch.from_numpy(like.states.std((0, 1))))
     aim = replace(task, reward_for=lambda target: bonus(task.reward_for(target))) if options.bonus else task
-    space = DirectActions(task.horizon, task.action_dim) if prior is None else LatentActions(prior, task.horizon)
+    direct = DirectActions(task.horizon, task.action_dim, rms=options.rms)
+    space = direct if prior is None else LatentActions(prior, task.horizon)
     draw = seed * 1_000_003 + 1000 * k
     planner: Planner = partial(
         cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations, seed=draw
@@ -316,7 +322,9 @@ class _Round:
 
     def _record(self, path: Path) -> dict[str, float]:
         header = artifacts.read_header(path)
-        found = {"episodes": "planned", **cast(dict[str, Json], header.get("identity", {}))}  # that key came later
+        stored = cast(dict[str, Json], header.get("identity", {}))
+        later: dict[str, Json] = {"episodes": "planned", "configurations": self.identity["configurations"]}
+        found = later | stored | {"options": {"rms": 0.1, **cast(dict[str, Json], stored.get("options", {}))}}
         if differs := artifacts.differences(found, dict(self.identity)):
             raise StoreError(
                 f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import cast
 
 import pandas as pd
 
@@ -12,7 +13,7 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study import plans, rounds, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
-from tsmlib.study.claims.claim import DEFINITIONAL, VERDICTS
+from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
 from tsmlib.study.comparison import published
 from tsmlib.study.results import exploration as exploration_results
 from tsmlib.study.results import planning as planning_results
@@ -56,22 +57,23 @@ def readme_results() -> str:
     found = {
         "prediction error ↓": prediction_results.values(predict, "nrmse", env=env),
         "energy score ↓": prediction_results.values(predict, "energy_score_noise", env=env),
+        "80 % coverage": prediction_results.values(predict, "coverage80", env=env),
         "share of oracle's gain ↑": table.values(table.select(plans, metric="gain_share")),
         "gap (m) ↓": table.values(table.select(plans, metric="gap_absolute")),
     }
-    first, *_, last = found.values()
-    lines = []
+    lines, seeds = [], {len(values[model]) for values in found.values() for model in README_MODELS if model in values}
     for model in README_MODELS:
         cells = {title: table.spell(values[model]) if model in values else "-" for title, values in found.items()}
-        seeds = f"{len(first.get(model, ()))} / {len(last.get(model, ()))}"
-        lines.append({"model": f"`{model}`", **cells, "seeds": seeds})
+        members = cast(int, zoo.find(model).arguments(EnvSpec.parse(env)).get("members", 1))
+        noted = f" ({members} decoders, {members} x training)" * (members > 1)
+        lines.append({"model": f"`{model}`{noted}", **cells})
     episodes, targets = prediction_results.select(predict, "nrmse", env=env)["n"].max(), plans["n"].max()
     narrow = re.sub(r":-+", "---", re.sub(" +", " ", table.markdown(pd.DataFrame(lines))))  # README is to be short
     return f"""{narrow}
 
-*Published rows of `{env}`; means over training seeds (of predicting / of planning) ± half the 95 % t interval.
-Predicting: {episodes:,} test episodes, 90 steps open loop; error over the data's deviation (nRMSE), energy score of 32
-samples. Planning: {targets} targets, CEM over codes; share: 1 by the simulator, 0 for doing nothing; gap: mean size of
+*Published rows of `{env}`; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
+{episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
+truths in 80 % intervals. {targets} targets, CEM over codes: share, 1 by the simulator, 0 for doing nothing; gap, mean size of
 predicted minus executed return.*
 {readme_loops(env)}"""
 
@@ -82,9 +84,8 @@ def readme_loops(env: str) -> str:
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
-        f"Planned again every ten steps, the object ends within 5 cm by {loops}. For pushing `{OURS}` has three "
-        "decoders; two LSTMs, or three baselines, judging together [plan as well](benchmarks/settings/README.md). "
-        f"{readme_training(env)}"
+        f"Planned again every ten steps, the object ends within 5 cm by {loops}. Two LSTMs, or three baselines, "
+        f"judging together [plan as well](benchmarks/settings/README.md) as `{OURS}`. {readme_training(env)}"
     )
 
 
@@ -95,18 +96,28 @@ def readme_training(env: str) -> str:
     if not len(lines):
         return ""
     shipped, longest = zoo.BUDGET[EnvSpec.parse(env).name], float(lines["seconds"].max())
-    both = lines[lines["seconds"].isin((shipped, longest))].pivot_table(
-        index="model", columns="seconds", values=["energy_80", "cost"]
-    )
-    said = ", ".join(
-        f"`{model}` {found['energy_80', shipped]:.2f} → {found['energy_80', longest]:.2f} "
-        f"({found['cost', shipped]:.1f} → {found['cost', longest]:.1f})"
-        for model, found in both.dropna().iterrows()
+    wide = lines.pivot_table(index=["seconds", "model", "seed"], values=["energy_10", "energy_80", "cost"])
+    before, after = (wide.loc[seconds] for seconds in (shipped, longest))
+    ratios = [_over_the_best(found, ["energy_10", "energy_80"]) for found in (before, after)]
+
+    def both(model: str) -> str:
+        return " → ".join(", ".join(ratio.loc[model].map("{:.2f}".format)) for ratio in ratios)
+
+    scores = "; ".join(f"`{model}` {both(model)}" for model in (PAPERS, OURS))
+    costs = ", ".join(
+        f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
     )
     return (
-        f"Energy score at 80 steps (cost, m, validation targets) of single networks trained {longest / shipped:g} "
-        f"times as long ({_seeds(lines)}; same page): {said}."
+        f"Single networks trained {longest / shipped:g} times as long ({_seeds(lines)}, validation, same page): energy "
+        f"score over the best baseline's at 10, 80 steps {scores}; cost of plans (m) {costs}."
     )
+
+
+def _over_the_best(found: pd.DataFrame, scores: list[str]) -> pd.DataFrame:
+    """Scores of (model, seed) over those of the best of the baselines that every seed has, mean over seeds."""
+    baselines = found[~found.index.get_level_values("model").isin(zoo.words(cls=zoo.CODED))][scores]
+    everywhere = baselines.groupby("model").filter(lambda own: len(own) == baselines.groupby("model").size().max())
+    return (found[scores] / everywhere.groupby("seed").min()).groupby("model").mean()
 
 
 def _seeds(rows: pd.DataFrame) -> str:
@@ -124,10 +135,20 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
         for word in VERDICTS if (same := [verdict for verdict in carrying if verdict.word == word])
     )  # fmt: skip
     named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
-    said = "; ".join(f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" for verdict in named)
+    said = "; ".join(
+        f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" + _leaning(verdict)
+        for verdict in named
+    )
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
 With `{OURS}` in its place, {claims_report.counts(ours)}.
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
+
+
+def _leaning(verdict: evaluate.Verdict) -> str:
+    """Of an inconclusive verdict: how many of its checks have their whole interval on the wrong side of the margin."""
+    against = sum(effect.against for effect in verdict.effects[""])
+    told = f", the intervals of {against} of its {len(verdict.effects[''])} checks lying against it"
+    return told * (verdict.word == INCONCLUSIVE and against > 0)
 
 
 # Pages of docs/ ------------------------------------------------------------------------------------------------------

@@ -82,12 +82,12 @@ class Sizes:
             validate_every=max(1, steps // 4),
         )  # fmt: skip
 
-    def options(self, past_len: int, *, muon: float = 0.0) -> ExplorationOptions:
-        """Of ``explore``, for a model that reads as many steps of past."""
+    def options(self, past_len: int, *, muon: float = 0.0, rms: float = 0.1) -> ExplorationOptions:
+        """Of ``explore``, for a model that reads as many steps of past; rms: of torques where no prior is searched."""
         return ExplorationOptions(
             model=self.training(past_len, 20, muon=muon), prior=self.training(10, 10, updates=self.prior),
             rounds=self.rounds, every=self.every, candidates=self.candidates, elites=self.elites,
-            iterations=self.iterations,
+            iterations=self.iterations, rms=rms,
         )  # fmt: skip
 
 
@@ -326,7 +326,7 @@ def loop(
     own = None if folder is None else folder / (env if env == PENDULUM else EnvSpec.parse(env).name) / word
     model, prior, train, held_out = learner(word, sizes, seed, env, own)
     measured, began = measure(sizes, seed, env), len(train) + len(held_out)
-    options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0))
+    options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0), rms=here.rms)
 
     def new(k: int) -> Trajectories | None:
         return here.random(sizes.episodes, _seed(seed, k)) if data == RANDOM else None

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,16 @@ from tsmlib.storage.provenance import provenance
 from tsmlib.training.precision import native_bf16
 
 KEPT = 2  # generations
+LATER = ("configuration", "began with")  # fields of a run's identity that older checkpoints do not have
+
+
+@runtime_checkable
+class Configured(Protocol):
+    """A model that states what it is made of, as JSON."""
+
+    def config(self) -> dict[str, Json]:
+        """Arguments that make such a model."""
+        ...
 
 
 class TrainingStopped(RuntimeError):
@@ -51,7 +61,8 @@ class TrainingState(Generic[C]):
     """All that a run needs to continue: weights, moments, the step, the best weights and the curve so far.
 
     optimizers: by the name of their moments in a checkpoint. total: steps of the whole run. identity: what the run is,
-    as JSON, its lr among it; a checkpoint of another run is refused. folder: of the checkpoints; none without.
+    as JSON, its lr among it; the model's configuration and its weights, which are the first ones, are added. A
+    checkpoint of another run is refused. folder: of the checkpoints; none without.
     """
 
     def __init__(
@@ -59,7 +70,9 @@ class TrainingState(Generic[C]):
         total: int, identity: Mapping[str, Json], folder: Path | None = None,
     ) -> None:  # fmt: skip
         self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
-        self.identity, self.folder = identity, folder
+        configuration = model.config() if isinstance(model, Configured) else {}
+        began = artifacts.digest(model.state_dict())[:16]
+        self.identity, self.folder = {**identity, "configuration": configuration, "began with": began}, folder
         self.step, self.seconds = 0, 0.0
         self.keep(math.inf)
 
@@ -109,7 +122,7 @@ class TrainingState(Generic[C]):
         groups: dict[str, dict[str, Tensor]] = {name: {} for name in ("model", "best", *self.optimizers)}
         moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.optimizers}
         try:
-            if differs := artifacts.differences(header["identity"], self.identity):
+            if differs := _differences(header["identity"], self.identity):
                 raise StoreError(f"{path} is the checkpoint of another run: {'; '.join(differs)}. {anew}")
             for name, tensor in tensors.items():
                 group, _, rest = name.partition(".")
@@ -151,6 +164,15 @@ class TrainingState(Generic[C]):
         device = next(self.model.parameters()).device
         name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
         return {**provenance(), "device": name, "native_bf16": native_bf16(device)}
+
+
+def _differences(stated: Mapping[str, Json], identity: Mapping[str, Json]) -> list[str]:
+    """What tells the run of a file from this one; older files say nothing of model and first weights."""
+    asked = {name: value for name, value in identity.items() if name in stated or name not in LATER}
+    more = [
+        f"{name} is {value!r:.200} in the file, expected none" for name, value in stated.items() if name not in asked
+    ]
+    return artifacts.differences(stated, asked) + more
 
 
 @contextmanager

@@ -86,6 +86,13 @@ class Effect:
         return self.value is None or self.check.op == "==" or bool(self.check.accepts(self.value, self.value))
 
     @property
+    def against(self) -> bool:
+        """Whether the whole interval lies on the wrong side of the margin."""
+        if self.low is None or self.high is None or self.check.op == "==":
+            return False
+        return not self.right_side and not self.low <= self.check.margin <= self.high
+
+    @property
     def ease(self) -> tuple[int, float]:
         """Sorts checks by how far they are from holding, the furthest first."""
         value, low, high = self.beyond
@@ -213,7 +220,7 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
         "fails": (FAILED, f"{measured} {failing} of {len(effects[''])} checks fail."),
         "open": (
             INCONCLUSIVE,
-            f"{measured} {'The interval holds the margin.' if key.low is not None else 'One seed has no interval.'}",
+            f"{measured} {_undecided(key, len(effects['']))}",
         ),
         "missing": (UNTESTABLE, key.why),
     }[first]
@@ -224,6 +231,15 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     elif first in ("fails", "open") and holds:
         word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. As the paper words it, {why}"
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
+
+
+def _undecided(key: Effect, checks: int) -> str:
+    """Why a check decides nothing."""
+    if key.low is None:
+        return "One seed has no interval."
+    if key.against:
+        return f"The interval lies on the wrong side, but not by Holm's procedure over {checks} checks."
+    return "The interval holds the margin."
 
 
 def _of_one_family(effects: Sequence[Effect]) -> list[Effect]:
@@ -294,8 +310,10 @@ def compared(check: Check, found: Estimate, n: str) -> Effect:
     low, high = found.mean - half, found.mean + half
     inside = check.op != "==" and low <= check.margin <= high
     state = "holds" if check.accepts(low, high) else "open" if inside else "fails"
-    below = found.p_below(check.margin)
-    p = np.nan if check.op == "==" else 1 - below if check.op[0] == "<" else below
+    p = np.nan
+    if check.op != "==":  # mirrored, since a mean on the margin is no evidence against either side
+        sign = -1 if check.op[0] == "<" else 1
+        p = replace(found, mean=sign * found.mean).p_below(sign * check.margin)
     return Effect(check, state, found.mean, low, high, n, p=p)
 
 

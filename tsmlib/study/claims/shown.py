@@ -15,7 +15,7 @@ DATA, WORKSPACE, TRAINING = Shown("01_collect"), Shown("01_collect", figure="01_
 RANGE = Shown("03_predict", "What the numbers rest on", "03_horizon")
 HORIZON = Shown("03_predict", "Against the horizon", "03_horizon")
 CALIBRATION = Shown("03_predict", "After contact", "03_calibration")
-CHANGES = Shown("03_predict", "Two changes, apart")
+CHANGES = Shown("03_predict", "The paper's choices, one at a time")
 FIGURE5 = Shown("03_predict", "Figure 5", "figure5")
 CODES_USED = Shown("04_latent", "Is the code used?", "04_use")
 SPREAD = Shown("04_latent", "Does the spread tell the error?", "04_spread_error")

@@ -216,7 +216,8 @@ def along_the_way(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.nd
 
 MAIN: Columns = {
     "return_predicted": ("predicted return", "{:.2f}"), "return_true": ("executed return", "{:.2f}"),
-    "exploitation_gap": ("gap", "{:.2f}"), "relative_gap_median": ("median gap / executed", "{:.1%}"),
+    "exploitation_gap": ("gap", "{:+.2f}"), "gap_absolute": ("its mean size", "{:.2f}"),
+    "relative_gap_median": ("median gap / executed", "{:.1%}"),
     "cost_over_oracle": ("cost / oracle's", "{:.3f}"), "gain_share": ("share of oracle's gain", "{:.2f}"),
     "final_distance": ("final distance (m)", "{:.3f}"), "success": (ARRIVED, "{:.1%}"),
     "plan_seconds": ("seconds, all targets", "{:.0f}"),
@@ -231,7 +232,10 @@ SIGNS: Columns = {
 
 
 def _printed(plans: pd.DataFrame, columns: Columns) -> pd.DataFrame:
-    return table.printed(table.means(table.with_method(plans), ["env", "method", "n"]), columns)
+    """Means over training seeds as texts, and how many seeds there are."""
+    own, by = table.with_method(plans), ["env", "method", "n"]
+    seeds = own.groupby(by, sort=False)["seed"].nunique().rename("seeds")
+    return seeds.reset_index().merge(table.printed(table.means(own, by), columns), on=by)
 
 
 @table.sourced
@@ -260,18 +264,25 @@ def loops_table(found: pd.DataFrame) -> str:
 @table.sourced
 def _loops(found: pd.DataFrame) -> pd.DataFrame:
     opened, closed = (_printed(plans_of(found, execution=execution), LOOP) for execution in (OPEN, CLOSED))
-    return opened.merge(closed, "right", ["env", "method", "n"], suffixes=(f", {OPEN}", f", {CLOSED}"))
+    return opened.merge(closed, "right", ["env", "method", "n", "seeds"], suffixes=(f", {OPEN}", f", {CLOSED}"))
 
 
 @table.sourced
 def planners_table(found: pd.DataFrame) -> pd.DataFrame:
-    """Model and search space by planner, in Markdown: the mean executed return, and in brackets the gap."""
+    """Model and search space by planner, in Markdown: the mean executed return, and in brackets the gap.
+
+    After it the number of training seeds where another planner of the line has more.
+    """
     own = plans_of(found)
     own = table.with_method(own[own["model"] != "none"], "model", "search_space")
     wide = table.means(own, ["env", "method"], ["planner", "metric"])
+    seeds = own.groupby(["env", "method", "planner"], sort=False)["seed"].nunique().unstack(sort=False)
+    fewer = seeds.map("; {:.0f} seed(s)".format, na_action="ignore").where(seeds.lt(seeds.max(axis=1), axis=0), "")
+    fewer = fewer.reindex(wide.index)
     cells = {
         title: wide[word, "return_true"].map("{:.2f}".format, na_action="ignore")
-        + wide[word, "exploitation_gap"].map(" ({:+.2f})".format, na_action="ignore")
+        + wide[word, "exploitation_gap"].map(" ({:+.2f}".format, na_action="ignore")
+        + fewer[word].map("{})".format)
         for word, title in PLANNERS.items()
         if (word, "return_true") in wide
     }
