@@ -73,8 +73,8 @@ def readme_results() -> str:
 
 *Published rows of `{env}`; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
 {episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
-truths in 80 % intervals. {targets} targets, CEM over codes: share, 1 by the simulator, 0 for doing nothing; gap, mean size of
-predicted minus executed return.*
+truths in 80 % intervals. {targets} targets, CEM over codes: share, 1 by the simulator, 0 for doing nothing; gap, mean
+size of predicted minus executed return.*
 {readme_loops(env)}"""
 
 
@@ -211,7 +211,10 @@ def results_page() -> str:
     pages = robots_page(published("09_your_own")), exploration_page(published("10_explore"), published("10_model_free"))
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
-    return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper.
+    there = [word for word in zoo.ZOO if word in set(predict["model"])]
+    names = ", ".join(f"{zoo.look(word).name} is `{word}`" for word in there)
+    return f"""Written by `python -m tsmlib publish` from `data/results`, scale paper. In tables of plans and in figures
+{names}.
 
 ## Prediction
 

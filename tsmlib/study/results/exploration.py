@@ -209,8 +209,8 @@ def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
 
 
 def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
-    """Environment steps of rounds to the final return of each model-free learner, and of that learner to the last
-    round's; means over seeds. Empty where either has no rows.
+    """Environment steps of rounds to the final return of each model-free learner, and the round that came to it; means
+    over seeds. Empty where either has no rows.
 
     free: learning curves of ``benchmarks/model_free``. "-" for a return that was not reached.
     """
@@ -224,11 +224,13 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
         for word, ours in table.groups(rounds, "model"):
             own = ours.groupby("env_steps")["value"].mean()
             taken, end = _steps_to(own, curve.iloc[-1]), float(curve.index[-1])
+            k = 0 if taken is None else int(ours[ours["env_steps"] == taken]["iteration"].min())
             lines.append({
                 "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{curve.iloc[-1]:.2f}",
                 "rounds of": f"`{word}`", "steps to that return": "-" if taken is None else f"{taken:,.0f}",
-                "share": "-" if taken is None else f"{taken / end:.1%}", "return after the last": f"{own.iloc[-1]:.2f}",
-                "steps of the policy to it": "-" if (t := _steps_to(curve, own.iloc[-1])) is None else f"{t:,.0f}",
+                "share": "-" if taken is None else f"{taken / end:.1%}",
+                "reached": "never" if taken is None else f"in round {k}" if k else "before the first round",
+                "return after the last": f"{own.iloc[-1]:.2f}",
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
     return table.markdown(pd.DataFrame(lines))
@@ -251,7 +253,7 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
             for ahead, part in table.groups(table.select(own, metric=metric), "steps_ahead"):
                 line[f"{title}, {ahead} steps"] = table.spell(part["value"])
         line["CPU s"] = table.spell(table.select(own, metric="train_seconds")["value"], "{:.0f}")
-        lines.append({**line, "n": int(own["n"].max())})
+        lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
 
