@@ -229,7 +229,7 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
                 "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{curve.iloc[-1]:.2f}",
                 "rounds of": f"`{word}`", "steps to that return": "-" if taken is None else f"{taken:,.0f}",
                 "share": "-" if taken is None else f"{taken / end:.1%}",
-                "reached": "never" if taken is None else f"in round {k}" if k else "before the first round",
+                "when": "never" if taken is None else f"in round {k}" if k else "before the first round",
                 "return after the last": f"{own.iloc[-1]:.2f}",
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
