@@ -96,6 +96,15 @@ def test_a_clock_goes_on_and_the_statistics_of_all_else_are_as_without_it(dt: fl
     assert 7 * dt < float(reached.mean()) < 13 * dt, reached.mean() / dt  # it stood still, or ran away
 
 
+def test_an_action_that_is_never_used_does_not_stop_the_training_of_the_prior() -> None:
+    unused = replace(TRAIN, actions=TRAIN.actions * np.float32([1, 0]))
+    prior = ActionPrior.for_data(unused, segment_len=H, channels=8, dilations=(1, 2))
+    assert prior.std[1] == 1
+    assert prior.std[0] == torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0)[0]
+    history = fit(prior, prior.loss, unused, unused, TrainingOptions(**SIZES | {"steps": 5}))
+    assert math.isfinite(history.validation[-1])
+
+
 def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
     schedule = SIZES | {name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings}
     return fit(model, loss or model.loss, TRAIN, HELD_OUT, TrainingOptions(**schedule), **settings)

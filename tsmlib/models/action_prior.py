@@ -61,9 +61,10 @@ class ActionPrior(Configured):
         return prior
 
     def fit_scale(self, actions: Tensor, lengths: Sequence[int] = ()) -> ActionPrior:
-        """Take the scale of training actions (N, T, du); padding beyond ``lengths`` has no part."""
+        """Take the scale of training actions (N, T, du), 1 if never used; padding beyond ``lengths`` has no part."""
         steps = actions[real_steps(lengths, actions.shape[1])] if lengths else actions.flatten(0, 1)
-        self.std.copy_(steps.std(0))
+        std = steps.std(0)
+        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:
