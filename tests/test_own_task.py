@@ -175,6 +175,20 @@ def test_adam_refuses_the_true_simulator() -> None:
         adam(simulator_predictor(REACHER, task.start), task.reward, DirectActions(T), N, iterations=2)
 
 
+def test_what_a_reward_would_be_after_the_end_neither_counts_nor_spoils_the_slope() -> None:
+    x = torch.tensor([1.0, 0.5, 0.1, -0.1, math.nan])[None, :, None].requires_grad_()
+    u = torch.tensor([0.1, 0.1, 0.1, 1.0, 1.0])[None, :, None].requires_grad_()
+    counted = rewards.until(lambda x: x[..., 0] < 0.2, lambda x, u: x[..., 0].log() + (1 - u[..., 0]).sqrt())
+    found = counted(x[None, None], u[None])  # (S, C, B, T) of states, (C, B, T) of actions
+    torch.testing.assert_close(found[0, 0, 0, :3], (x[0, :3, 0].log() + 0.9**0.5))
+    assert (found[..., 3:] == 0).all()
+    found.sum().backward()
+    assert x.grad is not None
+    assert u.grad is not None
+    torch.testing.assert_close(x.grad.flatten(), torch.tensor([1.0, 2.0, 10.0, 0.0, 0.0]))
+    torch.testing.assert_close(u.grad.flatten(), torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0]) * -0.5 / 0.9**0.5)
+
+
 # Targets and horizons ------------------------------------------------------------------------------------------------
 
 
