@@ -383,6 +383,16 @@ def test_a_task_of_ones_own_is_made_of_an_arm_too() -> None:
     torch.testing.assert_close(tsmlib.simulator_predictor(task)(torch.zeros(1, 2, 4, 2))[0, 0], trial.states[:, 1:])
 
 
+@pytest.mark.parametrize("how", ["-noise0.25", "-delay5"])
+def test_a_task_of_an_imperfect_arm_begins_where_the_plain_arms_does(how: str) -> None:
+    imperfect, plain = (
+        Task.from_env(f"tsm/ReacherPush{word}-v1", n=3, horizon=4, reward=still, seed=1) for word in (how, "")
+    )
+    np.testing.assert_array_equal(imperfect.start, plain.start)
+    trial = tsmlib.execute(imperfect, torch.zeros(3, 4, 2))
+    np.testing.assert_allclose(trial.states[:, 0], plain.start, rtol=1e-6, atol=1e-7)
+
+
 def test_a_search_space_of_another_robot_is_refused() -> None:
     data = tsmlib.collect_random(PENDULUM, episodes=2, horizon=10)
     task, model = Task.from_env(PENDULUM, n=2, horizon=4, reward=still), tsmlib.OneStep.for_data(data, hidden=8)

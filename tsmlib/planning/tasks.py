@@ -58,12 +58,14 @@ class Task:
         cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 0, success: Success | None = None,
         tolerance: float = 0.0, name: str = "",
     ) -> Task:  # fmt: skip
-        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...
+        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
+        states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
         """
-        with closing(make_simulation(env, n)) as begun:
+        plain = EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
+        with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
         return cls(
