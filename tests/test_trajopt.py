@@ -22,6 +22,7 @@ from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.base import Plan, Planner, Predictor
+from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import (
     adam,
     cem,
@@ -35,6 +36,7 @@ from tsmlib.planning.planners import (
 )
 from tsmlib.planning.predictors import EnsemblePredictor, fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, NoNoise, standard_normal
 from tsmlib.trajectory import Segment, Window, initial_past
@@ -581,6 +583,16 @@ def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float)
     follows = torch.from_numpy(env.rollout(actions[:, 20:].numpy())).float()
     states = simulator_predictor(env_id, observed)(actions[None, :, 20:])[0, 0]
     assert (states - follows)[..., 4:8].abs().max() < off  # metres
+
+
+def test_the_simulator_of_an_arms_task_goes_on_after_what_was_done() -> None:
+    task = Task.from_env("tsm/Reacher-v0", n=2, horizon=15, reward=lambda x, u: x[..., 0], seed=0)
+    done, rest = 0.3 * torch.ones(2, 10, 2), torch.zeros(2, 5, 2)
+    states = simulator_predictor(task, done=done)(rest[None])[0, 0]
+    torch.testing.assert_close(states, execute(task, torch.cat([done, rest], 1)).states[:, 11:], rtol=1e-4, atol=1e-5)
+    at_start = simulator_predictor(task)(rest[None])
+    assert torch.equal(simulator_predictor(task, done=done[:, :0])(rest[None]), at_start)
+    assert torch.equal(simulator_predictor(task, task.start, done=done)(rest[None]), at_start)  # it is where it is
 
 
 def test_the_true_simulator_of_an_arm_predicts_from_a_start_alone() -> None:
