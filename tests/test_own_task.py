@@ -11,6 +11,7 @@ from torch import Tensor
 from untrained import in_units
 
 from tsmlib import rewards, study
+from tsmlib.envs import variant
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.execution import execute
@@ -204,6 +205,17 @@ def test_a_target_out_of_reach_is_refused() -> None:
     dataclasses.replace(push, target=far)  # an object can lie in the corner
     with pytest.raises(ValueError, match=r"target 0 at \(0.300, 0.300\) m is out of reach: the object gets .* 0.21 m"):
         dataclasses.replace(push, target=3 * far)
+
+
+def test_a_target_in_the_hole_around_the_shoulder_is_refused() -> None:
+    unequal = variant(REACHER, link_lengths=(0.06, 0.18))
+    task = study.draw_task(unequal, seed=3, n=2)
+    dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.24, 0.0]]))
+    with pytest.raises(
+        ValueError,
+        match=r"target 1 at \(0.000, 0.100\) m is out of reach: .* the hole around it, expected 0.11 to 0.24 m",
+    ):
+        dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.0, 0.1]]))
 
 
 def test_a_target_that_is_no_number_is_refused() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tsmlib import rewards
 from tsmlib.collection import smooth_torques
-from tsmlib.envs.geometry import room
+from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, make_simulation
 from tsmlib.rewards import Reward, rewarded
@@ -169,9 +169,11 @@ def require_reachable(env: str, start: np.ndarray, target: Tensor, position: sli
         raise ValueError(f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start")
     physics = EnvSpec.parse(env).physics
     if position == rewards.TIP:
-        reach = sum(physics.link_lengths)
-        within, what = target.norm(dim=1) <= reach + 1e-6, "fingertip"
-        limit = f"{reach:g} m from the shoulder"
+        reach, inner, away = sum(physics.link_lengths), hole(physics), target.norm(dim=1)
+        within, what = (away <= reach + 1e-6) & (away >= inner - 1e-6), "fingertip"
+        limit = f"{reach:g} m from the shoulder" + (
+            f" and not into the hole around it, expected {inner:g} to {reach:g} m" if inner else ""
+        )
     else:
         within, what = target.abs().amax(1) <= room(physics) + 1e-6, "object"
         limit = f"{room(physics):g} m along x and y, where the walls are"
