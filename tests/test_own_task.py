@@ -96,6 +96,12 @@ def test_a_reward_of_the_wrong_shape_is_refused(wrong: Reward, found: str) -> No
         posed(wrong)
 
 
+def test_a_horizon_of_no_step_is_refused_and_not_the_one_before() -> None:
+    with pytest.raises(ValueError, match="horizon is 0, expected a positive number of steps"):
+        posed().with_reward("trace an arc", arc, horizon=0)
+    assert posed().with_reward("trace an arc", arc).horizon == T
+
+
 def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None:
     task = study.load_task("tsm/Reacher-v0").take(4)
     some = task.take([3, 1])

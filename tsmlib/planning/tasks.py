@@ -64,7 +64,7 @@ class Task:
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
         """
-        plain = EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
+        seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
@@ -122,7 +122,8 @@ class Task:
         that it may depend on the time. target (2,) or (B, 2): where it should end, for final_distance and pictures.
         """
         goal = self.target if target is None else target.float().expand(len(self), -1)
-        return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=horizon or self.horizon)
+        steps = self.horizon if horizon is None else horizon
+        return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=steps)
 
     def judged(self, states: Tensor) -> tuple[Tensor, Tensor | None]:
         """Final distance (B,), NaN where none is measured, and success (B,) bool, of executed states (B, T + 1, dx)."""
@@ -147,6 +148,7 @@ class Task:
 
     def take(self, chosen: int | Sequence[int]) -> Task:
         """The first instances, or those of some indices; ValueError where there is none, or not as many."""
+        chosen = int(chosen) if isinstance(chosen, np.integer) else chosen
         if isinstance(chosen, int) and not 1 <= chosen <= len(self):
             raise ValueError(f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
         each = list(range(chosen)) if isinstance(chosen, int) else list(chosen)
