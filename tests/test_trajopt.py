@@ -331,6 +331,24 @@ def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_
     torch.testing.assert_close(planned[0.25].actions, planned[1.0].actions)  # since they are of one opinion
 
 
+def test_a_candidate_that_only_the_first_member_judged_is_never_an_elite() -> None:
+    class Spread(DirectActions):
+        def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
+            return torch.linspace(-1, 1, n)[:, None, None, None].expand(-1, n_targets, 1, 1)
+
+    alone = list[Tensor]()  # predicted alone: the start, the mean of the elites, the plan
+
+    def predict(actions: Tensor) -> Tensor:
+        alone.extend([actions] if len(actions) == 1 else [])
+        return actions[None]
+
+    space = Spread(1, 1, rms=0.3)
+    judge = EnsemblePredictor((predict, predict))
+    cem(judge, lambda x, u: x[..., 0], space, 1, candidates=64, elites=4, iterations=1, screened=0.0)
+    best = 0.3 * torch.linspace(-1, 1, 64)[-4:].mean()
+    torch.testing.assert_close(alone[2].flatten(), (0.9 * best).tanh()[None])  # 2, since two members see the start
+
+
 def test_the_return_of_a_screened_plan_is_the_mean_of_what_all_members_predict() -> None:
     judge = EnsemblePredictor((predictor(), lambda actions: 0.9 * predictor()(actions)))
     plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
