@@ -506,6 +506,14 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: st
         TrainingOptions(**{**SIZES, **settings})
 
 
+@pytest.mark.parametrize(("new", "future_len", "better"), [(new_tsm, 6, 4), (new_tsm, 3, 4), (new_prior, 6, 4)])
+def test_a_future_of_no_whole_number_of_segments_is_refused(new: Any, future_len: int, better: int) -> None:
+    with pytest.raises(
+        ValueError, match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or"
+    ):
+        train(new(), future_len=future_len)
+
+
 def test_episodes_shorter_than_the_windows_are_refused() -> None:
     with pytest.raises(TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"):
         train(new_tsm(), future_len=36)

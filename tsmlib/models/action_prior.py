@@ -16,7 +16,14 @@ import torch
 from torch import Tensor
 
 from tsmlib.models.config import Configured, weights_from
-from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
+from tsmlib.models.layers import (
+    CausalDecoder,
+    Encoder,
+    chunked,
+    kl_from_standard_normal,
+    sample_posterior,
+    whole_segments,
+)
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Trajectories, Window, real_steps
@@ -104,7 +111,7 @@ class ActionPrior(Configured):
         The past of the first segment is the window's; that of each later one is the decoded segment before it.
         """
         past, loss = window.past.actions, window.past.actions.new_zeros(())
-        for future in window.future.actions.split(self.segment_len, dim=1):
+        for future in whole_segments(window.future.actions, self.segment_len):
             mean, log_variance = self.encode(future)
             decoded = self.decode(past[:, -self.past_len :], sample_posterior(mean, log_variance, generator))
             error = ((decoded - future) / self.std).square().sum((1, 2))
