@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -381,6 +382,29 @@ def test_a_task_of_ones_own_is_made_of_an_arm_too() -> None:
     trial = tsmlib.execute(task, torch.zeros(2, 4, 2))
     np.testing.assert_allclose(trial.states[:, 0], task.start, rtol=1e-6)
     torch.testing.assert_close(tsmlib.simulator_predictor(task)(torch.zeros(1, 2, 4, 2))[0, 0], trial.states[:, 1:])
+
+
+@pytest.mark.parametrize("env_id", [PENDULUM, "tsm/Reacher-v0"])
+def test_numpys_integers_are_integers(env_id: str) -> None:
+    tasks = [Task.from_env(env_id, n=2, horizon=4, reward=still, seed=seed) for seed in (np.int64(3), 3)]
+    np.testing.assert_array_equal(tasks[0].start, tasks[1].start)
+    assert tasks[0].seeds == tasks[1].seeds
+    np.testing.assert_array_equal(tasks[0].take(np.int64(1)).start, tasks[1].take(1).start)
+    data = [tsmlib.collect_random(env_id, 2, horizon=3, seed=seed) for seed in (np.int64(3), 3)]
+    np.testing.assert_array_equal(data[0].states, data[1].states)
+    with closing(make_simulation(env_id, 2)) as run:
+        again = collect(run, open_loop(torch.from_numpy(data[0].actions)), horizon=3, seed=np.int64(3))
+    np.testing.assert_array_equal(data[0].states, again.states)
+
+
+@pytest.mark.parametrize("how", ["-noise0.25", "-delay5"])
+def test_a_task_of_an_imperfect_arm_begins_where_the_plain_arms_does(how: str) -> None:
+    imperfect, plain = (
+        Task.from_env(f"tsm/ReacherPush{word}-v1", n=3, horizon=4, reward=still, seed=1) for word in (how, "")
+    )
+    np.testing.assert_array_equal(imperfect.start, plain.start)
+    trial = tsmlib.execute(imperfect, torch.zeros(3, 4, 2))
+    np.testing.assert_allclose(trial.states[:, 0], plain.start, rtol=1e-6, atol=1e-7)
 
 
 def test_a_search_space_of_another_robot_is_refused() -> None:

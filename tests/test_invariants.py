@@ -143,6 +143,13 @@ def test_states_without_an_object_or_a_number_are_refused() -> None:
 # Actions -------------------------------------------------------------------------------------------------------------
 
 
+def test_a_constant_torque_weighs_double_in_roughness_as_it_is_stated() -> None:
+    wave = 0.2 * torch.sin(2 * torch.pi * 10 * torch.arange(200) * 0.02)  # of 10 Hz; mean square 0.02
+    found = roughness((0.2 + wave)[None, :, None])  # and 0.04 of the constant part
+    torch.testing.assert_close(found["fast"], torch.tensor([0.02 / (2 * 0.04 + 0.02)]))
+    torch.testing.assert_close(found["centroid"], torch.tensor([10 * 0.02 / (2 * 0.04 + 0.02)]))
+
+
 def test_the_roughness_of_waves_is_known() -> None:
     time = 0.02 * torch.arange(100)
     slow, fast = (torch.sin(2 * torch.pi * hertz * time) for hertz in (2.0, 10.0))

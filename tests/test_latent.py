@@ -84,6 +84,15 @@ def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> 
     return SampledFutures(PUSH, window, states.expand(2, -1, -1, -1).clone())
 
 
+def test_quantiles_of_the_spread_go_from_the_narrowest_window_to_the_widest() -> None:
+    seen = scene(5)
+    wide = torch.tensor([3.0, 0.0, 4.0, 1.0, 2.0])[:, None, None] * torch.tensor([-1.0, 1.0])[:, None, None, None]
+    seen.window.past.actions[:, :, 0] = torch.arange(5.0)[:, None]  # which window it is
+    seen = SampledFutures(PUSH, seen.window, seen.samples + wide)
+    found = [int(latent.window_at(seen, moving(), q).past.actions[0, 0, 0]) for q in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    assert found == [1, 3, 4, 0, 2]
+
+
 def test_the_divergence_of_a_gaussian_is_the_textbook_s_and_adds_up_over_dimensions() -> None:
     mean, log_variance = torch.randn(5, 4, generator=rng()), torch.randn(5, 4, generator=rng(1))
     found = latent.kl_by_dimension(mean, log_variance)

@@ -11,6 +11,7 @@ from torch import Tensor
 from untrained import in_units
 
 from tsmlib import rewards, study
+from tsmlib.envs import variant
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.execution import execute
@@ -95,6 +96,12 @@ def test_a_reward_of_the_wrong_shape_is_refused(wrong: Reward, found: str) -> No
         posed(wrong)
 
 
+def test_a_horizon_of_no_step_is_refused_and_not_the_one_before() -> None:
+    with pytest.raises(ValueError, match="horizon is 0, expected a positive number of steps"):
+        posed().with_reward("trace an arc", arc, horizon=0)
+    assert posed().with_reward("trace an arc", arc).horizon == T
+
+
 def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None:
     task = study.load_task("tsm/Reacher-v0").take(4)
     some = task.take([3, 1])
@@ -175,6 +182,20 @@ def test_adam_refuses_the_true_simulator() -> None:
         adam(simulator_predictor(REACHER, task.start), task.reward, DirectActions(T), N, iterations=2)
 
 
+def test_what_a_reward_would_be_after_the_end_neither_counts_nor_spoils_the_slope() -> None:
+    x = torch.tensor([1.0, 0.5, 0.1, -0.1, math.nan])[None, :, None].requires_grad_()
+    u = torch.tensor([0.1, 0.1, 0.1, 1.0, 1.0])[None, :, None].requires_grad_()
+    counted = rewards.until(lambda x: x[..., 0] < 0.2, lambda x, u: x[..., 0].log() + (1 - u[..., 0]).sqrt())
+    found = counted(x[None, None], u[None])  # (S, C, B, T) of states, (C, B, T) of actions
+    torch.testing.assert_close(found[0, 0, 0, :3], (x[0, :3, 0].log() + 0.9**0.5))
+    assert (found[..., 3:] == 0).all()
+    found.sum().backward()
+    assert x.grad is not None
+    assert u.grad is not None
+    torch.testing.assert_close(x.grad.flatten(), torch.tensor([1.0, 2.0, 10.0, 0.0, 0.0]))
+    torch.testing.assert_close(u.grad.flatten(), torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0]) * -0.5 / 0.9**0.5)
+
+
 # Targets and horizons ------------------------------------------------------------------------------------------------
 
 
@@ -190,6 +211,17 @@ def test_a_target_out_of_reach_is_refused() -> None:
     dataclasses.replace(push, target=far)  # an object can lie in the corner
     with pytest.raises(ValueError, match=r"target 0 at \(0.300, 0.300\) m is out of reach: the object gets .* 0.21 m"):
         dataclasses.replace(push, target=3 * far)
+
+
+def test_a_target_in_the_hole_around_the_shoulder_is_refused() -> None:
+    unequal = variant(REACHER, link_lengths=(0.06, 0.18))
+    task = study.draw_task(unequal, seed=3, n=2)
+    dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.24, 0.0]]))
+    with pytest.raises(
+        ValueError,
+        match=r"target 1 at \(0.000, 0.100\) m is out of reach: .* the hole around it, expected 0.11 to 0.24 m",
+    ):
+        dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.0, 0.1]]))
 
 
 def test_a_target_that_is_no_number_is_refused() -> None:

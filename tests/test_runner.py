@@ -26,7 +26,7 @@ from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.storage import manifest
 from tsmlib.storage.files import StoreError
-from tsmlib.study import notebooks, papermill_plugin, parameters, runs
+from tsmlib.study import explorer, notebooks, papermill_plugin, parameters, runs
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import RunError, resolve
 
@@ -577,3 +577,12 @@ def test_cells_that_only_begin_like_papermills_are_left_alone() -> None:
 def test_the_installed_package_registers_the_entry_point() -> None:
     names = [entry.name for entry in importlib.metadata.entry_points(group="papermill.io")]
     assert "tsmlib-default-output" in names, "install the package first: pip install --no-deps -e ."
+
+
+def test_a_port_that_is_taken_or_none_is_named_with_what_to_type(tmp_path: Path) -> None:
+    for name in ("index.html", "manifest.json"):
+        (tmp_path / name).write_text("{}")
+    with explorer.server(tmp_path, port=0) as running:
+        for port, why in ((running.server_port, ".+"), (99999, "ports are 0 to 65535"), (-1, "ports are 0 to 65535")):
+            with pytest.raises(RunError, match=rf"port {port} of 127.0.0.1 cannot be used \({why}\).*--port 0"):
+                explorer.server(tmp_path, port=port)

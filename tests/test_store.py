@@ -12,8 +12,10 @@ import resource
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -433,6 +435,21 @@ def test_a_fault_while_writing_leaves_the_old_file_and_nothing_else(
         assert str(saved) in str(caught.value)
     assert saved.read_bytes() == before
     assert only(saved.parent) == [saved.name]
+
+
+def test_threads_that_write_one_file_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, both, replace = tmp_path / "x.json", threading.Barrier(2, timeout=30), os.replace
+
+    def together(source: Path, target: Path) -> None:
+        both.wait()
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", together)
+    contents = [word * 100_000 for word in (b"a", b"b")]
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(lambda data: files.write_bytes(path, data), contents))
+    assert path.read_bytes() in contents
+    assert os.listdir(tmp_path) == ["x.json"]
 
 
 def test_data_reaches_the_disk_before_its_name_does(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:

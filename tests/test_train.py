@@ -80,6 +80,32 @@ def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_d
         torch.testing.assert_close(states.std(0), torch.ones(4), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("dt", [0.125, 0.02])  # the steps of the second differ by rounding
+def test_a_clock_goes_on_and_the_statistics_of_all_else_are_as_without_it(dt: float) -> None:
+    clock = np.broadcast_to(dt * np.arange(31)[:, None], (30, 31, 1)).astype(np.float32)
+    timed = replace(
+        TRAIN, states=np.concatenate([TRAIN.states, clock], 2), names=("a", "b", "c", "time"), units=("",) * 4
+    )
+    model, plain = OneStep.for_data(timed, hidden=8), OneStep.for_data(TRAIN, hidden=8)
+    assert model.features.moving.all()
+    assert torch.equal(model.features.step_std[:3], plain.features.step_std)
+    torch.testing.assert_close(model.features.step_std[3], torch.tensor(dt), rtol=1e-3, atol=0)
+    fit(model, model.loss, timed, timed, TrainingOptions(1, 4, steps=60, batch_size=32, lr=1e-2, warmup=3))
+    states = torch.from_numpy(timed.states)
+    past = initial_past(states[:, 0], 1, 2)
+    reached = rollout(model, past, torch.from_numpy(timed.actions[:, :10]))[:, -1, 3].detach()
+    assert 7 * dt < float(reached.mean()) < 13 * dt, reached.mean() / dt  # it stood still, or ran away
+
+
+def test_an_action_that_is_never_used_does_not_stop_the_training_of_the_prior() -> None:
+    unused = replace(TRAIN, actions=TRAIN.actions * np.float32([1, 0]))
+    prior = ActionPrior.for_data(unused, segment_len=H, channels=8, dilations=(1, 2))
+    assert prior.std[1] == 1
+    assert prior.std[0] == torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0)[0]
+    history = fit(prior, prior.loss, unused, unused, TrainingOptions(**SIZES | {"steps": 5}))
+    assert math.isfinite(history.validation[-1])
+
+
 def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
     schedule = SIZES | {name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings}
     return fit(model, loss or model.loss, TRAIN, HELD_OUT, TrainingOptions(**schedule), **settings)
@@ -492,6 +518,14 @@ def test_numbers_that_are_not_positive_are_refused() -> None:
 def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TrainingOptions(**{**SIZES, **settings})
+
+
+@pytest.mark.parametrize(("new", "future_len", "better"), [(new_tsm, 6, 4), (new_tsm, 3, 4), (new_prior, 6, 4)])
+def test_a_future_of_no_whole_number_of_segments_is_refused(new: Any, future_len: int, better: int) -> None:
+    with pytest.raises(
+        ValueError, match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or"
+    ):
+        train(new(), future_len=future_len)
 
 
 def test_episodes_shorter_than_the_windows_are_refused() -> None:

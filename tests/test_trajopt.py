@@ -22,6 +22,7 @@ from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.base import Plan, Planner, Predictor
+from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import (
     adam,
     cem,
@@ -35,6 +36,7 @@ from tsmlib.planning.planners import (
 )
 from tsmlib.planning.predictors import EnsemblePredictor, fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
+from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, NoNoise, standard_normal
 from tsmlib.trajectory import Segment, Window, initial_past
@@ -329,6 +331,24 @@ def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_
     torch.testing.assert_close(planned[0.25].actions, planned[1.0].actions)  # since they are of one opinion
 
 
+def test_a_candidate_that_only_the_first_member_judged_is_never_an_elite() -> None:
+    class Spread(DirectActions):
+        def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
+            return torch.linspace(-1, 1, n)[:, None, None, None].expand(-1, n_targets, 1, 1)
+
+    alone = list[Tensor]()  # predicted alone: the start, the mean of the elites, the plan
+
+    def predict(actions: Tensor) -> Tensor:
+        alone.extend([actions] if len(actions) == 1 else [])
+        return actions[None]
+
+    space = Spread(1, 1, rms=0.3)
+    judge = EnsemblePredictor((predict, predict))
+    cem(judge, lambda x, u: x[..., 0], space, 1, candidates=64, elites=4, iterations=1, screened=0.0)
+    best = 0.3 * torch.linspace(-1, 1, 64)[-4:].mean()
+    torch.testing.assert_close(alone[2].flatten(), (0.9 * best).tanh()[None])  # 2, since two members see the start
+
+
 def test_the_return_of_a_screened_plan_is_the_mean_of_what_all_members_predict() -> None:
     judge = EnsemblePredictor((predictor(), lambda actions: 0.9 * predictor()(actions)))
     plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
@@ -581,6 +601,16 @@ def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float)
     follows = torch.from_numpy(env.rollout(actions[:, 20:].numpy())).float()
     states = simulator_predictor(env_id, observed)(actions[None, :, 20:])[0, 0]
     assert (states - follows)[..., 4:8].abs().max() < off  # metres
+
+
+def test_the_simulator_of_an_arms_task_goes_on_after_what_was_done() -> None:
+    task = Task.from_env("tsm/Reacher-v0", n=2, horizon=15, reward=lambda x, u: x[..., 0], seed=0)
+    done, rest = 0.3 * torch.ones(2, 10, 2), torch.zeros(2, 5, 2)
+    states = simulator_predictor(task, done=done)(rest[None])[0, 0]
+    torch.testing.assert_close(states, execute(task, torch.cat([done, rest], 1)).states[:, 11:], rtol=1e-4, atol=1e-5)
+    at_start = simulator_predictor(task)(rest[None])
+    assert torch.equal(simulator_predictor(task, done=done[:, :0])(rest[None]), at_start)
+    assert torch.equal(simulator_predictor(task, task.start, done=done)(rest[None]), at_start)  # it is where it is
 
 
 def test_the_true_simulator_of_an_arm_predicts_from_a_start_alone() -> None:

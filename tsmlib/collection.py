@@ -42,6 +42,7 @@ def collect(
             f"the actions are of {controller.actions.shape[1]} steps, those of an episode of {horizon} were expected; "
             f"give as many, or horizon={controller.actions.shape[1]}"
         )
+    seed = int(seed) if isinstance(seed, np.integer) else seed
     episodes: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
     start = episodes.reset(seed=seed, states=states)
     past = initial_past(torch.from_numpy(start).float(), past_len, episodes.action_dim)
@@ -80,6 +81,7 @@ def collect_random(
     time_constant: float | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
 ) -> Trajectories:
     """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone."""
+    seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:
         actions = smooth_torques(
             episodes, horizon, generator=torch.Generator().manual_seed(seed), action_dim=run.action_dim, rms=rms,

@@ -38,14 +38,27 @@ def _approach(position: slice, target: Tensor, torque_weight: float) -> Reward:
 def until(ended: Callable[[Tensor], Tensor], reward: Reward) -> Reward:
     """``reward`` up to and with the first step after which the episode is over, and nothing from there on.
 
-    ended: states (..., T, dx) -> (..., T) bool, what the environment ends an episode by: a model does not know.
+    ended: states (..., T, dx) -> (..., T) bool, what the environment ends an episode by: a model does not know. To
+    ``reward`` the last step that counts repeats from there on, as it does in episodes that ended.
     """
 
     def counted(states: Tensor, actions: Tensor) -> Tensor:
-        over = ended(states).to(states.dtype)
-        return reward(states, actions) * (over.cumsum(-1) - over < 1)
+        over = ended(states).int()
+        counts = over.cumsum(-1) - over < 1
+        return torch.where(counts, reward(_held(states, counts), _held(actions, counts)), 0.0)
 
     return counted
+
+
+def _held(part: Tensor, counts: Tensor) -> Tensor:
+    """States or actions (..., T, d), from the last step that ``counts`` (..., T) on as they are there.
+
+    A reward that is infinite beyond the end would have a slope that is NaN, whether it is counted or not.
+    """
+    shape = torch.broadcast_shapes(part.shape[:-1], counts.shape)
+    part, counts = part.expand(*shape, -1), counts.expand(shape)
+    last = counts.sum(-1)[..., None, None] - 1  # (..., 1, 1)
+    return torch.where(counts[..., None], part, part.detach().take_along_dim(last, -2))
 
 
 def final_distance(states: Tensor, target: Tensor, position: slice) -> Tensor:

@@ -80,11 +80,17 @@ def room(physics: Physics) -> float:
 def target_ring(spec: EnvSpec) -> tuple[float, float]:
     """Radii between which targets are drawn, m: those of the task, as far as this arm and its object can get."""
     inner, outer = TARGET_RING[spec.task]
-    near, far = sorted(spec.physics.link_lengths)
-    inner = max(
-        inner, far - near - 0.01
-    )  # of the hole around the shoulder, the standard arm's 1 cm are part of its task
-    return inner, min(outer, near + far, room(spec.physics)) if spec.task == "push" else min(outer, near + far)
+    inner, reach = max(inner, hole(spec.physics)), sum(spec.physics.link_lengths)
+    return inner, min(outer, reach, room(spec.physics)) if spec.task == "push" else min(outer, reach)
+
+
+def hole(physics: Physics) -> float:
+    """Radius around the shoulder within which the fingertip has no target, m: of where it does not get, less 1 cm.
+
+    The standard arm's 1 cm are part of its task.
+    """
+    near, far = sorted(physics.link_lengths)
+    return max(0.0, far - near - 0.01)
 
 
 def block_ring(spec: EnvSpec) -> tuple[float, float]:

@@ -68,6 +68,10 @@ def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
 
     ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power. ``fast``: share of power
     above 5 Hz. ``autocorrelation``: of successive torques. Without any torque all are zero.
+
+    Power is here |FFT|^2 of the frequencies from 0 on, each counted once. Of the mean square torque all have a mirror
+    image except the constant part and, of an even number of steps, the highest frequency: in ``centroid`` and ``fast``
+    these two therefore weigh double. Published rows are made so.
     """
     tiny = 1e-12
     power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)  # (B, F)

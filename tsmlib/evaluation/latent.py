@@ -114,9 +114,9 @@ def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
 
 
 def window_at(seen: SampledFutures, features: Features, quantile: float) -> Window:
-    """The window (N = 1) at a quantile of the spread of samples."""
+    """The window (N = 1) at a quantile, from 0 to 1, of the spread of samples."""
     spread = deviations(seen, features)[0].mean(1)
-    i = int(spread.argsort()[int(quantile * len(spread))])
+    i = int(spread.argsort()[min(int(quantile * len(spread)), len(spread) - 1)])
     return Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
 
 

@@ -16,7 +16,14 @@ import torch
 from torch import Tensor
 
 from tsmlib.models.config import Configured, weights_from
-from tsmlib.models.layers import CausalDecoder, Encoder, chunked, kl_from_standard_normal, sample_posterior
+from tsmlib.models.layers import (
+    CausalDecoder,
+    Encoder,
+    chunked,
+    kl_from_standard_normal,
+    sample_posterior,
+    whole_segments,
+)
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Trajectories, Window, real_steps
@@ -61,9 +68,10 @@ class ActionPrior(Configured):
         return prior
 
     def fit_scale(self, actions: Tensor, lengths: Sequence[int] = ()) -> ActionPrior:
-        """Take the scale of training actions (N, T, du); padding beyond ``lengths`` has no part."""
+        """Take the scale of training actions (N, T, du), 1 if never used; padding beyond ``lengths`` has no part."""
         steps = actions[real_steps(lengths, actions.shape[1])] if lengths else actions.flatten(0, 1)
-        self.std.copy_(steps.std(0))
+        std = steps.std(0)
+        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,7 +111,7 @@ class ActionPrior(Configured):
         The past of the first segment is the window's; that of each later one is the decoded segment before it.
         """
         past, loss = window.past.actions, window.past.actions.new_zeros(())
-        for future in window.future.actions.split(self.segment_len, dim=1):
+        for future in whole_segments(window.future.actions, self.segment_len):
             mean, log_variance = self.encode(future)
             decoded = self.decode(past[:, -self.past_len :], sample_posterior(mean, log_variance, generator))
             error = ((decoded - future) / self.std).square().sum((1, 2))

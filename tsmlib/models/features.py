@@ -17,7 +17,8 @@ class Features(nn.Module):
     """Physical states as networks and scores see them: angles as cosine and sine, everything standardised.
 
     The statistics come from training data by ``fit`` and travel with the model. A state dimension that never changes
-    within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out.
+    within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out. One
+    that grows evenly (a clock) has the size of its steps in place of their deviation, which is none.
     """
 
     mean: Tensor
@@ -44,7 +45,8 @@ class Features(nn.Module):
         self.mean.copy_(raw.mean(0))
         std = raw.std(0)
         self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
-        self.step_std.copy_(steps.std(0))
+        step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
+        self.step_std.copy_(torch.where(step_std > 1e-3 * step_rms, step_std, step_rms))  # a clock's steps are alike
         return self
 
     @property

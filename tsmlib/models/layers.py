@@ -31,6 +31,17 @@ def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
 
 
+def whole_segments(future: Tensor, segment_len: int) -> tuple[Tensor, ...]:
+    """A window's future (B, n H, .) in segments of H steps; ValueError where it is no whole number of them."""
+    steps = future.shape[1]
+    if steps % segment_len:
+        raise ValueError(
+            f"future_len is {steps}, which is not a whole number of segments of {segment_len}; "
+            f"choose {max(1, steps // segment_len) * segment_len}, or give the model segment_len={steps}"
+        )
+    return future.split(segment_len, dim=1)
+
+
 class BatchedLinear(nn.Module):
     """M linear layers side by side: (M, B, in) -> (M, B, out). Drawn as torch draws one linear layer."""
 

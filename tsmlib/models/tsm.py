@@ -23,6 +23,7 @@ from tsmlib.models.layers import (
     chunked,
     kl_from_standard_normal,
     sample_posterior,
+    whole_segments,
 )
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.storage.files import Json
@@ -178,5 +179,5 @@ class TSM(Featured, Configured):
         return torch.cat([self.features(states), actions], dim=-1)
 
     def _segments(self, future: Segment) -> list[Segment]:
-        parts = zip(*(part.split(self.segment_len, dim=1) for part in future), strict=True)
+        parts = zip(*(whole_segments(part, self.segment_len) for part in future), strict=True)
         return [Segment(*part) for part in parts]

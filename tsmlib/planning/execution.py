@@ -34,6 +34,9 @@ class Trial:
     (B,): metres, or as the task's measure of success has it, NaN where it has none; plan: where the actions came from,
     with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
 
+    Behind delayed actions ``actions`` are those that were given, and the executed return is of the states that were and
+    of these: each is charged at the step at which it is given, also the last ones, which never arrive.
+
     success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
     returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none. seen: the
     episodes as they were collected, with what the sensors said and how each of them ended.

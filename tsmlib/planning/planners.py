@@ -164,11 +164,11 @@ def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, see
         parameters = mean + deviation * space.noise(candidates, len(mean), generator)
         if iteration:
             parameters[0] = search.parameters
-        returns = search.returns_of_many(parameters)
-        # To the refit a candidate on which the model diverges, or that was sorted out, is as bad as the worst.
+        returns, judged = search.returns_of_many(parameters)
+        # To the refit a candidate on which the model diverges is as bad as the worst, one that was sorted out worse.
         finite = torch.isfinite(returns)
         worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
-        mean, deviation = refit(parameters, returns.where(finite, worst), mean, deviation)
+        mean, deviation = refit(parameters, returns.where(finite, worst).where(judged, -torch.inf), mean, deviation)
         search.update(torch.cat([parameters, mean[None]]), torch.cat([returns, search.returns_of(mean[None])]))
     return search.plan()
 
@@ -281,10 +281,12 @@ class _Search:
     def returns_of(self, parameters: Tensor) -> Tensor:
         return evaluate(self.predict, self.reward, self.space, parameters)
 
-    def returns_of_many(self, parameters: Tensor) -> Tensor:
-        """``returns_of``, but -inf for all candidates except the ``judged`` best by the first member of an ensemble."""
+    def returns_of_many(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """``returns_of``, and which candidates were judged (C, B) bool: the ``judged`` best by the first member of an
+        ensemble; the return of the others is -inf."""
         if not 0 < self.judged < len(parameters) or not isinstance(self.predict, EnsemblePredictor):
-            return self.returns_of(parameters)
+            returns = self.returns_of(parameters)
+            return returns, torch.ones_like(returns, dtype=torch.bool)
         first, *others = self.predict.each
         actions = _decoded(self.space, parameters)
         rough = _returns(first, self.reward, actions)
@@ -293,7 +295,8 @@ class _Search:
         chosen = actions.gather(0, _like(best, actions).expand(-1, -1, *actions.shape[2:]))
         judged = [_returns(other, self.reward, chosen) for other in others]
         returns = torch.stack([rough.gather(0, best), *judged]).mean(0)
-        return torch.full_like(rough, -torch.inf).scatter(0, best, returns)
+        judged_by_all = torch.zeros_like(rough, dtype=torch.bool).scatter(0, best, True)
+        return torch.full_like(rough, -torch.inf).scatter(0, best, returns), judged_by_all
 
     def update(self, parameters: Tensor, returns: Tensor) -> None:
         value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)

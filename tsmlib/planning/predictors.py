@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -90,9 +91,10 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
     env: a task, from its starts; ``done`` (B, t, du): after these actions. Of an episode that ended the last state
     repeats; ``rewards.until`` says what counts then. UnsupportedEnvironment where no state can be set.
 
-    The id of an arm, from ``start`` (B, dx): any state can be one, also one in the middle of an episode. In MuJoCo what
+    An arm, by its id or a task, from ``start`` (B, dx): any state can be one, also one in the middle of an episode, and
+    ``done``, which led there, has no more part in it; without ``start`` a task's is executed first. In MuJoCo what
     follows is what would have followed, up to rounding; in pymunk, contacts that last forget the force with which they
-    press. UnsupportedEnvironment for an arm with noise or delay; ValueError without ``start``.
+    press. UnsupportedEnvironment for an arm with noise or delay; ValueError for an id without ``start``.
     """
     if isinstance(env, Task) and env.seeds:
         sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
@@ -102,14 +104,14 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
             return torch.from_numpy(begun.outcomes(actions.numpy())).float()[None]
 
         return outcomes
-    if isinstance(env, Task) and start is None:
-        start = env.start
     name = env.env if isinstance(env, Task) else env
     if name.startswith("tsm/") and name != (arm := EnvSpec.parse(name).arm.id):
         raise UnsupportedEnvironment(
             f"{name} hides its states behind noisy sensors or delays actions, so what would follow is no function of "
             f"what is seen; the true simulator of {arm} can be asked"
         )
+    if start is None and isinstance(env, Task):
+        start = env.start if done is None or not done.shape[1] else _reached(env, done)
     if start is None:
         raise ValueError(f"candidates in {name} have no common start; give start (B, dx), or a task")
     make = cache(partial(make_simulation, name))
@@ -121,3 +123,9 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
 
     return predict
+
+
+def _reached(task: Task, done: Tensor) -> np.ndarray:
+    """The states (B, dx) of an arm after ``done`` (B, t, du) from the task's starts."""
+    with closing(make_simulation(task.env, len(task))) as run:
+        return collect(run, open_loop(done), horizon=done.shape[1], states=task.start).states[:, -1]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tsmlib import rewards
 from tsmlib.collection import smooth_torques
-from tsmlib.envs.geometry import room
+from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, make_simulation
 from tsmlib.rewards import Reward, rewarded
@@ -58,12 +58,14 @@ class Task:
         cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 0, success: Success | None = None,
         tolerance: float = 0.0, name: str = "",
     ) -> Task:  # fmt: skip
-        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...
+        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
+        states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
         """
-        with closing(make_simulation(env, n)) as begun:
+        seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
+        with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
         return cls(
@@ -120,7 +122,8 @@ class Task:
         that it may depend on the time. target (2,) or (B, 2): where it should end, for final_distance and pictures.
         """
         goal = self.target if target is None else target.float().expand(len(self), -1)
-        return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=horizon or self.horizon)
+        steps = self.horizon if horizon is None else horizon
+        return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=steps)
 
     def judged(self, states: Tensor) -> tuple[Tensor, Tensor | None]:
         """Final distance (B,), NaN where none is measured, and success (B,) bool, of executed states (B, T + 1, dx)."""
@@ -145,6 +148,7 @@ class Task:
 
     def take(self, chosen: int | Sequence[int]) -> Task:
         """The first instances, or those of some indices; ValueError where there is none, or not as many."""
+        chosen = int(chosen) if isinstance(chosen, np.integer) else chosen
         if isinstance(chosen, int) and not 1 <= chosen <= len(self):
             raise ValueError(f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
         each = list(range(chosen)) if isinstance(chosen, int) else list(chosen)
@@ -167,9 +171,11 @@ def require_reachable(env: str, start: np.ndarray, target: Tensor, position: sli
         raise ValueError(f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start")
     physics = EnvSpec.parse(env).physics
     if position == rewards.TIP:
-        reach = sum(physics.link_lengths)
-        within, what = target.norm(dim=1) <= reach + 1e-6, "fingertip"
-        limit = f"{reach:g} m from the shoulder"
+        reach, inner, away = sum(physics.link_lengths), hole(physics), target.norm(dim=1)
+        within, what = (away <= reach + 1e-6) & (away >= inner - 1e-6), "fingertip"
+        limit = f"{reach:g} m from the shoulder" + (
+            f" and not into the hole around it, expected {inner:g} to {reach:g} m" if inner else ""
+        )
     else:
         within, what = target.abs().amax(1) <= room(physics) + 1e-6, "object"
         limit = f"{room(physics):g} m along x and y, where the walls are"

@@ -8,6 +8,7 @@ import json
 import os
 import socket
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +33,7 @@ class StoreError(ValueError):
 def write_bytes(path: PathLike, data: bytes) -> None:
     """Replace ``path`` by ``data`` in one step, creating its folder; on failure the old file stays and nothing else."""
     path, here = Path(path), f".tmp-{socket.gethostname()}-"
-    temporary = path.with_name(f".{path.name}{here}{os.getpid()}")
+    temporary = path.with_name(f".{path.name}{here}{threading.get_ident()}-{os.getpid()}")
     try:
         _make(path.parent)
         for left in path.parent.glob(f".*{glob.escape(here)}*"):  # by a process of this machine that was killed

@@ -45,14 +45,15 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 def server(folder: Path = PAGE, *, port: int = PORT) -> http.server.ThreadingHTTPServer:
     """A server of the page on 127.0.0.1, not yet running; port 0 is any that is free.
 
-    RunError where the page is not built or the port is taken.
+    RunError where the page is not built, or the port is taken or none.
     """
     if not (folder / "index.html").exists() or not (folder / "manifest.json").exists():
         raise RunError(f"there is no page in {folder}; build it, which needs node and npm: make explorer")
     try:
         return http.server.ThreadingHTTPServer(("127.0.0.1", port), functools.partial(Handler, directory=str(folder)))
-    except OSError as error:
-        raise RunError(f"port {port} of 127.0.0.1 cannot be used ({error.strerror}); name another: --port 0") from error
+    except (OSError, OverflowError) as error:
+        why = error.strerror if isinstance(error, OSError) else "ports are 0 to 65535"
+        raise RunError(f"port {port} of 127.0.0.1 cannot be used ({why}); name another: --port 0") from error
 
 
 def serve(*, port: int = PORT, browser: bool = False) -> None:
