@@ -80,7 +80,7 @@ def test_every_robot_is_collected_fitted_planned_for_and_executed(env_id: str) -
     plan = tsmlib.cem(through, task.reward, space, len(task), candidates=4, elites=2, iterations=1)
     trial = tsmlib.execute(task, plan)
     assert trial.states.shape == (2, 6, data.states.shape[2])
-    for i, (seen, total, _) in enumerate(stepped(env_id, plan.actions, seed=0)):
+    for i, (seen, total, _) in enumerate(stepped(env_id, plan.actions, seed=task.seeds[0])):
         taken = len(seen) - 1
         np.testing.assert_allclose(trial.states[i, : taken + 1], seen, rtol=1e-6, atol=1e-6)
         torch.testing.assert_close(
@@ -375,6 +375,11 @@ def test_a_task_of_any_robot_is_cut_and_repeated_with_its_seeds() -> None:
     np.testing.assert_array_equal(task.start[2], gymnasium.make(PENDULUM).reset(seed=9)[0])
     with pytest.raises(ValueError, match=r"the reward of .* is a tensor \(2, 1, 3\); expected a tensor \(2, 1, 3, 4\)"):
         Task.from_env(PENDULUM, n=3, horizon=4, reward=lambda x, u: still(x, u).sum(-1))
+
+
+def test_by_default_a_task_begins_where_no_data_of_the_default_seed_did() -> None:
+    data, task = tsmlib.collect_random(PENDULUM, 60, horizon=1), Task.from_env(PENDULUM, n=8, horizon=4, reward=still)
+    assert not (data.states[:, None, 0] == task.start[None]).all(-1).any()
 
 
 def test_a_task_of_ones_own_is_made_of_an_arm_too() -> None:

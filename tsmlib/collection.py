@@ -80,7 +80,11 @@ def collect_random(
     rms: float = 0.5,  # of full action
     time_constant: float | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
 ) -> Trajectories:
-    """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone."""
+    """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone.
+
+    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts;
+    ``Task.from_env`` therefore begins at 1000 by default.
+    """
     seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:
         actions = smooth_torques(

@@ -55,11 +55,14 @@ class Task:
 
     @classmethod
     def from_env(
-        cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 0, success: Success | None = None,
+        cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 1000, success: Success | None = None,
         tolerance: float = 0.0, name: str = "",
     ) -> Task:  # fmt: skip
         """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
         states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
+
+        Neighbouring seeds share starts, so the default lies far from the 0 of ``collect_random``: what is measured does
+        not begin where training data began.
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
