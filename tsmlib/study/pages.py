@@ -28,6 +28,8 @@ from tsmlib.study.zoo import OURS, PAPERS
 QUALITY = ROOT / "benchmarks" / "settings" / "quality.csv"  # of trained models, against the time of training
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
+BASELINES = [model for model in README_MODELS if model not in (PAPERS, OURS)]
+SCORES = ("energy_10", "energy_80")  # of QUALITY
 README_CLAIMS = ("C02", "C32")  # what the paper says of predictions and plans
 
 
@@ -96,33 +98,45 @@ def readme_training(env: str) -> str:
     if not len(lines):
         return ""
     shipped, longest = zoo.BUDGET[EnvSpec.parse(env).name], float(lines["seconds"].max())
-    wide = lines.pivot_table(index=["seconds", "model", "seed"], values=["energy_10", "energy_80", "cost"])
-    before, after = (wide.loc[seconds] for seconds in (shipped, longest))
-    ratios = [_over_the_best(found, ["energy_10", "energy_80"]) for found in (before, after)]
+    wide = lines.pivot_table(index=["seconds", "model", "seed"], values=[*SCORES, "cost"])
+    trained = {seconds: wide.loc[seconds].unstack("model") for seconds in (shipped, longest)}
+    before, after = (each.dropna() for each in trained.values())  # of seeds that have every model
 
     def both(model: str) -> str:
-        return " → ".join(", ".join(ratio.loc[model].map("{:.2f}".format)) for ratio in ratios)
+        return " → ".join(
+            ", ".join(f"{(each[score][model] / each[score][BASELINES].min(axis=1)).mean():.2f}" for score in SCORES)
+            for each in (before, after)
+        )
 
     scores = "; ".join(f"`{model}` {both(model)}" for model in (PAPERS, OURS))
     costs = ", ".join(
         f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
     )
     return (
-        f"Single networks trained {longest / shipped:g} times as long ({_seeds(lines)}, validation, same page): energy "
+        f"Single networks trained {longest / shipped:g} times as long ({_seeds(after)}, validation, same page): energy "
         f"score over the best baseline's at 10, 80 steps {scores}; cost of plans (m) {costs}."
+        f"{_against(trained[longest], 'onestep')}"
     )
 
 
-def _over_the_best(found: pd.DataFrame, scores: list[str]) -> pd.DataFrame:
-    """Scores of (model, seed) over those of the best of the baselines that every seed has, mean over seeds."""
-    baselines = found[~found.index.get_level_values("model").isin(zoo.words(cls=zoo.CODED))][scores]
-    everywhere = baselines.groupby("model").filter(lambda own: len(own) == baselines.groupby("model").size().max())
-    return (found[scores] / everywhere.groupby("seed").min()).groupby("model").mean()
+def _against(found: pd.DataFrame, baseline: str) -> str:
+    """Energy scores of models with codes over those of one baseline, of all seeds that have both; for several seeds."""
+    pairs = {
+        model: [(found[score][model] / found[score][baseline]).dropna() for score in SCORES] for model in (PAPERS, OURS)
+    }
+    seeds = {len(ratio) for ratios in pairs.values() for ratio in ratios}
+    if min(seeds) < 2:
+        return ""
+    said = "; ".join(
+        f"`{model}` {', '.join(table.spell(ratio, '{:.2f} ± {:.2f}') for ratio in ratios)}"
+        for model, ratios in pairs.items()
+    )
+    return f" Over `{baseline}` alone, {min(seeds)} seeds: {said}."
 
 
 def _seeds(rows: pd.DataFrame) -> str:
-    """Seeds of rows in words: seed 0, or seeds 0, 1."""
-    found = [str(seed) for seed in sorted(rows["seed"].dropna().unique())]
+    """Seeds of rows, in a column or the index, in words: seed 0, or seeds 0, 1."""
+    found = [str(seed) for seed in sorted(rows.reset_index()["seed"].dropna().unique())]
     return f"seed{'s' * (len(found) > 1)} {', '.join(found)}"
 
 
