@@ -151,13 +151,14 @@ def figure8(found: pd.DataFrame, floor: Mapping[Method, float]) -> Iterator[Draw
 
 
 def advantage_map(
-    found: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
-) -> Iterator[Drawing]:
-    """``subject`` minus each rival, by noise and delay."""
+    found: pd.DataFrame, clean: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float],
+    delays: Sequence[int],
+) -> Iterator[Drawing]:  # fmt: skip
+    """``subject`` minus each rival, by noise and delay. clean: rows of 03_predict, of the arms without either."""
+    rows = robustness.advantage_rows(found, clean, (subject, *rivals), noises, delays)
     ahead = partial(robustness.advantage, subject=subject, rivals=rivals, noises=noises, delays=delays)
-    maps, yours = table.pair(found, ahead)
+    maps, yours = table.pair(rows, ahead)
     if maps:
-        rows = table.select(found, metric="ll_horizon", model=(subject, *rivals), execution="open loop")
         yield Drawing(
             figures.advantage_map(maps, zoo.method(subject), unit="nats per step", yours=yours), "06_map", rows
         )
