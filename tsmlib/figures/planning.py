@@ -23,7 +23,7 @@ from tsmlib.statistics import interval
 
 Results = Mapping[str, Mapping[Method, Mapping[str, np.ndarray | None]]]  # task -> method -> {"true", "predicted"}
 FLOORS = ("zero", "random")
-MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "D"}  # planner -> marker
+MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "p"}  # planner -> marker
 
 
 Returns = tuple[np.ndarray, np.ndarray | None]  # executed and predicted (n,)
