@@ -169,11 +169,14 @@ def advantage_map(
 
 def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Drawing]:
     """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles."""
+    task, units = exploration.TASKS[env].capitalize(), exploration.UNITS[env]
     rows = table.select(found, execution=planning.CLOSED, env=env)
     curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
-        yield Drawing(figures.rounds(curves, "", yours=yours), stem, rows)
+        panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
+        ylabels = {f"{task}: {title}": units[title] for title in curves}
+        yield Drawing(figures.rounds(panels, ylabels, yours=own), stem, rows)
 
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:
@@ -181,4 +184,6 @@ def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawi
     rows = table.select(found, execution=planning.OPEN, env=env)
     curves, yours = table.pair(rows, partial(exploration.way_curves, steps_ahead=steps_ahead))
     if curves:
-        yield Drawing(figures.adapted(curves, f"energy score, {steps_ahead} steps", yours=yours), "10_ways", rows)
+        yield Drawing(
+            figures.adapted(curves, f"energy score, {steps_ahead} steps (data's s.d.)", yours=yours), "10_ways", rows
+        )

@@ -264,8 +264,8 @@ LOOKS = {  # of what is run and drawn beside the models; greys for what is no me
     "random": Look("random torques", "#7A7A7A"), "zero": Look("zero torque", "#B0B0B0"),
     "data": Look("data", "#4A4A4A"), "filter": Look("Kalman filter", "#B03A2E"),
     "exponential": Look("exponential average", "#8C8C8C"),
-    "pets": Look("PETS (mbrl-lib)", "#C2A5CF", (3, 1, 0)),
-    "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", (3, 1, 180)),
+    "pets": Look("PETS (mbrl-lib)", "#C2A5CF", "H"),
+    "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", "8"),
 }  # fmt: skip
 
 
