@@ -101,12 +101,14 @@ def figure6(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task])
     return Drawing(figures.figure6(published, yours), "figure6", planning.plans_of(found))
 
 
-def predicted_and_executed(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
-    """Returns of single targets, of the best method and of direct plans. by_target: rows with a ``target``."""
-    some = [zoo.method(zoo.OURS, "latent", "cem"), *zoo.methods((zoo.PAPERS, "lstm", "onestep"), "cem", ["direct"])]
-    published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks, methods=some))
-    figure = figures.predicted_vs_true(published, yours)
-    return Drawing(figure, "05_predicted_and_executed", planning.plans_of(found))
+def predicted_and_executed(by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
+    """Returns of single targets and training seeds, of latent plans through some models. by_target: rows with a
+    ``target``."""
+    models = (zoo.OURS, zoo.PAPERS, "lstm", "onestep")
+    rows = table.select(planning.plans_of(by_target), model=models, search_space="latent", planner="cem")
+    read = partial(planning.return_panels, tasks=tasks, methods=zoo.methods(models, "cem", ["latent"]), apart=True)
+    published, yours = table.pair(rows, read)
+    return Drawing(figures.predicted_vs_true(published, yours), "05_predicted_and_executed", rows)
 
 
 def closed_loop(found: pd.DataFrame, by_target: pd.DataFrame, task: Task) -> Drawing:

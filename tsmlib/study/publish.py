@@ -187,7 +187,7 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield drawings.calibration(predict, MUJOCO_IDS)
     yield drawings.code_use(codes, [env for env in MUJOCO_IDS if env in set(codes["env"])])
     yield drawings.figure6(control, by_target, tasks)
-    yield drawings.predicted_and_executed(control, by_target, tasks)
+    yield drawings.predicted_and_executed(by_target, tasks)
     yield drawings.closed_loop(control, by_target, tasks[-1])
     free = policies_results.finished(published("model_free")).assign(source=table.YOURS)
     yield drawings.figure7(tables_storage.frame(pd.concat([control, free])), control)
