@@ -20,6 +20,7 @@ from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
+from tsmlib.rewards import BLOCK
 from tsmlib.storage import tables
 from tsmlib.study import zoo
 from tsmlib.study.results import latent as latent_results
@@ -147,12 +148,17 @@ def test_codes_of_a_recurrent_model_are_looked_at_in_the_same_way(
     assert len(effects) == 3
     assert min(effects) > 0
     codes = torch.randn(5, 3, generator=rng())
-    one = latent.window_at(seen, recurrent.features, 0.5)
+    one = latent.widest(seen, recurrent, codes, 30)
     ways = latent.decode_codes(recurrent, one, codes, 30)
     assert ways.shape == (5, 30, 10)
     past, future = (Segment(*(part.expand(5, -1, -1) for part in side)) for side in one)
     first = recurrent.decode(past, future.actions[:, :10], codes)
     torch.testing.assert_close(ways[:, :10], first)  # then the mode goes on
+    spread = float((ways[:, -1, BLOCK] - ways[0, -1, BLOCK]).norm(dim=1).max())
+    for i in range(len(seen.window.past.states)):  # no other window has the object end further apart
+        other = Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
+        ends = latent.decode_codes(recurrent, other, codes, 30)[:, -1, BLOCK]
+        assert float((ends - ends[0]).norm(dim=1).max()) <= spread
     still = latent.decode_codes(recurrent, one, torch.zeros(1, 3), 30)
     assert torch.equal(still, recurrent.predict_segment(*one[:1], one.future.actions))
 
