@@ -9,7 +9,7 @@ import torch
 
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
-from tsmlib.evaluation.actions import novelty, roughness, within
+from tsmlib.evaluation.actions import novelty, roughness, typical, within
 from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
@@ -141,6 +141,12 @@ def test_states_without_an_object_or_a_number_are_refused() -> None:
 
 
 # Actions -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_typical_plan_is_the_one_of_median_size() -> None:
+    wave = torch.tensor([0.0, 1.0] * 5)[:, None].expand(-1, 2)
+    assert typical(torch.stack([0.01 * wave, 0.9 * wave, 0.4 * wave])) == 2
+    assert typical(torch.stack([0.9 * wave, 0.4 * wave, 0.01 * wave, 0.4 * wave])) == 1
 
 
 def test_the_roughness_of_waves_is_known() -> None:
