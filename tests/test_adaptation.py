@@ -11,8 +11,9 @@ from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
+from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, pages, rounds, runs
+from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
 from tsmlib.study.comparison import published
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
@@ -279,6 +280,32 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     ]  # fmt: skip
     (ax,) = figures.adapted({"model": curves}, "score", yours={"model": curves}).axes
     assert [label.get_text() for label in ax.get_xticklabels()] == ["0", "20", "500"]
+
+
+def test_a_way_of_training_has_no_look_of_a_model() -> None:
+    models = [*(spec.look for spec in zoo.ZOO.values() if spec.group != "choice"), *zoo.LOOKS.values()]
+    ways = results.WAYS.values()
+    assert len({look.marker for look in ways}) == len({look.colour for look in ways}) == len(ways)
+    assert not {look.colour for look in ways} & {look.colour for look in models}
+    trained = [zoo.look(word) for word in zoo.words("dynamics", "ablation")]
+    assert not {look.marker for look in ways} & {look.marker for look in trained}
+
+
+def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> None:
+    common = dict(env=PUSH, model="lstm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=9)
+    rows = tables.frame([
+        common | dict(metric=metric, env_steps=steps, value=low + 0.01 * seed + steps / 1e5, seed=seed, scale="paper")
+        for metric, low in (("return_true", -9.0), ("success", 0.5)) for steps in (0, 20_000, 40_000)
+        for seed in range(3)
+    ]).assign(source=table.YOURS)  # fmt: skip
+    (drawing,) = drawings.rounds(rows, PUSH, results.DRAWN[PUSH])
+    first, second = drawing.figure.axes
+    assert [ax.get_title(loc="left") for ax in (first, second)] == ["Push: executed return", "Push: share within 5 cm"]
+    assert [ax.get_ylabel() for ax in (first, second)] == ["return (m)", "share of targets"]
+    assert first.xaxis.get_major_formatter()(20_000) == "20,000"
+    (bars,) = first.collections
+    mean, half = interval([-8.8, -8.79, -8.78])
+    assert bars.get_segments()[1][:, 1].tolist() == pytest.approx([mean - half, mean + half])
 
 
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:

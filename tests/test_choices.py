@@ -227,6 +227,14 @@ def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as
         assert found[quality.MEASURES[name]].tolist() == ["1.50 (onestep)", "0.50 (lstm)"]
 
 
+def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() -> None:
+    lines = pd.DataFrame([{"env": "tsm/ReacherPush-v1", "seed": seed, "targets": 100} for seed in (0, 2, 1, 0)])
+    assert quality.stamp(lines) == (
+        "ReacherPush, training seeds 0, 1, 2; one network each, of a recurrent TSM one decoder; predictions: n = 200 "
+        "fresh episodes, plans and violations: n = 100 validation targets"
+    )
+
+
 def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:
     scores = {
         ("tsm", 0): 1.0,

@@ -456,6 +456,16 @@ def test_the_figure_has_a_row_for_every_claim_with_rows() -> None:
         figures.claim_margins(nothing)
 
 
+def test_the_figure_says_what_is_claimed_and_what_an_open_mark_is() -> None:
+    beyond, none = np.array([[0.5, 0.2, 0.8]]), np.array([[0.5, np.nan, np.nan]])
+    rows = [("C1", "It holds.", "REPLICATED", "0.5, n = 3 seeds", beyond, np.array([0.4, 0.6]))]
+    more = [*rows, ("C2", "", "INCONCLUSIVE", "1, n = 1 seed", none, none[0])]
+    figures_of = [figures.claim_margins(part) for part in (rows, more)]
+    named = [[text.get_text() for text in figure.legends[0].get_texts()] for figure in figures_of]
+    assert [label.get_text() for label in figures_of[0].axes[0].get_yticklabels()] == ["C1  It holds."]
+    assert ["no interval: one training seed" in texts for texts in named] == [False, True]
+
+
 def test_a_claim_in_full_shows_every_seed_of_every_check_and_each_reading() -> None:
     rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0, q.ll(TSM, REACHER) < 8]), readings=SHARED)
     rows = [score("tsm", k, 1.0 + 4 * k) for k in range(3)]

@@ -186,7 +186,7 @@ def test_a_legend_has_no_column_that_its_rows_leave_almost_empty() -> None:
 def test_a_dot_of_predicted_and_executed_returns_is_named() -> None:
     legend = figures.predicted_vs_true(returns()).legends[0]
     assert [text.get_text() for text in legend.get_texts()] == [
-        "one target, mean over training seeds", "executed as predicted", "gap",
+        "one target of one training seed", "executed as predicted", "gap",
     ]  # fmt: skip
 
 

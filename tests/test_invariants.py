@@ -9,7 +9,7 @@ import torch
 
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
-from tsmlib.evaluation.actions import novelty, roughness, within
+from tsmlib.evaluation.actions import novelty, roughness, typical, within
 from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
@@ -148,6 +148,12 @@ def test_a_constant_torque_weighs_double_in_roughness_as_it_is_stated() -> None:
     found = roughness((0.2 + wave)[None, :, None])  # and 0.04 of the constant part
     torch.testing.assert_close(found["fast"], torch.tensor([0.02 / (2 * 0.04 + 0.02)]))
     torch.testing.assert_close(found["centroid"], torch.tensor([10 * 0.02 / (2 * 0.04 + 0.02)]))
+
+
+def test_a_typical_plan_is_the_one_of_median_size() -> None:
+    wave = torch.tensor([0.0, 1.0] * 5)[:, None].expand(-1, 2)
+    assert typical(torch.stack([0.01 * wave, 0.9 * wave, 0.4 * wave])) == 2
+    assert typical(torch.stack([0.9 * wave, 0.4 * wave, 0.01 * wave, 0.4 * wave])) == 1
 
 
 def test_the_roughness_of_waves_is_known() -> None:

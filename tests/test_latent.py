@@ -20,6 +20,7 @@ from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
+from tsmlib.rewards import BLOCK
 from tsmlib.storage import tables
 from tsmlib.study import zoo
 from tsmlib.study.results import latent as latent_results
@@ -82,15 +83,6 @@ def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> 
         Segment(state.expand(n, 10, -1).clone(), torch.zeros(n, 10, 2)), Segment(states, torch.zeros(n, steps, 2))
     )
     return SampledFutures(PUSH, window, states.expand(2, -1, -1, -1).clone())
-
-
-def test_quantiles_of_the_spread_go_from_the_narrowest_window_to_the_widest() -> None:
-    seen = scene(5)
-    wide = torch.tensor([3.0, 0.0, 4.0, 1.0, 2.0])[:, None, None] * torch.tensor([-1.0, 1.0])[:, None, None, None]
-    seen.window.past.actions[:, :, 0] = torch.arange(5.0)[:, None]  # which window it is
-    seen = SampledFutures(PUSH, seen.window, seen.samples + wide)
-    found = [int(latent.window_at(seen, moving(), q).past.actions[0, 0, 0]) for q in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    assert found == [1, 3, 4, 0, 2]
 
 
 def test_the_divergence_of_a_gaussian_is_the_textbook_s_and_adds_up_over_dimensions() -> None:
@@ -156,12 +148,17 @@ def test_codes_of_a_recurrent_model_are_looked_at_in_the_same_way(
     assert len(effects) == 3
     assert min(effects) > 0
     codes = torch.randn(5, 3, generator=rng())
-    one = latent.window_at(seen, recurrent.features, 0.5)
+    one = latent.widest(seen, recurrent, codes, 30)
     ways = latent.decode_codes(recurrent, one, codes, 30)
     assert ways.shape == (5, 30, 10)
     past, future = (Segment(*(part.expand(5, -1, -1) for part in side)) for side in one)
     first = recurrent.decode(past, future.actions[:, :10], codes)
     torch.testing.assert_close(ways[:, :10], first)  # then the mode goes on
+    spread = float((ways[:, -1, BLOCK] - ways[0, -1, BLOCK]).norm(dim=1).max())
+    for i in range(len(seen.window.past.states)):  # no other window has the object end further apart
+        other = Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
+        ends = latent.decode_codes(recurrent, other, codes, 30)[:, -1, BLOCK]
+        assert float((ends - ends[0]).norm(dim=1).max()) <= spread
     still = latent.decode_codes(recurrent, one, torch.zeros(1, 3), 30)
     assert torch.equal(still, recurrent.predict_segment(*one[:1], one.future.actions))
 

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
@@ -75,20 +76,32 @@ def test_figure_7_is_laid_out_without_warnings_and_not_left_open(name: str) -> N
     assert min(text.get_fontsize() for text in figure.findobj(plt.Text) if text.get_text()) >= 6.5
 
 
-def test_a_line_is_the_mean_and_its_band_the_interval_over_copies() -> None:
+def bars(ax: Axes, method: Method) -> list[np.ndarray]:
+    """Both ends of each interval of a method that is drawn as a bar."""
+    found = [part for part in ax.collections if isinstance(part, LineCollection)]
+    return [part.get_segments()[0] for part in found if to_hex(part.get_color()[0]) == method.look.colour.lower()]
+
+
+def test_a_line_is_the_mean_and_its_end_stands_beside_the_axis_with_its_interval() -> None:
     given = learned()
     ax = figure7({"reach": {RIVAL: given}}).axes[0]
-    true, predicted = lines(ax, RIVAL)
+    true, end, predicted = lines(ax, RIVAL)
     np.testing.assert_allclose(true.get_ydata(), given["return_true"].mean(0))
     np.testing.assert_array_equal(true.get_xdata(), given["steps"])
     np.testing.assert_allclose(predicted.get_ydata(), given["return_predicted"].mean(0))
     assert predicted.is_dashed()
     assert not true.is_dashed()
-    vertices = ax.collections[0].get_paths()[0].vertices
-    mean, half = interval(given["return_true"][:, 4])
-    assert sorted(set(np.round(vertices[vertices[:, 0] == given["steps"][4], 1], 9))) == pytest.approx(
-        [mean - half, mean + half]
-    )
+    mean, half = interval(given["return_true"][:, -1])
+    (bar,) = bars(ax, RIVAL)
+    assert bar[:, 1].tolist() == pytest.approx([mean - half, mean + half])
+    assert bar[0, 0] == end.get_xdata()[0] > given["steps"][-1]
+    assert end.get_ydata().tolist() == pytest.approx([mean])
+    assert [text.get_text() for text in ax.get_xticklabels()][-1] == "ends"
+
+
+def test_the_legend_says_what_an_interval_is_over() -> None:
+    figure = figure7({"reach": {RIVAL: learned(), PPO: model_free(k=4)}})
+    assert "95 % interval over 3 copies of a policy, 4 seeds without a model" in legend(figure)
 
 
 def test_tasks_stand_side_by_side_and_share_the_scale_of_their_column() -> None:
@@ -100,17 +113,19 @@ def test_tasks_stand_side_by_side_and_share_the_scale_of_their_column() -> None:
         assert [ax.get_xlabel().split("\n")[0].split(";")[0] for ax in column] == list(AXES.values())
 
 
-def test_a_model_s_data_set_is_a_point_and_a_model_free_run_a_line_against_samples() -> None:
+def test_policies_of_a_data_set_stand_beside_the_axis_of_samples_and_a_model_free_run_is_a_line_on_it() -> None:
     given = learned(samples=50_000)
-    ax = figure7({"reach": {LATENT: given, PPO: model_free()}}, against=["samples"]).axes[0]
-    level, point = lines(ax, LATENT)[:2]
-    assert point.get_ydata()[0] == pytest.approx(given["return_true"][:, -1].mean())
-    assert level.get_xdata().tolist() == [*point.get_xdata(), 300_000]
-    (note,) = ax.texts
-    assert note.get_text().startswith("line: data of the models, 50k")
-    assert 50_000 < point.get_xdata()[0] < 60_000  # beside the line that stands at all of them
-    (curve,) = lines(ax, PPO)
-    assert len(curve.get_xdata()) == 26
+    ax = figure7({"reach": {LATENT: given, RIVAL: learned(), PPO: model_free()}}, against=["samples"]).axes[0]
+    point, other = lines(ax, LATENT)[0], lines(ax, RIVAL)[0]  # then an arrow where an interval leaves the panel
+    assert point.get_ydata().tolist() == [pytest.approx(given["return_true"][:, -1].mean())]
+    assert len(lines(ax, PPO)[0].get_xdata()) == 26
+    ticks = dict(zip([text.get_text() for text in ax.get_xticklabels()], ax.get_xticks(), strict=True))
+    assert 300_000 < point.get_xdata()[0] < ticks["models,\n50k steps"] < other.get_xdata()[0]
+    assert ax.spines["bottom"].get_bounds()[1] < point.get_xdata()[0]  # where the axis counts no steps
+    (data,) = [line for line in ax.lines if list(line.get_xdata()) == [50_000, 50_000]]
+    assert list(data.get_ydata()) == [0, 1]
+    (bar,) = bars(ax, PPO)
+    assert bar[0, 0] < point.get_xdata()[0]
 
 
 def test_a_model_free_run_is_drawn_against_steps_of_the_environment_which_the_axis_says() -> None:
@@ -122,14 +137,15 @@ def test_a_model_free_run_is_drawn_against_steps_of_the_environment_which_the_ax
 
 def test_the_legend_names_each_model_once_and_what_filled_and_open_mean() -> None:
     figure = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-5), PPO: model_free()}})
-    words = ["TSM", "PPO", "latent policy", "direct policy", "predicted return", "95 % interval"]
+    words = ["TSM", "PPO", "latent policy", "direct policy", "predicted return", "steps in the models' data",
+             "95 % interval over 3 copies of a policy, 3 seeds without a model"]  # fmt: skip
     assert legend(figure) == words
 
 
 def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> None:
     ax = figure7({"reach": {LATENT: learned(), PPO: model_free()}}, against=["seconds"]).axes[0]
     assert ax.get_xscale() == "log"
-    (curve,), (own,) = lines(ax, PPO), lines(ax, LATENT)
+    curve, own = lines(ax, PPO)[0], lines(ax, LATENT)[0]
     assert len(curve.get_xdata()) == 25
     assert own.get_xdata()[0] == 400
     low, high = ax.get_xlim()
@@ -138,13 +154,13 @@ def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> No
 
 def test_a_policy_through_the_prior_is_filled_and_one_of_torques_open() -> None:
     ax = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-6)}}, against=["steps"]).axes[0]
-    curves = [line for line in lines(ax, LATENT) if not line.is_dashed()]
+    curves = [line for line in lines(ax, LATENT) if len(line.get_xdata()) > 1 and not line.is_dashed()]
     assert [to_hex(line.get_markerfacecolor()).upper() for line in curves] == [LATENT.look.colour, "#FFFFFF"]
 
 
 def test_references_are_lines_and_of_several_oracles_the_one_that_tables_divide_by() -> None:
     figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["steps"])
-    flat = {line.get_ydata()[0] for line in figure.axes[0].lines if len(set(line.get_ydata())) == 1}
+    flat = {line.get_ydata()[0] for line in figure.axes[0].lines if list(line.get_ydata()) == [line.get_ydata()[0]] * 2}
     assert flat == {-4.2, -12.0}
     assert "oracle" in legend(figure)
     assert "zero torque" not in legend(figure)  # far below, and in words

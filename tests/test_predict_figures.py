@@ -112,6 +112,12 @@ def test_the_line_against_training_time_joins_the_means_of_trainings_that_are_al
     assert line.get_xydata().tolist() == [[580, 4], [2320, 2]]
 
 
+def test_training_time_is_nominal_and_the_line_is_the_budget_that_ships() -> None:
+    figure = figures.training_time({"cost": {TSM: (np.array([580.0]), np.ones(1))}}, ships=580.0)
+    assert figure.axes[0].get_xlabel() == "nominal training time\nof one network (s)"
+    assert figure.legends[0].get_texts()[-1].get_text() == "budget that ships, 580 s"
+
+
 def test_figure5_marks_the_mean_over_seeds_and_its_interval() -> None:
     seeds = np.array([1.0, 2.0, 4.0])
     (ax,) = figures.figure5({"": {ENVS[0]: {TSM: seeds, LSTM: seeds + 1}}}).axes

@@ -95,6 +95,17 @@ def test_a_stamp_names_the_arms_of_which_there_are_fewer_seeds() -> None:
     assert table.stamp(rows, figure=True) == "scale paper, seeds 0, 1, 2 (ReacherPush: 0), n = 100"
 
 
+def test_a_stamp_names_the_worlds_and_the_models_of_which_there_are_fewer_seeds() -> None:
+    common = dict(env="tsm/Reacher-v0", metric="kl", value=1.0, scale="paper", n=100)
+    rows = [dict(common, model="tsm", seed=k) for k in range(3)]
+    rows += [dict(common, model=word, seed=0) for word in ("onestep", "lstm")]
+    rows += [dict(common, model="tsm", noise=0.1, seed=0), dict(common, model="tsm", noise=0.1, delay=5, seed=1)]
+    assert table.stamp(tables_storage.frame(rows).assign(source=table.YOURS), figure=True) == (
+        "scale paper, seeds 0, 1, 2 (Reacher with noise 0.1: 0; Reacher with noise 0.1 and delay 5: 1; "
+        "one-step, LSTM: 0), n = 100; no rows of recurrent TSM"
+    )
+
+
 @pytest.mark.parametrize(("models", "said"), [(["tsm"], True), (["tsm", "rtsm"], False), (["onestep"], False)])
 def test_a_stamp_says_where_our_model_has_no_rows_beside_others_with_codes(models: list[str], said: bool) -> None:
     rows = tables_storage.frame(

@@ -18,7 +18,7 @@ from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import tables
-from tsmlib.study import media, runs, zoo
+from tsmlib.study import drawings, media, runs, zoo
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import table
 
@@ -173,6 +173,23 @@ def test_seeds_are_averaged_target_by_target() -> None:
 
 
 # Tables --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_point_is_a_target_of_a_seed_and_every_model_is_searched_in_one_space() -> None:
+    task = some_task(n=2)
+    common = dict(env=task.env, task=task.name, planner="cem", execution="open loop", scale="paper", n=2)
+    rows = tables.frame([
+        common | dict(model=model, search_space=space, metric=metric, value=-1.0 - k - i, seed=k, target=i)
+        for model in (zoo.OURS, "lstm") for space in ("latent", "direct")
+        for metric in ("return_true", "return_predicted") for k in range(3) for i in range(2)
+    ]).assign(source=table.YOURS)  # fmt: skip
+    drawing = drawings.predicted_and_executed(rows, [task])
+    assert [ax.get_title(loc="left") for ax in drawing.figure.axes] == [
+        "recurrent TSM\nlatent, CEM",
+        "LSTM\nlatent, CEM",
+    ]
+    assert all(len(ax.collections[-1].get_offsets()) == 3 * 2 for ax in drawing.figure.axes)
+    assert table.stamp(drawing.rows, figure=True) == "scale paper, seeds 0, 1, 2, n = 2"
 
 
 def cells(markdown: str) -> list[list[str]]:

@@ -51,7 +51,10 @@ AHEAD = {part: {TSM: precompute(0.1 + 0.02 * i), LSTM: precompute(0.15), KALMAN:
 NOW = {part: {KALMAN: 0.07, SMOOTHED: 0.15} for part in PARTS}
 RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
 ONE_STEP = method("onestep")
-MAP = {"noise 0, delay 5": {ONE_STEP: -1.24, LSTM: 8.0}, "obstacle, after contact": {LSTM: 0.5}}
+MAP = {
+    "noise 0, delay 5": {ONE_STEP: np.array([-1.24]), LSTM: np.array([7.0, 8.0, 9.0])},
+    "obstacle, after contact": {LSTM: np.array([0.5])},
+}
 
 
 def episode(**changed: Any) -> Figure:
@@ -81,7 +84,7 @@ EVERY: dict[str, Callable[[], Figure]] = {
     ),
     "a map": grid,
     "a map of yours alone": lambda: grid({}, MAP),
-    "a map of one cell without a difference": lambda: grid({"plain arm": {LSTM: 0.0}}),
+    "a map of one cell without a difference": lambda: grid({"plain arm": {LSTM: np.zeros(1)}}),
 }
 
 
@@ -200,14 +203,18 @@ def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of
     (image,) = ax.images
     np.testing.assert_array_equal(image.get_array().filled(np.nan), [[-1.24, 8.0], [np.nan, 0.5]])
     assert [text.get_text() for text in ax.get_xticklabels()] == ["against one-step", "against LSTM"]
-    assert [text.get_text() for text in ax.get_yticklabels()] == list(MAP)
+    places = [text.get_text() for text in ax.get_yticklabels()]
+    assert places == ["noise 0, delay 5 (1 to 3 seeds)", "obstacle, after contact (1 seed)"]
     assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
     assert bar.get_ylabel() == "TSM ahead by\n(nats per step)"
 
 
-def test_every_cell_says_its_number_and_yours_in_brackets() -> None:
-    ax = grid(yours={"noise 0, delay 5": {LSTM: 7.0}, "obstacle, after contact": {ONE_STEP: -3.0}}).axes[0]
-    assert [text.get_text() for text in ax.texts] == ["−1.2", "+8.0 (+7.0)", "(−3.0)", "+0.5"]
+def test_every_cell_says_its_mean_half_an_interval_of_several_seeds_and_yours_in_brackets() -> None:
+    yours = {"noise 0, delay 5": {LSTM: np.array([7.0])}, "obstacle, after contact": {ONE_STEP: np.array([-3.0])}}
+    ax = grid(yours=yours).axes[0]
+    half = interval(MAP["noise 0, delay 5"][LSTM])[1]
+    assert [text.get_text() for text in ax.texts] == ["−1.2", f"+8.0 ± {half:.1f} (+7.0)", "(−3.0)", "+0.5"]
+    assert ax.get_xlabel() == "±: half the 95 % interval over seeds; in brackets: yours"
 
 
 # What cannot be drawn ------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from tsmlib.models.baselines import OneStep
 from tsmlib.models.tsm import TSM
 from tsmlib.sampling import Noise
 from tsmlib.storage import tables
-from tsmlib.study import zoo
+from tsmlib.study import drawings, zoo
 from tsmlib.study.predictions import WithoutPastActions
 from tsmlib.study.results import robustness as robustness_results
 from tsmlib.study.results import table
@@ -466,7 +466,7 @@ def scored(model: str, seeds: list[float], env: str = REACHER, subset: str = "")
     return [dict(common, value=value, seed=seed) for seed, value in enumerate(seeds)]
 
 
-def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_a_place_where_nothing_was_scored_is_left_out() -> None:
+def test_an_advantage_is_a_difference_per_pair_of_seeds_and_a_place_where_nothing_was_scored_is_left_out() -> None:
     obstacle, both = "tsm/ReacherObstacle-v0", imperfect(REACHER, noise=NOISE, delay=DELAY)
     noisy = imperfect(obstacle, noise=NOISE)
     rows = [
@@ -478,10 +478,27 @@ def test_an_advantage_is_a_mean_over_pairs_of_seeds_and_a_place_where_nothing_wa
     ]  # fmt: skip
     found = robustness_results.advantage(tables.frame(rows), "tsm", ["onestep", "lstm"], [0.0, 0.25], [0, 5])
     one_step, lstm = zoo.method("onestep"), zoo.method("lstm")
-    assert found == {  # 1 - 0 and 2 - 3; 5 - 2, the only pair; steps after a touch on the arm without noise
-        "noise 0, delay 0": {one_step: 0.0}, "noise 0.25, delay 5": {one_step: 3.0},
-        "obstacle, after contact": {lstm: 2.5},
+    assert {place: {rival: seeds.tolist() for rival, seeds in row.items()} for place, row in found.items()} == {
+        "noise 0, delay 0": {one_step: [1.0, -1.0]}, "noise 0.25, delay 5": {one_step: [3.0]},  # the only pair
+        "obstacle, after contact": {lstm: [2.5]},  # steps after a touch on the arm without noise
     }  # fmt: skip
+
+
+def test_the_map_has_the_seeds_of_each_place_and_of_the_clean_arms_those_of_the_predictions() -> None:
+    noisy, elsewhere = imperfect(REACHER, noise=NOISE), "tsm/ReacherPush-v1"
+    here, clean = list[dict[str, Any]](), list[dict[str, Any]]()
+    for word in ("tsm", "onestep"):
+        here += [*scored(word, [1.0]), *scored(word, [1.0], LATE), *scored(word, [7.0, 8.0], noisy)]
+        clean += [*scored(word, [1.0, 2.0, 3.0]), *scored(word, [4.0], elsewhere)]
+    given = [tables.frame([{**row, "scale": "paper", "n": 9} for row in rows]).assign(source=table.YOURS)
+             for rows in (here, clean)]  # fmt: skip
+    (drawing,) = drawings.advantage_map(*given, "tsm", ["onestep"], [0.0], [0, 5])
+    assert [text.get_text() for text in drawing.figure.axes[0].get_yticklabels()] == [
+        "noise 0, delay 0 (3 seeds)", "noise 0, delay 5 (1 seed)"
+    ]  # fmt: skip
+    assert len(drawing.rows) == 2 * (3 + 1)  # each measurement once, and nothing that is not drawn
+    stamp = table.stamp(drawing.rows, figure=True)
+    assert stamp.startswith("scale paper, seeds 0, 1, 2 (Reacher with delay 5: 0), n = 9")
 
 
 def test_a_threshold_is_reached_or_it_is_not() -> None:

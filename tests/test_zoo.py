@@ -12,6 +12,8 @@ import pytest
 import tsmlib
 from tsmlib import figures, study
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.figures.axes import YOURS
+from tsmlib.figures.planning import MARKERS
 from tsmlib.models.baselines import OneStep
 from tsmlib.storage import artifacts
 from tsmlib.study import runs, zoo
@@ -59,7 +61,14 @@ def test_a_stage_says_all_that_training_takes_from_it() -> None:
 def test_every_model_has_a_look_of_its_own() -> None:
     looks = [spec.look for spec in zoo.ZOO.values()]
     assert len({look.name for look in looks}) == len({look.colour for look in looks}) == len(looks)
-    assert len({zoo.look(word).marker for word in zoo.words("dynamics")}) == len(zoo.words("dynamics"))
+    words = [*zoo.words("dynamics", "ablation"), "pets", "pets+mse"]
+    assert len({zoo.look(word).marker for word in words}) == len(words)
+
+
+def test_a_diamond_is_the_reader_s_own_and_no_model_s() -> None:
+    markers = {look.marker for look in (*(spec.look for spec in zoo.ZOO.values()), *zoo.LOOKS.values())}
+    assert not {"D", "d"} & {*markers, *MARKERS.values()}
+    assert YOURS["marker"] == "D"
 
 
 def test_a_method_is_named_in_words() -> None:

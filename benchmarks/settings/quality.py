@@ -54,6 +54,7 @@ from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 
 HERE = Path(__file__).resolve().parent
+EPISODES = 200  # fresh ones
 FRESH_SEED = 2_000_004  # of episodes that no training, choice or published score has seen
 MEASURES = {  # column -> title and unit; of each a smaller value is better
     "energy_10": "energy score, 10 steps", "energy_80": "energy score, 80 steps", "energy": "energy score, mean",
@@ -240,12 +241,24 @@ def tables(every: pd.DataFrame) -> str:
     return "\n\n".join(parts)
 
 
+def stamp(lines: pd.DataFrame) -> str:
+    """What the figure's lines are of, below it: training seeds, networks, episodes and targets."""
+    seeds, targets = (", ".join(map(str, sorted(set(lines[name])))) for name in ("seed", "targets"))
+    return (
+        f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed{'s' * (lines['seed'].nunique() > 1)} {seeds}; "
+        f"one network each, of a recurrent TSM one decoder; predictions: n = {EPISODES} fresh episodes, plans and "
+        f"violations: n = {targets} validation targets"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("measure", "together", "table", "figure"))
     parser.add_argument("files", nargs="*", type=Path, help="trained models")
     parser.add_argument("--targets", type=int, default=100, help="of validation (default 100)")
-    parser.add_argument("--episodes", type=int, default=200, help="fresh ones, to score predictions of (default 200)")
+    parser.add_argument(
+        "--episodes", type=int, default=EPISODES, help="fresh ones, to score predictions of (default 200)"
+    )
     parser.add_argument("--out", type=Path, default=HERE / "quality.csv", help="default quality.csv beside this script")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -276,7 +289,7 @@ def main() -> None:
             for name, title in MEASURES.items()
         }
         figure = drawings.training_time(curves, ships=zoo.BUDGET["ReacherPush"])
-        style.save(figure, runs.ROOT / "figures" / "training_time")
+        style.save(style.stamp(figure, stamp(lines)), runs.ROOT / "figures" / "training_time")
 
 
 if __name__ == "__main__":

@@ -86,6 +86,12 @@ def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
     }
 
 
+def typical(actions: Tensor) -> int:
+    """Index of the plan of median size among torques (B, T, du): by ``change`` of ``roughness``, of two middle ones the
+    smaller, of equal ones the first."""
+    return int(roughness(actions)["change"].argsort(stable=True)[(len(actions) - 1) // 2])
+
+
 def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
     """Distance (B,) of plans (B, T, du) from the training torques (N, T', du).
 

@@ -113,11 +113,17 @@ def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
     return codes
 
 
-def window_at(seen: SampledFutures, features: Features, quantile: float) -> Window:
-    """The window (N = 1) at a quantile, from 0 to 1, of the spread of samples."""
-    spread = deviations(seen, features)[0].mean(1)
-    i = int(spread.argsort()[min(int(quantile * len(spread)), len(spread) - 1)])
-    return Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
+def widest(seen: SampledFutures, model: Coded, codes: Tensor, steps: int) -> Window:
+    """The window (N = 1) in which the object's place after ``steps`` differs most under some codes (n, dz): by the
+    largest distance from that under the first of them; of equal windows the first."""
+    windows = [_alone(seen.window, i) for i in range(len(seen.window.past.states))]
+    ends = torch.stack([decode_codes(model, one, codes, steps)[:, -1, BLOCK] for one in windows])  # (N, n, 2)
+    return windows[int((ends - ends[:, :1]).norm(dim=-1).amax(1).argmax())]
+
+
+def _alone(window: Window, i: int) -> Window:
+    """One of several windows."""
+    return Window(*(Segment(*(part[i : i + 1] for part in side)) for side in window))
 
 
 @torch.no_grad()

@@ -24,8 +24,8 @@ WALK = mpl.colormaps["viridis"]
 def figure10(plans: Mapping[Method, np.ndarray], dt: float, changes: Mapping[Method, float]) -> Figure:
     """Torques over time (paper, figure 10): method -> (T, 2) in [-1, 1], four to a row, torques on one scale.
 
-    changes: method -> mean change of torque from step to step of all its plans, as a share of the data's, which goes
-    without saying for the data.
+    plans: of each method an example; changes: method -> mean change of torque from step to step of all its plans, as a
+    share of the data's, which goes without saying for the data.
     """
     plans = {method: shaped(method.label, actions, "T 2") for method, actions in plans.items()}
     figure, axes = panels(len(plans), 4, 1.3, sharex="row", sharey=True)
@@ -35,7 +35,8 @@ def figure10(plans: Mapping[Method, np.ndarray], dt: float, changes: Mapping[Met
         ax.set_ylim(-1.4 * limit, 1.08 * limit)  # the note stands below all torques
         ax.set_title(f"{method.look.name}\n{', '.join(method.how)}", fontsize=7)
         if method.model != "data":
-            style.note(ax, f"mean |Δu|: {changes[method]:.2f} × data's", 0.98, 0.02)
+            every = "draws" if method.model == "prior" else "plans"
+            style.note(ax, f"all {every}: |Δu| {changes[method]:.2f} × data's", 0.98, 0.02)
     style.torque_labels(figure)
     style.joint_legend(figure)
     return figure

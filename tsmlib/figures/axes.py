@@ -132,6 +132,16 @@ def curve(
         ax.fill_between(at, lower, mean + half, color=look["color"], alpha=0.11, lw=0, zorder=2)
 
 
+def bars(ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, main: str) -> None:
+    """Intervals as thin bars at ``at``; where one leaves its panel, an arrow."""
+    low, high = ax.get_ylim()
+    ends = np.clip(mean - half, low, high), np.clip(mean + half, low, high)
+    ax.vlines(at, *ends, color=main, lw=0.8, zorder=2)
+    for side, gone in ((-1, mean - half < low), (1, mean + half > high)):
+        for x in at[gone]:
+            arrow(ax, "y", x, side, main)
+
+
 def outside(ax: Axes, at: np.ndarray, mean: np.ndarray, method: Method) -> list[str]:
     """Arrows where a line leaves its panel, and its furthest values in words."""
     low, high = ax.get_ylim()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from tsmlib.figures.style import WIDTH, legend, styled
+from tsmlib.figures.style import WIDTH, entry, legend, styled
 
 VERDICTS = {  # verdict -> colour
     "REPLICATED": "#009E73", "READING-DEPENDENT": "#E69F00", "INCONCLUSIVE": "#7A7A7A", "NOT REPLICATED": "#D55E00",
@@ -18,20 +19,21 @@ VERDICTS = {  # verdict -> colour
 
 
 @styled
-def claim_margins(claims: Sequence[tuple[str, str, str, np.ndarray, np.ndarray]]) -> Figure:
+def claim_margins(claims: Sequence[tuple[str, str, str, str, np.ndarray, np.ndarray]]) -> Figure:
     """Every effect against its margin, a row per claim: the margin is the line, the claimed side tinted.
 
-    claims: id, verdict, the deciding effect in words, how far estimate and ends of the interval of each effect (n, 3)
-    lie beyond the margin, the deciding one last, and how far each of its training seeds does; ends that are NaN are no
-    interval. Each effect has a scale of its own, to the furthest end: the further out the estimate, the surer. Thick is
-    the one that decides, with its seeds as ticks; an open mark has no interval. ValueError without claims.
+    claims: id, what the paper says, verdict, the deciding effect in words, how far estimate and ends of the interval of
+    each effect (n, 3) lie beyond the margin, the deciding one last, and how far each of its training seeds does; ends
+    that are NaN are no interval. Each effect has a scale of its own, to the furthest end: the further out the estimate,
+    the surer. Thick is the one that decides, with its seeds as ticks; an open mark has no interval, since it is of one
+    training seed. What the paper says stands to the left, over two lines where it is long. ValueError without claims.
     """
     if not claims:
         raise ValueError("no claim has rows: nothing to draw")
-    figure, ax = plt.subplots(figsize=(WIDTH, 0.17 * len(claims) + 0.75))
+    figure, ax = plt.subplots(figsize=(WIDTH + 1.6, 0.2 * len(claims) + 0.75))
     ax.axvspan(0, 1.05, color="#EEF6F2", lw=0, zorder=0)
     ax.axvline(0, color="#555555", lw=0.8, zorder=1)
-    for y, (_, verdict, text, beyond, seeds) in enumerate(claims):
+    for y, (_, _, verdict, text, beyond, seeds) in enumerate(claims):
         furthest = np.maximum(np.fmax.reduce(np.abs(beyond), axis=1, keepdims=True), 1e-300)
         furthest[-1] = np.fmax.reduce(np.abs(seeds), initial=furthest[-1, 0])
         scaled = beyond / furthest
@@ -45,16 +47,21 @@ def claim_margins(claims: Sequence[tuple[str, str, str, np.ndarray, np.ndarray]]
                     mfc="white" if np.isnan(low) else colour)  # fmt: skip
         ax.annotate(text, (1, y), (4, 0), ("axes fraction", "data"), "offset points", va="center", fontsize=5.5,
                     color="#444444")  # fmt: skip
-    ax.set_yticks(range(len(claims)), [claim for claim, *_ in claims], fontsize=6)
+    ax.set_yticks(range(len(claims)), [textwrap.fill(f"{claim}  {says}".strip(), 60) for claim, says, *_ in claims],
+                  fontsize=5.5, linespacing=1.0, ha="left")  # fmt: skip
     ax.set(xlim=(-1.05, 1.05), ylim=(len(claims) - 0.5, -0.5), xticks=[-1, 0, 1])
     ax.set_xticklabels(["against the claim", "margin", "for it"])
-    ax.tick_params(axis="y", length=0)
+    ax.tick_params(axis="y", length=0, pad=172)  # points: the width of 60 letters
     ax.spines["left"].set_visible(False)
-    given = {verdict for _, verdict, *_ in claims}
+    given = {verdict for _, _, verdict, *_ in claims}
     marks = [
         Line2D([], [], color=VERDICTS[word], marker="o", ms=3.4, label=word.lower())
         for word in VERDICTS
         if word in given
     ]
+    grey = "#444444"
+    if any(np.isnan(beyond[:, 1]).any() for *_, beyond, _ in claims):
+        marks.append(entry("no interval: one training seed", color=grey, marker="o", ms=3.4, mfc="white", ls=""))
+    marks.append(entry("one training seed of the effect that decides", color=grey, marker="|", ms=6, mew=0.6, ls=""))
     legend(figure, marks)
     return figure

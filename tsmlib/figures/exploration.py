@@ -9,6 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 from tsmlib.figures import axes
 from tsmlib.figures.checks import finite, per_panel, shaped
@@ -20,37 +22,41 @@ Rounds = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -
 
 @styled
 def rounds(curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None = None) -> Figure:
-    """What was measured after each round, against environment steps: mean over seeds, band for the 95 % t interval.
+    """What was measured after each round, against environment steps: mean over seeds, bars for the 95 % t interval.
 
     curves: title -> method -> environment steps (R,) and values (k, R); ylabel: one for all, or title -> text; yours:
-    as curves, drawn over them as hollow diamonds. A line begins before the first round.
+    as curves, drawn over them as hollow diamonds. A line begins before the first round. Marks of methods at the same
+    steps stand a little beside each other, so that their bars part.
     """
     own, every = yours or {}, {title: {**(yours or {}).get(title, {}), **rows} for title, rows in curves.items()}
     look_of, ylabels = axes.looks(curves, own), per_panel("ylabel", ylabel, curves)
     width = WIDTH if len(curves) > 1 else 3.8
     figure, grid = panels(len(curves), len(curves), 2.0, width=width, head=0)
-    banded = False
+    barred, far = False, max(float(at.max()) for rows in every.values() for at, _ in rows.values())
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
         values = np.concatenate([np.ravel(found) for _, found in every[title].values()])
         ax.set_ylim(axes.limits(values, values))
         notes = []
-        for i, (method, given) in enumerate(rows.items()):
+        for method, given in rows.items():
             at, found = _checked(f"{title}, {method.label}", *given)
             mean, half = axes.band(found)
-            axes.curve(ax, at, mean, half, look_of[method] | {"ms": 4.5}, shift=i / max(1, len(rows)))
-            notes += axes.outside(ax, at, mean, method)
-            banded |= bool(half.any())
+            beside = at + 0.012 * far * ([*look_of].index(method) - (len(look_of) - 1) / 2)
+            axes.bars(ax, beside, mean, half, method.look.colour)
+            ax.plot(beside, mean, **look_of[method] | {"ms": 4.5}, zorder=3 if len(at) > 1 else 4)
+            notes += axes.outside(ax, beside, mean, method)
+            barred |= bool(half.any())
         for method, given in own.get(title, {}).items():
             at, found = _checked(f"{title}, {method.label}, yours", *given)
             notes += axes.diamonds(ax, "y", at, found.mean(0), method)
-        ax.set_xlim(left=0)
+        ax.set_xlim(0, 1.05 * far)
         ax.locator_params(axis="x", nbins=5)
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: f"{steps:,.0f}"))
         ax.grid(axis="y", color=GRID, lw=0.6)
         ax.set(title=title, ylabel=ylabels[title])
         axes.foot(ax, "environment steps", notes, width / len(curves) - 0.5)
     handles = axes.entries(look_of)
-    if banded:
-        handles.append(entry("95 % interval over seeds", color="#DDDDDD", lw=5, solid_capstyle="butt"))
+    if barred:
+        handles.append(_bar())
     return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 3 if len(curves) > 1 else 2)
 
 
@@ -59,31 +65,41 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
     """Errors of adapted models against the episodes that they know of the changed robot, on logarithmic axes.
 
     curves: title -> way -> episodes (R,) and errors (k, R), all above 0; yours: as curves, drawn over them as hollow
-    diamonds. Mean over seeds, bars for the 95 % t interval.
+    diamonds. Mean over seeds, bars for the 95 % t interval; marks at the same number of episodes stand a little beside
+    each other.
     """
     own, look_of = yours or {}, axes.looks(curves, yours or {})
     figure, grid = panels(len(curves), len(curves), 2.1, head=0, sharex=True, sharey=True)
-    every = [found for rows in (*curves.values(), *own.values()) for found in rows.values()]
-    points, ticks = np.concatenate([np.ravel(y) for _, y in every]), sorted({float(x) for at, _ in every for x in at})
+    given = [found for rows in (*curves.values(), *own.values()) for found in rows.values()]
+    every, ticks = [y for _, y in given], sorted({float(x) for at, _ in given for x in at})
+    points = np.concatenate([np.ravel(found) for found in every])
+    limits = axes.limits(points, axes.ends(column for found in every for column in found.T), log=True)
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
-        axes.log_axis(ax, *axes.limits(points, points, log=True))
+        axes.log_axis(ax, *limits)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.set_ylim(limits)
         ax.set_xscale("symlog", linthresh=5)
         ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         ax.minorticks_off()
-        for way, given in rows.items():
-            at, found = _checked(f"{title}, {way.label}", *given)
+        for way, row in rows.items():
+            at, found = _checked(f"{title}, {way.label}", *row)
             mean, half = axes.band(found)
-            low = np.minimum(half, 0.9 * mean)  # the axis is logarithmic
-            ax.errorbar(at, mean, (low, half), **look_of[way] | {"ms": 5}, elinewidth=1, capsize=2)
-        for way, given in own.get(title, {}).items():
-            at, found = _checked(f"{title}, {way.label}, yours", *given)
+            beside = at * 1.06 ** ([*look_of].index(way) - (len(look_of) - 1) / 2)
+            axes.bars(ax, beside, mean, half, way.look.colour)
+            ax.plot(beside, mean, **look_of[way] | {"ms": 5.5, "mew": 1}, zorder=3)
+        for way, row in own.get(title, {}).items():
+            at, found = _checked(f"{title}, {way.label}, yours", *row)
             axes.diamonds(ax, "y", at, found.mean(0), way)
         ax.grid(axis="y", color=GRID, lw=0.6)
         ax.set(title=title, xlabel="episodes of the changed arm")
     grid[0].set_ylabel(ylabel)
-    bars = [entry("95 % interval over seeds", color=DARK, lw=1, marker="|", ms=8)] * any(len(y) > 1 for _, y in every)
+    bars = [_bar()] * any(len(found) > 1 for found in every)
     handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
     return axes.finish(figure, [grid], handles, 4)
+
+
+def _bar() -> Line2D:
+    return entry("95 % interval over seeds", color=DARK, ls="", marker="|", ms=8, mew=0.8)
 
 
 def _checked(word: str, at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

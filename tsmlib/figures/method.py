@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 SEARCH_SPACES = ("latent", "direct")  # Eq. 3 and Eq. 2
+Marker = str | tuple[int, int, float]  # matplotlib's: a letter, or corners, kind and angle
 PLANNERS = {"adam": "Adam", "adam+starts": "Adam from samples", "cem": "CEM", "mppi": "MPPI"}
 
 
 @dataclass(frozen=True)
 class Look:
-    """The name of a model as the reader meets it, and its colour and marker in every figure."""
+    """The name of a model as the reader meets it, and its colour and marker in every figure.
+
+    marker: matplotlib's; no diamond, which is the reader's own (``axes.YOURS``).
+    """
 
     name: str
     colour: str
-    marker: str = "o"
+    marker: Marker = "o"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from tsmlib.statistics import interval
 
 Results = Mapping[str, Mapping[Method, Mapping[str, np.ndarray | None]]]  # task -> method -> {"true", "predicted"}
 FLOORS = ("zero", "random")
-MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "D"}  # planner -> marker
+MARKERS = {"adam": "o", "adam+starts": "v", "cem": "s", "mppi": "^", "policy": "p"}  # planner -> marker
 
 
 Returns = tuple[np.ndarray, np.ndarray | None]  # executed and predicted (n,)
@@ -195,9 +195,9 @@ def _title(ax: Axes, method: Method) -> None:
 
 @styled
 def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
-    """Predicted against executed returns, one dot per target (mean over seeds); the line to the diagonal is the gap.
+    """Predicted against executed returns, one dot per target and training seed; the line to the diagonal is the gap.
 
-    results and yours as in ``figure6``; methods without predictions are left out.
+    results and yours as in ``figure6``, but n plans of any targets and seeds; methods without predictions are left out.
     """
     published, own = (
         {task: {method: (true, told) for method, (true, told) in rows.items() if told is not None}
@@ -224,8 +224,8 @@ def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
         for i, (method, ((true, predicted), (mine, told))) in enumerate(rows.items()):
             ax, main = figure.add_subplot(grid[first + i // columns, i % columns]), method.look.colour
             ax.plot(limits, limits, color="#999999", lw=0.7, zorder=1)
-            ax.vlines(true, true, predicted, color=tint(main, 0.35), lw=0.6, zorder=2)
-            ax.scatter(true, predicted, s=7, color=main, linewidths=0, zorder=3)
+            ax.vlines(true, true, predicted, color=tint(main, 0.3), lw=0.4, zorder=2)
+            ax.scatter(true, predicted, s=5, color=main, alpha=0.7, linewidths=0, zorder=3)
             ax.plot(mine, told, **YOURS, color=DARK, zorder=4)
             _title(ax, method)
             gaps = {"mean gap": predicted - true, "yours": told - mine}
@@ -235,7 +235,7 @@ def predicted_vs_true(results: Results, yours: Results | None = None) -> Figure:
                    xlabel="executed return (m)" if i + columns >= len(rows) else "",
                    ylabel="" if i % columns else f"{task.capitalize()}: predicted return (m)")  # fmt: skip
             ax.locator_params(nbins=5)
-    dot = entry("one target, mean over training seeds", color=DARK, ls="", marker="o", ms=2.6, mew=0)
+    dot = entry("one target of one training seed", color=DARK, ls="", marker="o", ms=2.6, mew=0)
     diagonal = entry("executed as predicted", color="#999999", lw=0.7)
     gap = entry("gap", color=PALE, ls="", marker="|", ms=7)
     return finish(figure, [], [dot, diagonal, gap, *yours_entry(*own.values())], 4)

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from tsmlib.figures import axes
 from tsmlib.figures.checks import finite, known
 from tsmlib.figures.method import SEARCH_SPACES, Method
-from tsmlib.figures.style import DARK, DASHED, GRID, WIDTH, Props, entry, note, styled
+from tsmlib.figures.style import DARK, DASHED, GRID, WIDTH, Props, entry, styled
 
 Curves = dict[str, np.ndarray]
 LearningCurves = Mapping[str, Mapping[Method, Mapping[str, np.ndarray]]]  # task -> method -> Curves
@@ -24,7 +24,8 @@ References = Mapping[str, Mapping[Method, float]]  # task -> method -> return
 AXES = {"steps": "steps in the model", "samples": "environment steps, the model's data included",
         "seconds": "seconds, training of the model included"}  # fmt: skip
 FREE = "; without a model, in the environment"  # more on the first of AXES
-PREDICTED: Props = {"ls": DASHED, "lw": 0.7}
+PREDICTED: Props = {"ls": DASHED, "lw": 0.6, "alpha": 0.7}
+STRIP = "#F4F4F4"
 
 
 @styled
@@ -34,18 +35,19 @@ def figure7(
 ) -> Figure:  # fmt: skip
     """Learning curves of policies (paper, figure 7): a column for each task, a row for each quantity of ``against``.
 
-    curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets in m, and of
-    {"steps", "samples", "seconds": (R,)} what is known of it, "return_predicted": (k, R) of the model. steps: in the
-    model that a policy learns in, or else in the environment; samples: in the environment, those of the model's data
-    included. A method is drawn in the rows that it has numbers for. references: task -> oracle, zero or random torques
-    -> return, drawn as lines.
+    curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets in m, of k
+    copies of a policy or, without a model, of k training seeds, and of {"steps", "samples", "seconds": (R,)} what is
+    known of it, "return_predicted": (k, R) of the model. steps: in the model that a policy learns in, or else in the
+    environment; samples: in the environment, those of the model's data included. A method is drawn in the rows that it
+    has numbers for. references: task -> oracle, zero or random torques -> return, drawn as lines.
 
-    A model has one colour and marker; latent policies are filled and thick, direct ones open. Lines are means, bands
-    their 95 % t intervals over the k. Against steps, dashes show the predicted return. A policy whose samples are a
-    data set that never grows is a point there, at its end, and a faint line to the right of it; such points stand side
-    by side, right of a line that says how many they all are. Seconds are on a logarithmic axis from 1 s. The range of
-    returns is that of the ends and what lies near them; where curves begin, and references outside, stand in words
-    below. yours: as curves, drawn over them as hollow diamonds.
+    A model has one colour and marker; latent policies are filled and thick, direct ones open. Lines are means; against
+    steps, dashes show the predicted return. Ends of curves stand once more in a strip beside the axis of steps, with
+    bars for their 95 % t intervals over the k. A policy whose samples are a data set that never grows has no curve
+    against these: its end and interval stand in a strip, whose one tick says how many they are, as a line on the axis
+    does. Seconds are on a logarithmic axis from 1 s. The range of returns is that of the ends and what lies near them;
+    where curves begin, and references outside, stand in words below. yours: as curves, drawn over them as hollow
+    diamonds.
     """
     return _draw(curves, references or {}, against, yours=yours)
 
@@ -57,8 +59,8 @@ def figure8(
     """Learning curves of policies with noise and with delay beside the clean arm (paper, figure 8), one scale for all.
 
     curves: condition -> method -> {"return_true": (k, R), "steps": (R,)}, steps in the model; references: zero or
-    random torques -> return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals. yours: as
-    curves, drawn over them as hollow diamonds.
+    random torques -> return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals over the k
+    copies of a policy. yours: as curves, drawn over them as hollow diamonds.
     """
     every = dict.fromkeys({**curves, **(yours or {})}, references or {})
     return _draw(curves, every, ("steps",), sharey=True, yours=yours)
@@ -68,7 +70,7 @@ def _draw(
     curves: LearningCurves, references: References, against: Sequence[str], sharey: bool = False,
     yours: LearningCurves | None = None,
 ) -> Figure:  # fmt: skip
-    """``figure7``; sharey: one scale of returns for all columns, from doing nothing on."""
+    """``figure7``; sharey: one scale of returns for all columns, from doing nothing on, and bands in place of bars."""
     known("against", against, list(AXES))
     known("references", references, [*curves, *(yours or {})])
     checked, own = (
@@ -78,7 +80,7 @@ def _draw(
     checked = {task: checked.get(task, {}) for task in {**checked, **own}}
     look_of = {method: _look(method, look) for method, look in axes.looks(checked, own).items()}
     levels = {task: axes.references(references.get(task, {})) for task in checked}
-    size = (WIDTH if len(checked) > 1 else 3.8, 1.75 * len(against) + 0.1)
+    size = (WIDTH if len(checked) > 1 else 3.8, (1.75 if sharey else 2.25) * len(against) + 0.1)
     figure, grid = plt.subplots(
         len(against), len(checked), figsize=size, squeeze=False, sharey=True if sharey else "col"
     )
@@ -93,7 +95,8 @@ def _draw(
             drawn, over = ({method: part[method] for method in look_of if word in part.get(method, {})}
                            for part in (rows, mine))  # fmt: skip
             below = [] if sharey else _below(ax, levels[task], [*drawn.values(), *over.values()], word)
-            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.3, over, below)
+            _panel(ax, word, drawn, look_of, WIDTH / len(checked) - 0.3, over, below, banded=sharey,
+                   barred=not sharey and (word != "seconds" or [*against] == ["seconds"]))  # fmt: skip
     for row in grid:
         row[0].set_ylabel("executed return (m)")
     every = [row for part in (checked, own) for rows in part.values() for row in rows.values()]
@@ -108,8 +111,12 @@ def _draw(
     handles += [entry(method.look.name, **axes.reference_look(method)) for method in used]
     if "steps" in against and any({"return_predicted", "steps"} <= row.keys() for row in every):
         handles.append(entry("predicted return", color="#777777", **PREDICTED))
-    if any(len(row["return_true"]) > 1 for row in every):
-        handles.append(entry("95 % interval", color="#DDDDDD", lw=5, solid_capstyle="butt"))
+    if "samples" in against and any(_fixed(row) for row in every):
+        handles.append(entry("steps in the models' data", color="#BBBBBB", ls="", marker="|", ms=8, mew=0.8))
+    if over_what := _over(checked):
+        bar: Props = {"color": DARK, "ls": "", "marker": "|", "ms": 8, "mew": 0.8}
+        shade: Props = {"color": "#DDDDDD", "lw": 5, "solid_capstyle": "butt"}
+        handles.append(entry(f"95 % interval over {over_what}", **(shade if sharey else bar)))
     handles += axes.yours_entry(*own.values())
     return axes.finish(figure, grid, handles, 5 if len(checked) > 1 else 2)
 
@@ -126,7 +133,7 @@ def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, 
         ends = np.array([*(mean[-1] for mean in means), *(max(own.values()) for own in levels.values() if own)])
         low, high = axes.limits(ends, ends)
         start = min(low, *(mean[0] for mean in means)) - 0.1 * (high - low)
-        return max(low - 1.2 * (high - low), start), high + 0.1 * (high - low)
+        return max(low - 0.6 * (high - low), start), high + 0.3 * (high - low)
     every = np.concatenate(means)
     low, high = axes.limits(every, every, also=floors)
     return max(low, min(floors) - 0.35 * (high - min(floors))) if floors else low, high
@@ -142,42 +149,81 @@ def _below(ax: Axes, levels: Mapping[Method, float], drawn: Sequence[Curves], wo
     return [", ".join(words)] if words else []
 
 
+def _fixed(row: Curves) -> bool:
+    """Whether a policy was learned from a data set that never grows."""
+    return "samples" in row and np.ptp(row["samples"]) == 0
+
+
+def _over(checked: Mapping[str, Mapping[Method, Curves]]) -> str:
+    """What intervals are over, in words: copies of a policy, and of one learned without a model training seeds."""
+    every = [(method, len(row["return_true"])) for rows in checked.values() for method, row in rows.items()]
+    said = []
+    for word, free in (("copies of a policy", False), ("seeds without a model", True)):
+        counts = sorted({k for method, k in every if bool(method.search_space) is not free and k > 1})
+        said += [f"{' to '.join(map(str, counts))} {word}"] * bool(counts)
+    return ", ".join(said)
+
+
 def _panel(
     ax: Axes, word: str, drawn: Mapping[Method, Curves], look_of: Mapping[Method, Props], inches: float,
-    over: Mapping[Method, Curves], below: Sequence[str],
+    over: Mapping[Method, Curves], below: Sequence[str], banded: bool, barred: bool,
 ) -> None:  # fmt: skip
-    """Curves against one quantity, a key of AXES; ``over`` them diamonds. below: what is already said to lie there."""
-    far, notes = _scale(ax, word, [row[word] for row in (*drawn.values(), *over.values())]), list(below)
-    points = [method for method, row in drawn.items() if word == "samples" and np.ptp(row[word]) == 0]
+    """Curves against one quantity, a key of AXES; ``over`` them diamonds. below: what is already said to lie there.
+
+    banded: with bands for intervals; barred: with bars for those of the ends, beside the axis where it counts steps.
+    """
+    rows, notes = [*drawn.values(), *over.values()], list(below)
+    far = _scale(ax, word, [row[word] for row in rows])
+    fixed = [method for method in look_of if word == "samples" and _fixed(drawn.get(method, over.get(method, {})))]
+    beside = [method for method in look_of if method in drawn] if word == "steps" and barred else fixed
+    sizes = sorted({float(row[word][0]) for row in rows if word == "samples" and _fixed(row)})
+    strip = _strip(ax, far, beside, sizes) if beside else {}
     for i, (method, row) in enumerate(drawn.items()):
         look, at, (mean, half) = look_of[method], row[word], axes.band(row["return_true"])
         if word == "seconds":
             at, mean, half = (part[at >= 1] for part in (at, mean, half))
-        if method in points:
-            if method is points[0]:
-                ax.axvline(at[-1], color="#CCCCCC", lw=0.6, zorder=1)
-                told = f"line: data of the models, {_spelled(at[-1], far)}\nright of it, side by side: their policies"
-                note(ax, told, 0.02 if at[-1] > far / 2 else 0.98, 0.02)  # where no curve begins
-            at, mean, half = at[-1:] + 0.018 * far * (1 + points.index(method)), mean[-1:], half[-1:]
-            ax.plot([at[0], far], [mean[0]] * 2, color=look["color"], lw=0.5, alpha=0.6, zorder=2)
-            ax.vlines(at, mean - half, mean + half, color=look["color"], lw=0.7, alpha=0.5, zorder=3)
-            ax.plot(at, mean, **{**look, "ls": ""}, zorder=4)
-        else:
-            axes.curve(ax, at, mean, half, look, shift=i / len(drawn))
+        ended = 0.0 if word == "seconds" else 0.01 * far * (1 + sum(m not in strip for m in [*drawn][:i]))
+        place = np.array([strip.get(method, at[-1] + ended)])
+        if method not in fixed:
+            axes.curve(ax, at, mean, half if banded else np.zeros(len(at)), look, shift=i / len(drawn))
+        if method in strip:
+            ax.plot(place, mean[-1:], **{**look, "ls": ""}, zorder=4)
+        if barred and half[-1]:
+            axes.bars(ax, place, mean[-1:], half[-1:], look["color"])
         if word == "steps" and "return_predicted" in row:
             ax.plot(at, row["return_predicted"].mean(0), color=look["color"], **PREDICTED, zorder=2.5)
-        notes += axes.outside(ax, at[-1:], mean[-1:], method) if below else axes.outside(ax, at, mean, method)
+        at = place if method in fixed else at
+        far_off = slice(-1, None) if below or method in fixed else slice(None)
+        notes += axes.outside(ax, at[far_off], mean[far_off], method)
     for method, row in over.items():
         at, mean = row[word], row["return_true"].mean(0)
         some = np.unique(np.linspace(0, len(at) - 1, 6).astype(int))
         if below:  # where curves begin is said
             some = some[mean[some] >= ax.get_ylim()[0]] if (mean[some] >= ax.get_ylim()[0]).any() else some[-1:]
-        if word == "samples" and np.ptp(at) == 0:
-            some = some[-1:]
+        if method in fixed:
+            at, some = np.full(len(at), strip[method]), np.array([len(at) - 1])
         notes += axes.diamonds(ax, "y", at[some], mean[some], method)
     ax.grid(axis="y", color=GRID, lw=0.6)
     free = word == "steps" and any(not method.search_space for method in (*drawn, *over))
     axes.foot(ax, AXES[word] + FREE * free, notes, inches)
+
+
+def _strip(ax: Axes, far: float, beside: Sequence[Method], sizes: Sequence[float]) -> dict[Method, float]:
+    """A strip beside a linear axis that ends at ``far``, and where each method stands in it: ends of curves, or of
+    policies whose models' data have some ``sizes``, which its one tick says, and lines on the axis."""
+    low, start, step = ax.get_xlim()[0], 1.07 * far, 0.035 * far
+    end = start + step * (len(beside) + 1)
+    ticks = [tick for tick in ax.xaxis.get_major_locator().tick_values(0, far) if 0 <= tick <= far]
+    said = " to ".join(dict.fromkeys(_spelled(size, far) for size in (*sizes[:1], *sizes[-1:])))
+    label = f"models,\n{said} steps" if sizes else "ends"
+    ax.set_xticks([*ticks, (start + end) / 2], [*(_spelled(tick, far) for tick in ticks), label])
+    ax.xaxis.get_major_ticks()[-1].tick1line.set_visible(False)
+    ax.axvspan(start, end, color=STRIP, lw=0, zorder=0)
+    ax.set_xlim(low, end)
+    ax.spines["bottom"].set_bounds(low, 1.02 * far)
+    for size in sizes:
+        ax.axvline(size, color="#BBBBBB", lw=0.8, zorder=1)
+    return {method: start + step * (i + 1) for i, method in enumerate(beside)}
 
 
 def _checked(field: str, given: Mapping[str, np.ndarray]) -> Curves:

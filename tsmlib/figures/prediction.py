@@ -77,7 +77,8 @@ def training_time(
     """Measures against the time that training took, one panel each, both axes logarithmic; one training a mark.
 
     curves: title -> method -> seconds (k,) and values (k,), positive; the line is that of the means where a time was
-    trained for more than once. ships: the seconds that shipped models took, a dashed line.
+    trained for more than once. seconds: nominal, of one network, of which a model may have several. ships: the budget
+    in seconds by which a network that ships is trained, a dashed line.
     """
     figure, grid = panels(len(curves), 4, 1.6)
     look_of = axes.looks(curves)
@@ -98,10 +99,10 @@ def training_time(
         if ships is not None:
             ax.axvline(ships, color=DARK, ls=DASHED, lw=0.7, zorder=1)
     for ax in grid[-4:]:
-        ax.set_xlabel("training (s)")
+        ax.set_xlabel("nominal training time\nof one network (s)")
     handles = axes.entries(look_of, ms=4)
     if ships is not None:
-        handles.append(entry("as shipped", color=DARK, ls=DASHED, lw=0.7))
+        handles.append(entry(f"budget that ships, {ships:,.0f} s", color=DARK, ls=DASHED, lw=0.7))
     return axes.finish(figure, [grid], handles, 6)
 
 

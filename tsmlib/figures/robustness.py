@@ -16,6 +16,7 @@ from tsmlib.figures import axes
 from tsmlib.figures.checks import Panels, finite, finite_panels
 from tsmlib.figures.method import Method
 from tsmlib.figures.style import BLUE, DARK, ORANGE, PALE, WIDTH, Props, entry, legend, panels, styled, tint
+from tsmlib.statistics import interval
 
 
 @styled
@@ -91,40 +92,51 @@ def filtering_errors(
 
 
 @styled
-def advantage_map(
-    differences: Mapping[str, Mapping[Method, float]],
-    subject: Method,
-    *,
-    unit: str,
-    yours: Mapping[str, Mapping[Method, float]] | None = None,
-) -> Figure:
+def advantage_map(differences: Panels, subject: Method, *, unit: str, yours: Panels | None = None) -> Figure:
     """Advantage of ``subject`` over its rivals where something is hidden and where nothing is: a line each.
 
-    differences: place -> rival -> how far the model is ahead, in ``unit``; above zero it is. yours: the same, in
-    brackets. Places without numbers are left out by whoever gives them.
+    differences: place -> rival -> how far the model is ahead, in ``unit``, by training seed (k,); above zero it is. A
+    cell is coloured by their mean and says it, with half the 95 % t interval where there are several; beside a place
+    stands how many there are. yours: the same, means in brackets. Places without numbers are left out by whoever gives
+    them.
     """
-    yours = yours or {}
-    places = list(dict.fromkeys([*differences, *yours]))
-    rivals = list(dict.fromkeys(m for part in (differences, yours) for row in part.values() for m in row))
+    checked, own = finite_panels(differences, "k"), finite_panels(yours or {}, "k")
+    places = list(dict.fromkeys([*checked, *own]))
+    rivals = list(dict.fromkeys(m for part in (checked, own) for row in part.values() for m in row))
     if not rivals:
         raise ValueError("differences holds no place with a rival: nothing to draw")
     values, mine = (
-        np.array([[part.get(place, {}).get(rival, np.nan) for rival in rivals] for place in places])
-        for part in (differences, yours)
-    )
+        np.array([[part[place][rival].mean() if rival in part.get(place, {}) else np.nan for rival in rivals]
+                  for place in places])
+        for part in (checked, own)
+    )  # fmt: skip
     shade = np.where(np.isnan(values), mine, values)
     far = float(np.nanmax(np.abs(shade), initial=0)) or 1.0
-    figure, ax = plt.subplots(figsize=(1.1 * len(rivals) + 2.4, 0.27 * len(places) + 0.55))
+    figure, ax = plt.subplots(figsize=(1.25 * len(rivals) + 2.8, 0.27 * len(places) + 0.55))
     image = ax.imshow(shade, cmap="PuOr", norm=TwoSlopeNorm(0.0, -far, far), aspect="auto")
-    for at, value in np.ndenumerate(values):
-        texts = [form.format(each) for form, each in (("{:+.1f}", value), ("({:+.1f})", mine[at])) if each == each]
-        ax.text(at[1], at[0], " ".join(texts).replace("-", "\u2212"), ha="center", va="center", fontsize=7.5,
-                color="white" if abs(shade[at]) > 0.6 * far else "black")  # fmt: skip
+    for (y, x), middle in np.ndenumerate(shade):
+        cells = [(form, part.get(places[y], {}).get(rivals[x])) for form, part in (("{}", checked), ("({})", own))]
+        said = [form.format(_ahead(seeds)) for form, seeds in cells if seeds is not None]
+        ax.text(x, y, " ".join(said).replace("-", "\u2212"), ha="center", va="center", fontsize=7.5,
+                color="white" if abs(middle) > 0.6 * far else "black")  # fmt: skip
     ax.set_xticks(range(len(rivals)), [f"against {rival.label}" for rival in rivals])
-    ax.set_yticks(range(len(places)), places)
+    ax.set_yticks(range(len(places)), [place + _seeds(checked.get(place, {})) for place in places])
     ax.xaxis.tick_top()
     ax.spines[:].set_visible(False)
     ax.tick_params(length=0, labelsize=7)
-    ax.set_xlabel("in brackets: yours" if yours else "")
+    below = ["±: half the 95 % interval over seeds"] * any(len(k) > 1 for row in checked.values() for k in row.values())
+    ax.set_xlabel("; ".join([*below, *(["in brackets: yours"] if own else [])]))
     figure.colorbar(image, ax=ax, label=f"{subject.label} ahead by\n({unit})", shrink=0.9)
     return figure
+
+
+def _ahead(seeds: np.ndarray) -> str:
+    """A mean, with half its interval where there are several seeds."""
+    mean, half = interval(seeds)
+    return f"{mean:+.1f}" + (f" ± {half:.1f}" if half else "")
+
+
+def _seeds(row: Mapping[Method, np.ndarray]) -> str:
+    """How many training seeds a place of the map has, from the fewest that a rival has to the most."""
+    counts = sorted({len(seeds) for seeds in row.values()})
+    return f" ({' to '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)})" if counts else ""

@@ -101,12 +101,14 @@ def figure6(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task])
     return Drawing(figures.figure6(published, yours), "figure6", planning.plans_of(found))
 
 
-def predicted_and_executed(found: pd.DataFrame, by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
-    """Returns of single targets, of the best method and of direct plans. by_target: rows with a ``target``."""
-    some = [zoo.method(zoo.OURS, "latent", "cem"), *zoo.methods((zoo.PAPERS, "lstm", "onestep"), "cem", ["direct"])]
-    published, yours = table.pair(by_target, partial(planning.return_panels, tasks=tasks, methods=some))
-    figure = figures.predicted_vs_true(published, yours)
-    return Drawing(figure, "05_predicted_and_executed", planning.plans_of(found))
+def predicted_and_executed(by_target: pd.DataFrame, tasks: Sequence[Task]) -> Drawing:
+    """Returns of single targets and training seeds, of latent plans through some models. by_target: rows with a
+    ``target``."""
+    models = (zoo.OURS, zoo.PAPERS, "lstm", "onestep")
+    rows = table.select(planning.plans_of(by_target), model=models, search_space="latent", planner="cem")
+    read = partial(planning.return_panels, tasks=tasks, methods=zoo.methods(models, "cem", ["latent"]), apart=True)
+    published, yours = table.pair(rows, read)
+    return Drawing(figures.predicted_vs_true(published, yours), "05_predicted_and_executed", rows)
 
 
 def closed_loop(found: pd.DataFrame, by_target: pd.DataFrame, task: Task) -> Drawing:
@@ -151,13 +153,14 @@ def figure8(found: pd.DataFrame, floor: Mapping[Method, float]) -> Iterator[Draw
 
 
 def advantage_map(
-    found: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
-) -> Iterator[Drawing]:
-    """``subject`` minus each rival, by noise and delay."""
+    found: pd.DataFrame, clean: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float],
+    delays: Sequence[int],
+) -> Iterator[Drawing]:  # fmt: skip
+    """``subject`` minus each rival, by noise and delay. clean: rows of 03_predict, of the arms without either."""
+    rows = robustness.advantage_rows(found, clean, (subject, *rivals), noises, delays)
     ahead = partial(robustness.advantage, subject=subject, rivals=rivals, noises=noises, delays=delays)
-    maps, yours = table.pair(found, ahead)
+    maps, yours = table.pair(rows, ahead)
     if maps:
-        rows = table.select(found, metric="ll_horizon", model=(subject, *rivals), execution="open loop")
         yield Drawing(
             figures.advantage_map(maps, zoo.method(subject), unit="nats per step", yours=yours), "06_map", rows
         )
@@ -168,11 +171,14 @@ def advantage_map(
 
 def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Drawing]:
     """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles."""
+    task, units = exploration.TASKS[env].capitalize(), exploration.UNITS[env]
     rows = table.select(found, execution=planning.CLOSED, env=env)
     curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
-        yield Drawing(figures.rounds(curves, "", yours=yours), stem, rows)
+        panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
+        ylabels = {f"{task}: {title}": units[title] for title in curves}
+        yield Drawing(figures.rounds(panels, ylabels, yours=own), stem, rows)
 
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:
@@ -180,4 +186,6 @@ def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawi
     rows = table.select(found, execution=planning.OPEN, env=env)
     curves, yours = table.pair(rows, partial(exploration.way_curves, steps_ahead=steps_ahead))
     if curves:
-        yield Drawing(figures.adapted(curves, f"energy score, {steps_ahead} steps", yours=yours), "10_ways", rows)
+        yield Drawing(
+            figures.adapted(curves, f"energy score, {steps_ahead} steps (data's s.d.)", yours=yours), "10_ways", rows
+        )

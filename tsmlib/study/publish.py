@@ -187,7 +187,7 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield drawings.calibration(predict, MUJOCO_IDS)
     yield drawings.code_use(codes, [env for env in MUJOCO_IDS if env in set(codes["env"])])
     yield drawings.figure6(control, by_target, tasks)
-    yield drawings.predicted_and_executed(control, by_target, tasks)
+    yield drawings.predicted_and_executed(by_target, tasks)
     yield drawings.closed_loop(control, by_target, tasks[-1])
     free = policies_results.finished(published("model_free")).assign(source=table.YOURS)
     yield drawings.figure7(tables_storage.frame(pd.concat([control, free])), control)
@@ -196,7 +196,7 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield drawings.filtering(imperfect, asked.worlds["noise"], words)
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
     subject = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
-    yield from drawings.advantage_map(imperfect, subject, asked.rivals, asked.noises, asked.delays)
+    yield from drawings.advantage_map(imperfect, predict, subject, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
         yield from drawings.rounds(explored, env, titles)
     yield from drawings.ways(explored, WEAK_MOTORS.env)

@@ -205,7 +205,7 @@ _MODELS = (
         pushing=tuple(replace(stage, muon=0.01) for stage in RECURRENT),
     ),
     ModelSpec(  # the energy score in place of squared error and KL
-        "tsm+energy", Look("TSM + energy", "#56B4E9", "D"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
+        "tsm+energy", Look("TSM + energy", "#56B4E9", "p"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
         "ablation", pushing=_slower(TEACHER, _free("energy_loss", (11, 6.9))),
     ),
     ModelSpec(  # the same with the state skip, and more teacher forcing
@@ -213,7 +213,7 @@ _MODELS = (
         _skip, "ablation", pushing=_slower(LONGER, _free("energy_loss", 8, 0.6)),
     ),
     ModelSpec(
-        "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "p"), _TSM, (replace(TEACHER, share=1.0),), _wide,
+        "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "<"), _TSM, (replace(TEACHER, share=1.0),), _wide,
         "ablation", pushing=_slower(replace(TEACHER, share=1.0)),
     ),
     ModelSpec(  # the state skip with the paper's loss
@@ -264,8 +264,8 @@ LOOKS = {  # of what is run and drawn beside the models; greys for what is no me
     "random": Look("random torques", "#7A7A7A"), "zero": Look("zero torque", "#B0B0B0"),
     "data": Look("data", "#4A4A4A"), "filter": Look("Kalman filter", "#B03A2E"),
     "exponential": Look("exponential average", "#8C8C8C"),
-    "pets": Look("PETS (mbrl-lib)", "#C2A5CF", "d"),
-    "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", "d"),
+    "pets": Look("PETS (mbrl-lib)", "#C2A5CF", "H"),
+    "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", "8"),
 }  # fmt: skip
 
 

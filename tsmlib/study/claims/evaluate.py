@@ -110,7 +110,8 @@ class Effect:
     @property
     def text(self) -> str:
         """Estimate, interval and n in words."""
-        return self.estimate if self.value is None else f"{self.estimate}, n = {self.n}"
+        counted = f"n = {self.n}" if self.n[:1].isdigit() else self.n  # what is exact has no number
+        return self.estimate if self.value is None else f"{self.estimate}, {counted}"
 
 
 STATES = ("fails", "missing", "open", "holds")  # of a whole rule: one check that fails decides, whatever is missing

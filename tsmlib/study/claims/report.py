@@ -183,16 +183,17 @@ def seeds_to_decide(effect: Effect) -> int:
     return int(enough[0]) if len(enough) else 0
 
 
-def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, np.ndarray, np.ndarray]]:
+def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, str, np.ndarray, np.ndarray]]:
     """What ``figures.claim_margins`` draws, of every claim with rows.
 
-    Id, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie beyond the margin, the
-    deciding one last, and how far the training seeds of that one (seeds,) do.
+    Id, what the paper says, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie
+    beyond the margin, the deciding one last, and how far the training seeds of that one (seeds,) do.
     """
     found = []
     for verdict in verdicts:
         effects = sorted(verdict.effects[""], key=lambda effect: effect is verdict.key)
         if any(effect.value is not None for effect in effects):
             beyond = np.array([e.beyond for e in effects if e.value is not None or e is verdict.key])
-            found.append((verdict.claim.id, verdict.word, verdict.key.text, beyond, verdict.key.seeds_beyond))
+            claim, key = verdict.claim, verdict.key
+            found.append((claim.id, claim.statement, verdict.word, key.text, beyond, key.seeds_beyond))
     return found

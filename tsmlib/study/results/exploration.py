@@ -44,12 +44,16 @@ EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "c
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
 SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
-WAYS = {
-    "zero-shot": Look("zero-shot", "#7A7A7A", "o"), "all": Look("all weights", "#003C8F", "*"),
-    "head": Look("head", "#56B4E9", "s"), "codes": Look("codes", "#CC79A7", "D"),
-    "scratch": Look("from scratch", "#E69F00", "^"),
-    "reference": Look("trained in full", "#111111", "P"),
+WAYS = {  # of training: no colour and no marker of a model; the redder, the more of the weights is trained on
+    "zero-shot": Look("zero-shot", "#6E6E6E", (5, 2, 0)), "all": Look("all weights", "#8B0A1A", (6, 1, 0)),
+    "head": Look("head", "#E34A33", "8"), "codes": Look("codes", "#F4A582", "+"),
+    "scratch": Look("from scratch", "#6B6B00", "x"),
+    "reference": Look("trained in full", "#1E1E1E", (4, 1, 45)),
 }  # fmt: skip
+UNITS = {  # of DRAWN, as a figure's axes say them
+    PENDULUM: {"executed return": "return (sum of 100 rewards)", "size of the gap": "gap (sum of 100 rewards)"},
+    PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
+}
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------

@@ -152,21 +152,25 @@ def plans_of(
     return own[(own["model"] == "none") | own["planner"].isin(list(planners))] if planners else own
 
 
-def by_target(found: pd.DataFrame, metric: str) -> dict[Method, np.ndarray]:
-    """Rows with a ``target`` as arrays: method -> (targets,), means over the seeds there are."""
+def by_target(found: pd.DataFrame, metric: str, *, apart: bool = False) -> dict[Method, np.ndarray]:
+    """Rows with a ``target`` as arrays: method -> (targets,), means over the seeds there are; apart: targets of each
+    seed, (seeds * targets,)."""
     own = table.with_method(table.select(found, metric=metric))
-    return table.arrays(table.means(own, "target", "method").sort_index())
+    return table.arrays(table.means(own, ["seed", "target"] if apart else "target", "method").sort_index())
 
 
 def returns(
-    found: pd.DataFrame, env: str, *, planner: str = "cem", execution: str = OPEN
+    found: pd.DataFrame, env: str, *, planner: str = "cem", execution: str = OPEN, apart: bool = False
 ) -> dict[Method, dict[str, np.ndarray | None]]:
-    """What ``figures.figure6`` draws of one task: method -> true and predicted returns, from rows with a ``target``."""
+    """What ``figures.figure6`` draws of one task: method -> true and predicted returns, from rows with a ``target``.
+
+    apart: of ``by_target``.
+    """
     own = plans_of(found, env=env, execution=execution, planners=[planner])
-    predicted = by_target(own, "return_predicted")
+    predicted = by_target(own, "return_predicted", apart=apart)
     return {
         method: {"true": true, "predicted": predicted.get(method)}
-        for method, true in by_target(own, "return_true").items()
+        for method, true in by_target(own, "return_true", apart=apart).items()
     }
 
 
@@ -183,10 +187,11 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
 
 
 def return_panels(
-    found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem", methods: Sequence[Method] = ()
-) -> dict[str, dict[Method, dict[str, np.ndarray | None]]]:
+    found: pd.DataFrame, tasks: Sequence[Task], *, planner: str = "cem", methods: Sequence[Method] = (),
+    apart: bool = False,
+) -> dict[str, dict[Method, dict[str, np.ndarray | None]]]:  # fmt: skip
     """The input of ``figures.figure6``: ``returns`` of each task, of some methods or of all."""
-    every = {task.name: returns(found, task.env, planner=planner) for task in tasks}
+    every = {task.name: returns(found, task.env, planner=planner, apart=apart) for task in tasks}
     return {task: {m: rows[m] for m in methods or ordered(rows) if m in rows} for task, rows in every.items()}
 
 

@@ -184,23 +184,40 @@ def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Met
     return curves
 
 
-def advantage(
-    found: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
-) -> dict[str, dict[Method, float]]:
-    """``subject`` minus each rival in ``ll_horizon``, nats per step: the input of the map.
+def advantage_rows(
+    found: pd.DataFrame, clean: pd.DataFrame, models: Sequence[str], noises: Sequence[float], delays: Sequence[int]
+) -> pd.DataFrame:
+    """The rows of the map: ``ll_horizon`` of some models, open loop, of each of its places. clean: of 03_predict, which
+    scored models of more seeds where there is neither noise nor delay; each measurement once."""
+    both = pd.concat([clean, found])
+    rows = [select(both, "ll_horizon", env=env, subset=subset, model=models)
+            for env, subset in _places(noises, delays).values()]  # fmt: skip
+    same = ["env", "noise", "delay", "subset", "model", "seed", "scale"]
+    return pd.concat(rows).drop_duplicates([*same, *(["source"] if "source" in both else [])])
 
-    Place -> rival -> mean over pairs of training seeds; places without any are left out. The plain arm with every noise
-    and delay, then the one with the obstacle, from the first touch on.
-    """
+
+def _places(noises: Sequence[float], delays: Sequence[int]) -> dict[str, tuple[str, str]]:
+    """Place of the map -> environment and subset: the plain arm with every noise and delay, then the one with the
+    obstacle, from the first touch on."""
     plain, obstacle = "tsm/Reacher-v0", "tsm/ReacherObstacle-v0"
     places = {f"noise {noise:g}, delay {delay}": (imperfect(plain, noise=noise, delay=delay), "")
               for delay in delays for noise in noises}  # fmt: skip
-    places["obstacle, after contact"] = obstacle, "contact"
+    return places | {"obstacle, after contact": (obstacle, "contact")}
+
+
+def advantage(
+    rows: pd.DataFrame, subject: str, rivals: Sequence[str], noises: Sequence[float], delays: Sequence[int]
+) -> dict[str, dict[Method, np.ndarray]]:
+    """``subject`` minus each rival in ``ll_horizon``, nats per step: the input of the map.
+
+    Place -> rival -> a difference for each training seed that both have (k,); places without any are left out. rows:
+    as ``advantage_rows`` gives them.
+    """
     ahead = {}
-    for words, (env, subset) in places.items():
-        pairs = paired(found, subject, "ll_horizon", env=env, subset=subset)
-        if rows := {other: float(pairs[other].mean()) for other in map(zoo.method, rivals) if other in pairs}:
-            ahead[words] = rows
+    for words, (env, subset) in _places(noises, delays).items():
+        pairs = paired(rows, subject, "ll_horizon", env=env, subset=subset)
+        if found := {other: pairs[other] for other in map(zoo.method, rivals) if other in pairs}:
+            ahead[words] = found
     return ahead
 
 

@@ -17,7 +17,7 @@ from tsmlib.storage import tables
 from tsmlib.storage.files import Json
 from tsmlib.study import zoo
 from tsmlib.study.runs import Run
-from tsmlib.study.zoo import LOOKS, ZOO, method
+from tsmlib.study.zoo import LOOKS, ZOO, look, method
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -235,12 +235,36 @@ def _origin(part: pd.DataFrame) -> str:
     if "target" in part and part["target"].notna().all():  # rows of single targets
         counts = [part["target"].nunique()]
     words = [f"scale {', '.join(part['scale'].unique())}"]
-    of_env = {env: sorted(set(own["seed"].dropna())) for env, own in groups(part, "env")}
-    fewer = [f"{_env_name(env)}: {', '.join(map(str, own))}" for env, own in of_env.items() if own and own != seeds]
-    more = f" ({'; '.join(fewer)})" * bool(fewer)
+    more = f" ({'; '.join(fewer)})" if (fewer := _fewer(part)) else ""
     words += [f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}{more}"] * bool(seeds)
     words += [f"n {'up to' if len(counts) > 1 else '='} {counts[-1]:,}"] * bool(counts)
     return ", ".join(words)
+
+
+def _fewer(part: pd.DataFrame) -> list[str]:
+    """Worlds, environments with their noise and delay, that have not all the seeds of some rows, with those that they
+    have; then models that have not all of them in any world that does."""
+    known = part[part["seed"].notna()]
+    seeds, known = set(known["seed"]), known.assign(noise=known["noise"].fillna(0), delay=known["delay"].fillna(0))
+    worlds = dict(groups(known, ["env", "noise", "delay"]))
+    whole = [own for own in worlds.values() if set(own["seed"]) == seeds]
+    models = groups(pd.concat(whole), "model") if whole else iter(())
+    named = {_world_name(*key): set(own["seed"]) for key, own in worlds.items()}
+    return [
+        f"{', '.join(names)}: {few}"
+        for of in (named, {look(model).name: set(own["seed"]) for model, own in models if model in {**ZOO, **LOOKS}})
+        for few, names in _by_value({name: ", ".join(map(str, sorted(o))) for name, o in of.items() if o != seeds})
+    ]
+
+
+def _by_value(texts: Mapping[str, str]) -> Iterator[tuple[str, list[str]]]:
+    """Each text with the names that have it."""
+    return ((text, [name for name in texts if texts[name] == text]) for text in dict.fromkeys(texts.values()))
+
+
+def _world_name(env: str, noise: float, delay: int) -> str:
+    said = [f"{word} {value:g}" for word, value in (("noise", noise), ("delay", delay)) if value]
+    return " with ".join(filter(None, (_env_name(env), " and ".join(said))))
 
 
 def _env_name(env: str) -> str:
