@@ -357,8 +357,11 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
     assert again.predicted == curve.predicted
     assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
-    for other, given, said in ((policy(kind), {"horizon": 6}, "horizon is 5 in the file, expected 6"),
-                               (policy(kind, seed=3), {}, "began with is '.*' in the file, expected '.*'")):  # fmt: skip
+    others = (
+        (policy(kind), {"horizon": 6}, "horizon is 5 in the file, expected 6"),
+        (policy(kind, seed=3), {}, "began with is '.*' in the file, expected '.*'"),
+    )
+    for other, given, said in others:
         with pytest.raises(files.StoreError, match=f"another run: {said}. Delete"):
             learn(other, **given, **settings)
 

@@ -113,8 +113,8 @@ def readme_training(env: str) -> str:
         f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
     )
     return (
-        f"Single networks trained {longest / shipped:g} times as long ({_seeds(after)}, validation, same page): energy "
-        f"score over the best baseline's at 10, 80 steps {scores}; cost of plans (m) {costs}."
+        f"Single networks trained {longest / shipped:g} times as long ({_seeds(after)}, validation): energy score over "
+        f"the best baseline's at 10, 80 steps {scores}; cost of plans (m) {costs}."
         f"{_against(trained[longest], 'onestep')}"
     )
 
@@ -131,7 +131,7 @@ def _against(found: pd.DataFrame, baseline: str) -> str:
         f"`{model}` {', '.join(table.spell(ratio, '{:.2f} ± {:.2f}') for ratio in ratios)}"
         for model, ratios in pairs.items()
     )
-    return f" Over `{baseline}` alone, {min(seeds)} seeds: {said}."
+    return f" Over `{baseline}`, {min(seeds)} seeds: {said}."
 
 
 def _seeds(rows: pd.DataFrame) -> str:
