@@ -154,6 +154,11 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
     assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
 
 
+def test_every_measure_of_rounds_that_is_drawn_has_a_unit() -> None:
+    for env, drawn in results.DRAWN.items():
+        assert set(drawn) <= set(results.ROUNDS[env].values()) & set(results.UNITS[env])
+
+
 def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,7 +51,10 @@ WAYS = {  # of training: no colour and no marker of a model; the redder, the mor
     "reference": Look("trained in full", "#1E1E1E", (4, 1, 45)),
 }  # fmt: skip
 UNITS = {  # of DRAWN, as a figure's axes say them
-    PENDULUM: {"executed return": "return (sum of 100 rewards)", "size of the gap": "gap (sum of 100 rewards)"},
+    PENDULUM: {
+        "executed return": "return (sum of 100 rewards)",
+        "size of the first plan's gap": "gap (sum of 100 rewards)",
+    },
     PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
 }
 
