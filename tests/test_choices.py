@@ -228,11 +228,17 @@ def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as
 
 
 def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() -> None:
-    lines = pd.DataFrame([{"env": "tsm/ReacherPush-v1", "seed": seed, "targets": 100} for seed in (0, 2, 1, 0)])
-    assert quality.stamp(lines) == (
-        "ReacherPush, training seeds 0, 1, 2; one network each, of a recurrent TSM one decoder; predictions: n = 200 "
-        "fresh episodes, plans and violations: n = 100 validation targets"
+    about = {"env": "tsm/ReacherPush-v1", "targets": 100}
+    trained = [("lstm", 580, 0), ("tsm", 580, 0), ("lstm", 2320, 0), *(("tsm", 2320, seed) for seed in (0, 2, 1))]
+    lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
+    rest = (
+        "; one network each, of a recurrent TSM one decoder; predictions: n = 200 fresh episodes, plans and violations: "
+        "n = 100 validation targets"
     )
+    assert quality.stamp(lines) == (
+        f"ReacherPush, training seed 0 (after 2320 s seeds 0, 1, 2 of TSM: small marks, the line joins means){rest}"
+    )
+    assert quality.stamp(lines[lines["seed"] == 0]) == f"ReacherPush, training seed 0{rest}"
 
 
 def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:

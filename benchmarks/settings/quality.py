@@ -243,10 +243,14 @@ def tables(every: pd.DataFrame) -> str:
 
 def stamp(lines: pd.DataFrame) -> str:
     """What the figure's lines are of, below it: training seeds, networks, episodes and targets."""
-    seeds, targets = (", ".join(map(str, sorted(set(lines[name])))) for name in ("seed", "targets"))
+    several_of, targets = several(lines), ", ".join(map(str, sorted(set(lines["targets"]))))
+    more = ", ".join(f"{seconds:g} s" for seconds in sorted(set(several_of["seconds"])))
+    seeds = ", ".join(map(str, sorted(set(several_of["seed"]))))
+    models = ", ".join(zoo.look(model).name for model in dict.fromkeys(several_of["model"]))
     return (
-        f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed{'s' * (lines['seed'].nunique() > 1)} {seeds}; "
-        f"one network each, of a recurrent TSM one decoder; predictions: n = {EPISODES} fresh episodes, plans and "
+        f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed 0"
+        + f" (after {more} seeds {seeds} of {models}: small marks, the line joins means)" * bool(more)
+        + f"; one network each, of a recurrent TSM one decoder; predictions: n = {EPISODES} fresh episodes, plans and "
         f"violations: n = {targets} validation targets"
     )
 

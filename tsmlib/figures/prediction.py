@@ -74,11 +74,11 @@ def figure5(
 def training_time(
     curves: Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]], *, ships: float | None = None
 ) -> Figure:
-    """Measures against the time that training took, one panel each, both axes logarithmic; one training a mark.
+    """Measures against the time that training took, one panel each, both axes logarithmic.
 
-    curves: title -> method -> seconds (k,) and values (k,), positive; the line is that of the means where a time was
-    trained for more than once. seconds: nominal, of one network, of which a model may have several. ships: the budget
-    in seconds by which a network that ships is trained, a dashed line.
+    curves: title -> method -> seconds (k,) and values (k,), positive; where a time was trained for more than once, the
+    line is that of the means, and each training a small mark. seconds: nominal, of one network, of which a model may
+    have several. ships: the budget in seconds by which a network that ships is trained, a dashed line.
     """
     figure, grid = panels(len(curves), 4, 1.6)
     look_of = axes.looks(curves)
@@ -89,8 +89,8 @@ def training_time(
             values = finite(f"values of {title}, {method.label}", values, f"{len(seconds)}")
             times, which = np.unique(seconds, return_inverse=True)
             means = np.bincount(which, values) / np.bincount(which)
-            ax.plot(seconds, values, **look_of[method] | {"ms": 4, "ls": ""}, zorder=3)
-            ax.plot(times, means, **look_of[method] | {"marker": ""}, zorder=2)
+            ax.plot(seconds, values, **look_of[method] | {"ms": 2, "mew": 0, "ls": "", "alpha": 0.6}, zorder=3)
+            ax.plot(times, means, **look_of[method] | {"ms": 4}, zorder=4)
             every, drawn = [*every, *seconds.tolist()], [*drawn, *values.tolist()]
         axes.log_axis(ax, min(drawn) / 1.15, max(drawn) * 1.15)
         ax.set(title=title, xscale="log", xlim=(min(every) / 1.3, max(every) * 1.3))
