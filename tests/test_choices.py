@@ -232,8 +232,8 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
     trained = [("lstm", 580, 0), ("tsm", 580, 0), ("lstm", 2320, 0), *(("tsm", 2320, seed) for seed in (0, 2, 1))]
     lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
     rest = (
-        "; one network each, of a recurrent TSM one decoder; predictions: n = 200 fresh episodes, plans and violations: "
-        "n = 100 validation targets"
+        "; one network each, of a recurrent TSM one decoder; predictions: n = 200 fresh episodes, plans and violations:"
+        " n = 100 validation targets"
     )
     assert quality.stamp(lines) == (
         f"ReacherPush, training seed 0 (after 2320 s seeds 0, 1, 2 of TSM: small marks, the line joins means){rest}"
