@@ -113,8 +113,8 @@ def readme_training(env: str) -> str:
         f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
     )
     return (
-        f"Single networks trained {longest / shipped:g} times as long (validation; {_seeds(before)} → {_seeds(after)}): "
-        f"energy score over the best baseline's at 10, 80 steps {scores}; cost of plans {costs}."
+        f"Single networks trained {longest / shipped:g} times as long (validation; {_seeds(before)} → {_seeds(after)}):"
+        f" energy score over the best baseline's at 10, 80 steps {scores}; cost of plans {costs}."
         f"{_against(trained[longest], 'onestep')}"
     )
 
