@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from reliability import files, pipelines, simulators, training
+from reliability import files, pipelines, simulators, training, world
 from reliability.__main__ import CHECKS, said
 from reliability.world import Outcome
+from tqdm.auto import tqdm
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for check, quick, _ in part}
@@ -121,3 +125,15 @@ def test_every_check_says_which_number_it_answers() -> None:
         number, what = said(check)
         assert re.fullmatch(r"R\d+(, R\d+)*", number), check
         assert what, check
+
+
+def test_a_child_that_is_killed_while_it_draws_a_progress_bar_stops_no_other() -> None:
+    def dies() -> None:
+        tqdm.get_lock().acquire()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def draws() -> list[int]:
+        return list(tqdm(range(3), file=io.StringIO()))
+
+    assert world.Child(dies).result() == (False, None)
+    assert world.in_child(draws) == [0, 1, 2]

@@ -10,6 +10,7 @@ import pickle
 import random
 import signal
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.tsm import TSM
@@ -160,6 +162,7 @@ class Child:
                 os.close(reader)
                 signal.signal(signal.SIGINT, signal.default_int_handler)
                 torch.set_num_threads(1)  # the threads of the parent are not here
+                tqdm.set_lock(threading.RLock())  # a child that is killed keeps the one that all share
                 warnings.simplefilter("ignore")
                 try:
                     found = (True, work())
