@@ -241,6 +241,23 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
     assert quality.stamp(lines[lines["seed"] == 0]) == f"ReacherPush, training seed 0{rest}"
 
 
+def test_networks_that_judge_together_are_set_against_the_same_networks_one_by_one() -> None:
+    about = {"within_5cm": "0.5", "gap_judge": "0.3", "costs": "1 2"}
+    lines = pd.DataFrame([
+        {"models": "lstm lstm", "seeds": "0 1", "seconds": "580 580", **about},
+        {"models": "lstm tsm", "seeds": "0 0", "seconds": "580 580", **about},  # of two kinds
+        {"models": "lstm lstm", "seeds": "0 2", "seconds": "580 580", **about},  # one of them was not planned with
+        {"models": None, "seeds": None, "seconds": None, **about},
+    ])
+    singles = pd.DataFrame([
+        {"model": "lstm", "seed": seed, "seconds": 580, "targets": 2, "costs": costs, "within": 0.5}
+        for seed, costs in ((0, "2 3"), (1, "4 5"))
+    ])
+    (line,) = decoders.alone(lines, singles).to_dict("records")
+    assert (line["model"], line["networks"], line["one by one"], line["together"]) == ("lstm", 2, "3.50", "1.50")
+    assert line["difference"].startswith("-2.00 ± 0.00")
+
+
 def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:
     scores = {
         ("tsm", 0): 1.0,

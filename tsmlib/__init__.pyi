@@ -13,6 +13,7 @@ from .models.base import rollout as rollout
 from .models.baselines import LSTM as LSTM
 from .models.baselines import OneStep as OneStep
 from .models.ensemble import Ensemble as Ensemble
+from .models.mixture import Mixture as Mixture
 from .models.recurrent import RecurrentTSM as RecurrentTSM
 from .models.tsm import TSM as TSM
 from .planning.base import Plan as Plan

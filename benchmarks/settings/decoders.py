@@ -3,13 +3,16 @@ each be trained for that, what does more training buy a baseline, and must all j
 
     python benchmarks/settings/decoders.py --name "three, full budget" --files a.safetensors b.safetensors c.safetensors
     python benchmarks/settings/decoders.py --compare "three, full budget"
+    python benchmarks/settings/decoders.py --alone
 
 The cross-entropy method over codes of the prior, 96 x 10, on validation targets, executed open loop; a candidate is
 judged by its mean return over the modes of all files' models, or only the share --screened that the first likes best.
 A line in decoders.csv per call: cost with its standard error, share within 5 cm, what the judge predicted beyond the
 executed return, and the costs of the single targets.
 --compare prints the table: the cost of that line minus those of the others, paired by target, with half the 95 % t
-interval over targets. ``budgets.py`` trains such files.
+interval over targets. --alone prints another, of lines whose files are trainings of one model that differ in the seed:
+their cost minus the mean cost of the same trainings one by one, which ``quality.py measure`` planned with, paired by target.
+``budgets.py`` trains such files.
 """
 
 from __future__ import annotations
@@ -34,6 +37,8 @@ from tsmlib.study import runs, zoo
 from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 
+from quality import described
+
 HERE = Path(__file__).resolve().parent
 
 
@@ -55,8 +60,11 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
     plan = cem(judge, task.reward, space, len(task), **options)
     trial = execute(task, plan)
     cost = -trial.executed_return
+    about = [described(path) for path in files]
     return {
-        "name": name, "decoders": len(plan.states), "targets": len(task),
+        "name": name, "models": " ".join(str(each["model"]) for each in about),
+        "seeds": " ".join(str(each["seed"]) for each in about),
+        "seconds": " ".join(str(each["seconds"]) for each in about), "decoders": len(plan.states), "targets": len(task),
         "cpu_seconds": f"{time.process_time() - began:.0f}", "cost": f"{cost.mean():.4g}",
         "cost_sem": f"{cost.std() / len(task) ** 0.5:.3g}",
         "within_5cm": f"{(trial.final_distance < task.tolerance).float().mean():.3g}",
@@ -80,11 +88,35 @@ def compared(lines: pd.DataFrame, name: str) -> pd.DataFrame:
     })  # fmt: skip
 
 
+def alone(lines: pd.DataFrame, singles: pd.DataFrame) -> pd.DataFrame:
+    """Several trainings of one model that judge together, against the same trainings one by one.
+
+    lines: of this table. singles: of ``quality.csv``; of as many targets.
+    """
+    found = []
+    for line in lines.dropna(subset=["models"]).itertuples():
+        word, *others = set(zip(line.models.split(), line.seconds.split(), strict=True))
+        costs = np.array(line.costs.split(), float)
+        own = singles[(singles["model"] == word[0]) & (singles["seconds"].astype(str) == word[1])]
+        own = own[own["seed"].astype(str).isin(line.seeds.split()) & (own["targets"] == len(costs))]
+        if others or len(own) != len(set(line.seeds.split())) or len(own) < 2:
+            continue
+        each = np.array([texts.split() for texts in own["costs"]], float)
+        found.append({
+            "model": word[0], "seconds": word[1], "networks": len(own), "one by one": f"{each.mean():.2f}",
+            "together": f"{costs.mean():.2f}", "difference": table.spell(costs - each.mean(axis=0), "{:+.2f} ± {:.2f}"),
+            "within 5 cm, one by one": f"{own['within'].mean():.0%}",
+            "within 5 cm, together": f"{float(line.within_5cm):.0%}", "predicted beyond executed": line.gap_judge,
+        })  # fmt: skip
+    return pd.DataFrame(found)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--name", help="of the line that is added")
     what.add_argument("--compare", metavar="NAME", help="print the table, every line against this one")
+    what.add_argument("--alone", action="store_true", help="print the table of trainings together and one by one")
     parser.add_argument("--files", nargs="+", type=Path, default=[], help="models, each with one decoder or several")
     parser.add_argument("--screened", type=float, default=1.0, help="share that all judge (default 1: all candidates)")
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
@@ -99,6 +131,9 @@ def main() -> None:
         if given.compare not in set(lines["name"]):
             parser.error(f"{given.out} has no line {given.compare!r}; it has: {', '.join(lines['name'])}")
         print(table.markdown(compared(lines, given.compare)))
+        return
+    if given.alone:
+        print(table.markdown(alone(lines, pd.read_csv(HERE / "quality.csv"))))
         return
     if not given.files:
         parser.error("--name wants --files: the models that a candidate is judged by")

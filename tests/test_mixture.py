@@ -1,0 +1,126 @@
+"""Several models as one: its samples are rollouts of one of them, and planners judge by all."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from untrained import in_units
+
+import tsmlib as tsm
+from tsmlib.models.base import predict_segment, stepper
+from tsmlib.planning.predictors import EnsemblePredictor
+from tsmlib.sampling import SeparateNoise, SharedNoise
+from tsmlib.trajectory import Segment
+
+DX, DU, B, T = 6, 2, 5, 25
+
+
+def drawn(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def one_step(seed: int) -> tsm.OneStep:
+    torch.manual_seed(seed)
+    return in_units(tsm.OneStep(DX, DU, angles=(0, 1), hidden=16, layers=2)).double().eval()
+
+
+def recurrent(seed: int, members: int = 1) -> tsm.RecurrentTSM:
+    torch.manual_seed(seed)
+    net = tsm.RecurrentTSM(DX, DU, angles=(0, 1), hidden=16, members=members)
+    for decoder in net.decoders:
+        decoder.codes.weight.data.mul_(20)  # so that a code says much
+    return in_units(net).double().eval()
+
+
+def given(n: int = B, steps: int = T) -> tuple[Segment, Tensor]:
+    noise = drawn(7)
+    past = Segment(torch.randn(n, 10, DX, generator=noise).double(), torch.randn(n, 10, DU, generator=noise).double())
+    return past, torch.randn(n, steps, DU, generator=noise).double()
+
+
+def test_the_mode_is_the_mean_of_the_models_modes() -> None:
+    models, (past, actions) = [one_step(0), recurrent(1)], given()
+    found = tsm.rollout(tsm.Mixture(models), past, actions)
+    assert torch.allclose(found, torch.stack([tsm.rollout(model, past, actions) for model in models]).mean(0))
+
+
+def test_a_sample_is_a_rollout_of_one_of_the_models_to_its_end() -> None:
+    models, (past, actions) = [one_step(0), one_step(1), one_step(2)], given(60)
+    found = tsm.rollout(tsm.Mixture(models), past, actions, generator=drawn(3))
+    each = torch.stack([tsm.rollout(model, past, actions) for model in models])
+    of = (found - each).abs().amax((2, 3))  # (models, rows)
+    assert torch.allclose(of.amin(0), torch.zeros(60).double(), atol=1e-12)
+    assert of.argmin(0).bincount(minlength=3).min() > 8
+
+
+def test_decoders_as_models_of_their_own_predict_and_are_judged_as_the_one_model() -> None:
+    net, (past, actions) = recurrent(0, members=3), given()
+    mixture, candidates = tsm.Mixture([net.alone(k) for k in range(3)]), actions[None].repeat(4, 1, 1, 1)
+    assert torch.allclose(tsm.rollout(mixture, past, actions), tsm.rollout(net, past, actions))
+    judged, ours = (tsm.model_predictor(model, past) for model in (net, mixture))
+    assert isinstance(ours, EnsemblePredictor)
+    assert len(ours.each) == 3
+    assert torch.allclose(ours(candidates), judged(candidates))
+    for one, other in zip(ours.each, judged.each, strict=True):
+        assert torch.allclose(one(candidates), other(candidates))
+
+
+@pytest.mark.parametrize("noise", [None, 5])
+def test_a_step_at_a_time_gives_the_states_of_the_rollout(noise: int | None) -> None:
+    mixture, (past, actions) = tsm.Mixture([one_step(0), recurrent(1), one_step(2)]), given()
+    step = stepper(mixture, past, generator=None if noise is None else drawn(noise))
+    found = torch.stack([step(u) for u in actions.unbind(1)], dim=1)
+    assert torch.allclose(found, tsm.rollout(mixture, past, actions, generator=None if noise is None else drawn(noise)))
+
+
+def test_candidates_are_compared_in_the_same_futures() -> None:
+    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
+    states = tsm.model_predictor(mixture, past, samples=6, seed=2)(actions[None].repeat(3, 1, 1, 1))
+    assert torch.equal(states[:, 0], states[:, 1])
+    assert torch.equal(states[:, 0], states[:, 2])
+    assert not torch.equal(states[0], states[1])
+
+
+def test_rows_that_share_noise_share_the_model_and_what_it_draws() -> None:
+    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given()
+    twice = Segment(*(part.repeat(2, 1, 1) for part in past))
+    found = predict_segment(mixture, twice, actions.repeat(2, 1, 1), generator=SharedNoise(drawn(1), B))
+    assert torch.equal(found[:B], found[B:])
+
+
+def test_copies_draw_as_each_alone() -> None:
+    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
+    twice = Segment(*(part.repeat(2, 1, 1) for part in past))
+    both = predict_segment(mixture, twice, actions.repeat(2, 1, 1), generator=SeparateNoise((drawn(1), drawn(2))))
+    for part, seed in zip(both.split(B), (1, 2), strict=True):
+        assert torch.allclose(part, predict_segment(mixture, past, actions, generator=drawn(seed)))
+
+
+def test_gradients_reach_the_actions() -> None:
+    mixture, (past, actions) = tsm.Mixture([one_step(0), recurrent(1)]), given()
+    actions.requires_grad_()
+    tsm.rollout(mixture, past, actions, generator=drawn(0))[:, -1].sum().backward()
+    assert (actions.grad[:, 0] != 0).any(dim=1).all()
+
+
+def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
+    env = "tsm/Reacher-v0"
+    mixture = tsm.Mixture([tsm.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "ensemble+mse")])
+    task, prior = tsm.load_task(env).take(2), tsm.load_pretrained("prior", env=env)
+    past, space = task.past(mixture.past_len), tsm.LatentActions(prior, task.horizon)
+    plan = tsm.cem(tsm.model_predictor(mixture, past), task.reward, space, len(task), candidates=8, elites=2, iterations=2)
+    plan = tsm.reevaluate(plan, tsm.fresh_predictor(mixture, past, seed=1), task.reward)
+    trial = tsm.execute(task, plan)
+    assert torch.isfinite(trial.executed_return).all()
+    assert plan.states.shape == (32, 2, task.horizon, 6)
+
+
+def test_no_models_or_models_of_other_robots_are_refused() -> None:
+    with pytest.raises(ValueError, match="a mixture of no models"):
+        tsm.Mixture([])
+    other = in_units(tsm.OneStep(10, DU, hidden=16, layers=2))
+    with pytest.raises(ValueError, match="states of 6 and 10 dimensions; expected models of one environment"):
+        tsm.Mixture([one_step(0), other])
+    with pytest.raises(ValueError, match="segment_len is 0, expected a positive number of steps"):
+        tsm.Mixture([one_step(0)], segment_len=0)
