@@ -199,12 +199,13 @@ def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_
 
 
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:
-    about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0"}
+    about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0", "split": "validation"}
     lines = pd.DataFrame([
         {"name": "ours", "cost": "10.0", "costs": "9 11", **about},
         {"name": "worse", "cost": "13.0", "costs": "12 14", **about},
         {"name": "better", "cost": "9.5", "costs": "8.5 10.5", **about},
         {"name": "other targets", "cost": "1", "costs": "1", **about},
+        {"name": "frozen targets", "cost": "1", "costs": "1 1", **about, "split": "test"},
     ])  # fmt: skip
     found = decoders.compared(lines, "ours").set_index("judged by")["cost of ours minus this"]
     assert found.to_dict() == {"better": "+0.50", "ours": "", "worse": "-3.00"}
@@ -242,20 +243,20 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
 
 
 def test_networks_that_judge_together_are_set_against_the_same_networks_one_by_one() -> None:
-    about = {"within_5cm": "0.5", "gap_judge": "0.3", "costs": "1 2"}
+    about = {"within_5cm": "0.5", "gap_judge": "0.3", "costs": "1 2", "split": "validation"}
     lines = pd.DataFrame([
         {"models": "lstm lstm", "seeds": "0 1", "seconds": "580 580", **about},
         {"models": "lstm tsm", "seeds": "0 0", "seconds": "580 580", **about},  # of two kinds
         {"models": "lstm lstm", "seeds": "0 2", "seconds": "580 580", **about},  # one of them was not planned with
         {"models": None, "seeds": None, "seconds": None, **about},
-    ])
+    ])  # fmt: skip
     singles = pd.DataFrame([
         {"model": "lstm", "seed": seed, "seconds": 580, "targets": 2, "costs": costs, "within": 0.5}
-        for seed, costs in ((0, "2 3"), (1, "4 5"))
-    ])
+        for seed, costs in ((0, "2 3"), (1, "4 7"))
+    ])  # fmt: skip
     (line,) = decoders.alone(lines, singles).to_dict("records")
-    assert (line["model"], line["networks"], line["one by one"], line["together"]) == ("lstm", 2, "3.50", "1.50")
-    assert line["difference"].startswith("-2.00 ± 0.00")
+    assert (line["model"], line["networks"], line["one by one"], line["together"]) == ("lstm", 2, "4.00", "1.50")
+    assert line["difference"].startswith("-2.50 ± ")
 
 
 def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:

@@ -109,7 +109,9 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     mixture = tsm.Mixture([tsm.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "ensemble+mse")])
     task, prior = tsm.load_task(env).take(2), tsm.load_pretrained("prior", env=env)
     past, space = task.past(mixture.past_len), tsm.LatentActions(prior, task.horizon)
-    plan = tsm.cem(tsm.model_predictor(mixture, past), task.reward, space, len(task), candidates=8, elites=2, iterations=2)
+    plan = tsm.cem(
+        tsm.model_predictor(mixture, past), task.reward, space, len(task), candidates=8, elites=2, iterations=2
+    )
     plan = tsm.reevaluate(plan, tsm.fresh_predictor(mixture, past, seed=1), task.reward)
     trial = tsm.execute(task, plan)
     assert torch.isfinite(trial.executed_return).all()

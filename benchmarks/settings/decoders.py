@@ -5,14 +5,15 @@ each be trained for that, what does more training buy a baseline, and must all j
     python benchmarks/settings/decoders.py --compare "three, full budget"
     python benchmarks/settings/decoders.py --alone
 
-The cross-entropy method over codes of the prior, 96 x 10, on validation targets, executed open loop; a candidate is
+The cross-entropy method over codes of the prior, 96 x 10, on validation targets (or by --split test on the frozen ones,
+by which nothing is chosen), executed open loop; a candidate is
 judged by its mean return over the modes of all files' models, or only the share --screened that the first likes best.
 A line in decoders.csv per call: cost with its standard error, share within 5 cm, what the judge predicted beyond the
 executed return, and the costs of the single targets.
 --compare prints the table: the cost of that line minus those of the others, paired by target, with half the 95 % t
 interval over targets. --alone prints another, of lines whose files are trainings of one model that differ in the seed:
-their cost minus the mean cost of the same trainings one by one, which ``quality.py measure`` planned with, paired by target.
-``budgets.py`` trains such files.
+their cost minus the mean cost of the same trainings one by one, which ``quality.py measure`` planned with, paired by
+target. ``budgets.py`` trains such files.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import torch
+from quality import described
 
 from tsmlib import study
 from tsmlib.models.base import Model
@@ -37,8 +39,6 @@ from tsmlib.study import runs, zoo
 from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 
-from quality import described
-
 HERE = Path(__file__).resolve().parent
 
 
@@ -47,9 +47,9 @@ def load(path: Path) -> Model:
     return cast(Model, artifacts.load_model(path, zoo.find(artifacts.read_header(path)["model"]).load()))
 
 
-def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float) -> dict[str, object]:
+def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float, split: str) -> dict[str, object]:
     """A line of the table."""
-    task = study.load_task(env, "validation").take(n_targets)
+    task = study.load_task(env, split).take(n_targets)
     prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
     through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
     each = [one for found in through for one in (found.each if isinstance(found, EnsemblePredictor) else [found])]
@@ -64,7 +64,8 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
     return {
         "name": name, "models": " ".join(str(each["model"]) for each in about),
         "seeds": " ".join(str(each["seed"]) for each in about),
-        "seconds": " ".join(str(each["seconds"]) for each in about), "decoders": len(plan.states), "targets": len(task),
+        "seconds": " ".join(str(each["seconds"]) for each in about), "split": split, "decoders": len(plan.states),
+        "targets": len(task),
         "cpu_seconds": f"{time.process_time() - began:.0f}", "cost": f"{cost.mean():.4g}",
         "cost_sem": f"{cost.std() / len(task) ** 0.5:.3g}",
         "within_5cm": f"{(trial.final_distance < task.tolerance).float().mean():.3g}",
@@ -76,7 +77,8 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
 def compared(lines: pd.DataFrame, name: str) -> pd.DataFrame:
     """The lines of as many targets as line ``name`` has, the cheapest first, with the paired difference to it."""
     costs = {other: np.array(texts.split(), float) for other, texts in zip(lines["name"], lines["costs"], strict=True)}
-    same = lines[[len(costs[other]) == len(costs[name]) for other in lines["name"]]]
+    of = dict(zip(lines["name"], lines["split"], strict=True))
+    same = lines[[len(costs[other]) == len(costs[name]) and of[other] == of[name] for other in lines["name"]]]
     same = same.sort_values("cost", key=lambda texts: texts.astype(float))
     minus = [
         "" if other == name else table.spell(costs[name] - costs[other], "{:+.2f} ± {:.2f}") for other in same["name"]
@@ -94,7 +96,7 @@ def alone(lines: pd.DataFrame, singles: pd.DataFrame) -> pd.DataFrame:
     lines: of this table. singles: of ``quality.csv``; of as many targets.
     """
     found = []
-    for line in lines.dropna(subset=["models"]).itertuples():
+    for line in lines[lines["split"] == "validation"].dropna(subset=["models"]).itertuples():
         word, *others = set(zip(line.models.split(), line.seconds.split(), strict=True))
         costs = np.array(line.costs.split(), float)
         own = singles[(singles["model"] == word[0]) & (singles["seconds"].astype(str) == word[1])]
@@ -120,7 +122,8 @@ def main() -> None:
     parser.add_argument("--files", nargs="+", type=Path, default=[], help="models, each with one decoder or several")
     parser.add_argument("--screened", type=float, default=1.0, help="share that all judge (default 1: all candidates)")
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
-    parser.add_argument("--targets", type=int, default=50, help="of the 100 of validation (default 50)")
+    parser.add_argument("--split", default="validation", choices=("validation", "test"), help="default validation")
+    parser.add_argument("--targets", type=int, default=50, help="of the 100 of the split (default 50)")
     parser.add_argument(
         "--out", type=Path, default=HERE / "decoders.csv", help="default decoders.csv beside this script"
     )
@@ -137,7 +140,7 @@ def main() -> None:
         return
     if not given.files:
         parser.error("--name wants --files: the models that a candidate is judged by")
-    line = planned(given.name, given.files, given.env, given.targets, given.screened)
+    line = planned(given.name, given.files, given.env, given.targets, given.screened, given.split)
     pd.concat([lines, pd.DataFrame([line])]).to_csv(given.out, index=False)
     print({name: value for name, value in line.items() if name != "costs"})
 

@@ -27,8 +27,8 @@ class Mixture(EnsembleModel):
     """An equal mixture of models of one environment: a sample is a rollout of one of them, drawn once per rollout.
 
     Its mode is the mean of theirs; planners judge a candidate by its mean return over the modes of all
-    (``model_predictor``), which is harder to exploit than one model. Models may be of any kinds and have segments of any
-    lengths; one that stands there twice counts twice. It is not trained: its models are.
+    (``model_predictor``), which is harder to exploit than one model. Models may be of any kinds and have segments of
+    any lengths; one that stands there twice counts twice. It is not trained: its models are.
 
     segment_len: steps for which a model is kept, at least a horizon. ValueError for no models, or for states of other
     sizes.
@@ -42,7 +42,8 @@ class Mixture(EnsembleModel):
         known = [model.features for model in map(as_dynamics, models) if hasattr(model, "features")]
         if len(sizes := sorted({len(features.step_std) for features in known})) > 1:
             raise ValueError(
-                f"models predict states of {' and '.join(map(str, sizes))} dimensions; expected models of one environment"
+                f"models predict states of {' and '.join(map(str, sizes))} dimensions; expected models of one "
+                "environment"
             )
         self.models, self.members, self.segment_len = tuple(models), len(models), segment_len
         self.past_len = max(as_dynamics(model).past_len for model in models)

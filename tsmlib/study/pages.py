@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import cast
 
 import pandas as pd
 
@@ -84,8 +83,8 @@ def readme_loops(env: str) -> str:
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
     return (
-        f"Planned again every ten steps, the object ends within 5 cm by {loops}. Several networks "
-        f"judging together [plan better than one](benchmarks/settings/README.md), whatever their kind. {readme_training(env)}"
+        f"Planned again every ten steps, the object ends within 5 cm by {loops}. Several networks judging together "
+        f"[plan better than one](benchmarks/settings/README.md), whatever their kind. {readme_training(env)}"
     ).rstrip()
 
 
@@ -111,8 +110,8 @@ def readme_training(env: str) -> str:
         f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
     )
     return (
-        f"[Training time](benchmarks/settings/README.md) decides: after {shorter / shipped:g} of it ({_seeds(before)}) → "
-        f"as shipped ({_seeds(after)}), validation: energy score over the best baseline's at 10, 80 steps {scores}; "
+        f"[Training time](benchmarks/settings/README.md) decides: after {shorter / shipped:g} of it ({_seeds(before)}) "
+        f"→ as shipped ({_seeds(after)}), validation: energy score over the best baseline's at 10, 80 steps {scores}; "
         f"cost of plans {costs}.{_against(trained[shipped], 'onestep')}"
     )
 
@@ -246,8 +245,8 @@ Pushing, seed by seed: the energy score of `{OURS}` over that of the best other 
 
 Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
-over steps. A candidate is judged by the mode of the model; of an ensemble, the first member sorts the candidates and the
-best quarter is judged by the mean over all members (`cem(screened=)`).
+over steps. A candidate is judged by the mode of the model; of an ensemble, the first member sorts the candidates and
+the best quarter is judged by the mean over all members (`cem(screened=)`).
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
