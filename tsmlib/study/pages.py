@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import cast
 
 import pandas as pd
 
@@ -96,19 +97,20 @@ def readme_training(env: str) -> str:
         return ""
     shorter = float(less["seconds"].max())
     wide = lines.pivot_table(index=["seconds", "model", "seed"], values=[*SCORES, "cost"])
-    trained = {seconds: wide.loc[seconds].unstack("model") for seconds in (shorter, shipped)}
+    trained = {s: cast(pd.DataFrame, wide.loc[s].unstack("model")) for s in (shorter, shipped)}
     before, after = (each.dropna() for each in trained.values())  # of seeds that have every model
 
     def both(model: str) -> str:
         return " → ".join(
-            ", ".join(f"{(each[score][model] / each[score][BASELINES].min(axis=1)).mean():.2f}" for score in SCORES)
+            ", ".join(f"{(each[score][model] / each[score][BASELINES].T.min()).mean():.2f}" for score in SCORES)
             for each in (before, after)
         )
 
     scores = "; ".join(f"`{model}` {both(model)}" for model in (PAPERS, OURS))
-    costs = ", ".join(
-        f"`{model}` {before['cost'][model].mean():.1f} → {after['cost'][model].mean():.1f}" for model in README_MODELS
-    )
+    cost = [cast(pd.DataFrame, each["cost"]).mean() for each in (before, after)]
+    named = {f"`{model}`": [of[model] for of in cost] for model in (PAPERS, OURS)}
+    named |= {"the best baseline": [of[BASELINES].min() for of in cost]}
+    costs = ", ".join(f"{name} {less:.1f} → {more:.1f}" for name, (less, more) in named.items())
     return (
         f"[Training time](benchmarks/settings/README.md) decides: after {shorter / shipped:g} of it ({_seeds(before)}) "
         f"→ as shipped ({_seeds(after)}), validation: energy score over the best baseline's at 10, 80 steps {scores}; "
