@@ -199,7 +199,7 @@ def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_
 
 
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:
-    about = {"within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0", "split": "validation"}
+    about = {"env": "e", "within_5cm": "0.5", "cost_sem": "1", "gap_judge": "0", "split": "validation"}
     lines = pd.DataFrame([
         {"name": "ours", "cost": "10.0", "costs": "9 11", **about},
         {"name": "worse", "cost": "13.0", "costs": "12 14", **about},
@@ -243,20 +243,28 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
 
 
 def test_networks_that_judge_together_are_set_against_the_same_networks_one_by_one() -> None:
-    about = {"within_5cm": "0.5", "gap_judge": "0.3", "costs": "1 2", "split": "validation"}
+    about = {
+        "env": "e", "within_5cm": "0.5", "gap_judge": "0.3", "costs": "1 2", "split": "validation", "decoders": "2",
+        "seconds": "580 580", "muons": "0.02 0.02",
+    }  # fmt: skip
     lines = pd.DataFrame([
-        {"models": "lstm lstm", "seeds": "0 1", "seconds": "580 580", **about},
-        {"models": "lstm tsm", "seeds": "0 0", "seconds": "580 580", **about},  # of two kinds
-        {"models": "lstm lstm", "seeds": "0 2", "seconds": "580 580", **about},  # one of them was not planned with
-        {"models": None, "seeds": None, "seconds": None, **about},
+        {"models": "lstm lstm", "seeds": "0 1", **about},
+        {"models": "lstm tsm", "seeds": "0 0", **about},  # of two kinds
+        {"models": "lstm lstm", "seeds": "1 1", **about},  # one training twice
+        {"models": "lstm lstm", "seeds": "0 1", **about, "split": "test"},
+        {"models": "lstm lstm", "seeds": "0 1", **about, "costs": "1 2 3"},  # of other targets
+        {"models": None, "seeds": None, **about},
     ])  # fmt: skip
+    kind = {"env": "e", "model": "lstm", "seconds": 580, "muon": 0.02, "within": 0.5}
     singles = pd.DataFrame([
-        {"model": "lstm", "seed": seed, "seconds": 580, "targets": 2, "costs": costs, "within": 0.5}
+        kind | {"seed": seed, "costs": costs}
         for seed, costs in ((0, "2 3"), (1, "4 7"))
     ])  # fmt: skip
     (line,) = decoders.alone(lines, singles).to_dict("records")
     assert (line["model"], line["networks"], line["one by one"], line["together"]) == ("lstm", 2, "4.00", "1.50")
     assert line["difference"].startswith("-2.50 ± ")
+    with pytest.raises(ValueError, match=r"quality.csv has no line of .*'lstm', 2, 580"):
+        decoders.alone(lines[:1].assign(seeds="0 2"), singles)
 
 
 def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:

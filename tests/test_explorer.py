@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
@@ -103,16 +104,23 @@ def test_the_arm_in_the_page_moves_as_in_python(task: str) -> None:
 @torch.no_grad()
 @pytest.mark.parametrize("task", ENVS)
 def test_networks_in_the_page_predict_as_in_torch(task: str) -> None:
+    # Where the object is met, rounding grows: in float32 torch's own states may differ by more from those in float64.
     frozen, questions, expected = load_task(ENVS[task]), [], []
     past = frozen.past(10)
     actions = torques(len(frozen), STEPS)
+    exact = Segment(*(part.double() for part in past))
     for word in MODELS:
         for k, decoder in enumerate(decoders(word, ENVS[task])):
-            expected.append(rollout(decoder, past, actions))
+            states = rollout(decoder, past, actions)
+            rounded = states - rollout(copy.deepcopy(decoder).double(), exact, actions.double())
+            expected.append((states, rounded.abs().amax((1, 2)).numpy()))
             asked = {"what": "rollout", "task": task, "model": word, "decoder": k, "pasts": as_pasts(past)}
             questions.append(asked | {"actions": actions.flatten(1).tolist()})
-    for found, states in zip(ask(*questions), expected, strict=True):
-        assert_near(found, states, 1e-4)
+    for found, (states, rounding) in zip(ask(*questions), expected, strict=True):
+        apart = np.array(found).reshape(states.shape) - states.numpy()
+        assert (np.abs(apart).max((1, 2)) > 1e-4).sum() <= 1  # of 100 episodes
+        for row, its in zip(apart, rounding, strict=True):
+            assert_near(row, np.zeros_like(row), max(1e-4, 10 * its))
 
 
 @torch.no_grad()
@@ -123,22 +131,20 @@ def test_codes_and_a_past_in_motion_are_read_as_in_torch() -> None:
     codes = torch.randn(8, 3, 8, generator=torch.Generator().manual_seed(1))
     asked = {"what": "rollout", "task": "push", "pasts": as_pasts(past), "codes": codes.flatten(1).tolist()}
     asked["actions"] = actions[:, 30:].flatten(1).tolist()
-    recurrent, (tsm,) = (decoders(word, ENVS["push"]) for word in ("rtsm", "tsm"))
-    assert len(recurrent) == 3
+    (recurrent,), (tsm,) = (decoders(word, ENVS["push"]) for word in ("rtsm", "tsm"))
     assert isinstance(tsm, TSM)
     chained, before = [], past
     for k in range(3):
         u = actions[:, 30 + 10 * k : 40 + 10 * k]
         chained.append(tsm.decode(before, u, codes[:, k]))
         before = Segment(chained[-1], u)
-    *found, stack = ask(*(asked | {"model": "rtsm", "decoder": k} for k in range(3)), asked | {"model": "tsm"})
-    for states, decoder in zip(found, recurrent, strict=True):
-        assert_near(states, decoder.decode(past, actions[:, 30:], codes), 1e-4)
+    found, stack = ask(asked | {"model": "rtsm"}, asked | {"model": "tsm"})
+    assert_near(found, recurrent.decode(past, actions[:, 30:], codes), 1e-4)
     assert_near(stack, torch.cat(chained, 1), 1e-4)
 
 
 @torch.no_grad()
-def test_a_candidate_is_worth_the_mean_over_the_modes_of_all_decoders() -> None:
+def test_a_candidate_is_worth_what_its_mode_returns() -> None:
     task, model = load_task(ENVS["push"]).take(20), load_pretrained("rtsm", env=ENVS["push"])
     space = LatentActions(load_pretrained("prior", env=task.env), task.horizon)  # type: ignore[arg-type]
     codes = torch.randn(1, 20, 10, 8, generator=torch.Generator().manual_seed(3))
@@ -153,7 +159,7 @@ def test_candidates_are_judged_alike_by_any_number_of_workers() -> None:
     codes = torch.randn(64, 80, generator=torch.Generator().manual_seed(4)).tolist()
     asked = {"what": "sorted", "task": "push", "model": "rtsm", "past": as_pasts(task.past(10))[0], "codes": codes}
     alone, *shared = ask(*(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4)))
-    assert sum(value is not None for value in alone) == 16
+    assert sum(value is not None for value in alone) == 64  # one decoder sorts nothing out
     assert all(found == alone for found in shared)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,7 +13,8 @@ from untrained import in_units
 import tsmlib as tsm
 from tsmlib.models.base import predict_segment, stepper
 from tsmlib.planning.predictors import EnsemblePredictor
-from tsmlib.sampling import SeparateNoise, SharedNoise
+from tsmlib.sampling import Noise, SeparateNoise, SharedNoise
+from tsmlib.storage.artifacts import digest
 from tsmlib.trajectory import Segment
 
 DX, DU, B, T = 6, 2, 5, 25
@@ -66,12 +70,16 @@ def test_decoders_as_models_of_their_own_predict_and_are_judged_as_the_one_model
         assert torch.allclose(one(candidates), other(candidates))
 
 
-@pytest.mark.parametrize("noise", [None, 5])
-def test_a_step_at_a_time_gives_the_states_of_the_rollout(noise: int | None) -> None:
-    mixture, (past, actions) = tsm.Mixture([one_step(0), recurrent(1), one_step(2)]), given()
-    step = stepper(mixture, past, generator=None if noise is None else drawn(noise))
+@pytest.mark.parametrize(
+    "noise",
+    [lambda: None, lambda: drawn(5), lambda: SharedNoise(drawn(5), 3), lambda: SeparateNoise((drawn(5), drawn(6)))],
+    ids=["mode", "generator", "shared", "separate"],
+)
+def test_a_step_at_a_time_gives_the_states_of_the_rollout(noise: Callable[[], Noise | None]) -> None:
+    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given(6)
+    step = stepper(mixture, past, generator=noise())
     found = torch.stack([step(u) for u in actions.unbind(1)], dim=1)
-    assert torch.allclose(found, tsm.rollout(mixture, past, actions, generator=None if noise is None else drawn(noise)))
+    assert torch.allclose(found, tsm.rollout(mixture, past, actions, generator=noise()))
 
 
 def test_candidates_are_compared_in_the_same_futures() -> None:
@@ -118,11 +126,34 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     assert plan.states.shape == (32, 2, task.horizon, 6)
 
 
-def test_no_models_or_models_of_other_robots_are_refused() -> None:
+def test_each_member_of_each_model_judges_a_candidate() -> None:
+    models, (past, actions) = [recurrent(0, members=3), tsm.Mixture([one_step(1), one_step(2)])], given()
+    judge = tsm.model_predictor(tsm.Mixture(models), past)
+    assert isinstance(judge, EnsemblePredictor)
+    alone = [models[0].alone(k) for k in range(3)] + [one_step(1), one_step(2)]
+    for found, model in zip(judge(actions[None]), alone, strict=True):
+        assert torch.allclose(found[0], tsm.rollout(model, past, actions))
+
+
+def test_what_is_no_models_of_one_environment_is_refused() -> None:
     with pytest.raises(ValueError, match="a mixture of no models"):
         tsm.Mixture([])
-    other = in_units(tsm.OneStep(10, DU, hidden=16, layers=2))
-    with pytest.raises(ValueError, match="states of 6 and 10 dimensions; expected models of one environment"):
+    with pytest.raises(TypeError, match=r"a mixture of a OneStep; expected a list of models, as in Mixture\(\[one, "):
+        tsm.Mixture(one_step(0))  # type: ignore[arg-type]
+    other = in_units(tsm.OneStep(10, DU, angles=(0, 1), hidden=16, layers=2))
+    with pytest.raises(ValueError, match=r"6 dimensions with angles \[0, 1\] and 10 dim.*expected models of one env"):
         tsm.Mixture([one_step(0), other])
-    with pytest.raises(ValueError, match="segment_len is 0, expected a positive number of steps"):
-        tsm.Mixture([one_step(0)], segment_len=0)
+
+
+def test_a_mixture_is_neither_stored_nor_trained(tmp_path: Path) -> None:
+    mixture = tsm.Mixture([one_step(0), one_step(1)])
+    with pytest.raises(TypeError, match="a Mixture is not stored; save each of its models"):
+        tsm.save_model(tmp_path / "m.safetensors", mixture, {})
+    with pytest.raises(TypeError, match="a Mixture is not trained"):
+        mixture.loss(None, None)
+
+
+def test_mixtures_are_told_apart_by_their_weights() -> None:
+    assert digest(tsm.Mixture([one_step(0), one_step(1)]).state_dict()) != digest(
+        tsm.Mixture([one_step(0), one_step(2)]).state_dict()
+    )

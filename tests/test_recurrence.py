@@ -147,7 +147,7 @@ def test_autocast_around_the_backward_pass_changes_nothing(name: str) -> None:
 
 @pytest.mark.parametrize("batch", [4, 33, 48])
 def test_nothing_depends_on_memory_that_was_never_written(batch: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Products in bfloat16 on AMX read beyond the part of a row that they are given; what is no number there spread.
+    # Products in bfloat16 on AMX read beside the columns that they are given; elsewhere this proves nothing.
     net, *_ = setting("rtsm", (0, 1), torch.float32)
     past, actions = Segment(torch.randn(batch, L, DX), torch.randn(batch, L, DU)), torch.randn(batch, K, DU)
     empty, empty_like = torch.Tensor.new_empty, torch.empty_like

@@ -5,7 +5,7 @@ and trainer (``ModelTrainer``), with the settings of its own examples, trained f
 it is fed is what the models here are fed: cosine and sine of the angles, standardised velocities and positions, and the
 action; its target is the increment of the state in units of its standard deviation. README.md tells how to install it.
 
-    python benchmarks/peers/pets.py --env tsm/ReacherPush-v1 --form mse --seconds 300
+    python benchmarks/peers/pets.py --env tsm/ReacherPush-v1 --form mse --seconds 2320
 """
 
 from __future__ import annotations

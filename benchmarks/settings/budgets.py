@@ -3,9 +3,9 @@
     python benchmarks/settings/budgets.py lstm --times 3 --muon 0.01
     python benchmarks/settings/budgets.py rtsm --times 0.3333 --seed 2
 
-trains on the data of scale paper, seed 0, and their symmetric copies; a recurrent TSM has one decoder. Model and
-checkpoints go to the run's folder ``settings`` (``TSM_RUN_DIR``); stopped, it goes on from there. ``curve.py`` makes
-the lines of the table from such a folder, ``decoders.py`` plans with the models.
+trains on the data of scale paper, seed 0, and their symmetric copies. Model and checkpoints go to the run's folder
+``settings`` (``TSM_RUN_DIR``); stopped, it goes on from there. ``curve.py`` makes the lines of the table from such a
+folder, ``decoders.py`` plans with the models.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ def main() -> None:
     torch.set_num_threads(1)
     run, spec, env = runs.resolve("02_train", scale="paper", seed=0), zoo.find(given.model), EnvSpec.parse(given.env)
     data, held_out = models.training_data(run, given.env, given.model)
-    one = {"members": 1} if given.model == "rtsm" else {}
-    net = spec.load().for_data(data, seed=given.seed, **{**spec.arguments(env), **one})
+    net = spec.load().for_data(data, seed=given.seed, **spec.arguments(env))
     stages = spec.schedule(env, given.times)
     if given.muon is not None:
         stages = [replace(stage, muon=given.muon) for stage in stages]

@@ -26,7 +26,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import torch
-from quality import described
+from quality import KEY, described
 
 from tsmlib import study
 from tsmlib.models.base import Model
@@ -40,6 +40,7 @@ from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 
 HERE = Path(__file__).resolve().parent
+TRAININGS = ("models", "seeds", "seconds", "muons")  # columns: of each file in turn
 
 
 def load(path: Path) -> Model:
@@ -49,7 +50,11 @@ def load(path: Path) -> Model:
 
 def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float, split: str) -> dict[str, object]:
     """A line of the table."""
-    task = study.load_task(env, split).take(n_targets)
+    about, task = [described(path) for path in files], study.load_task(env, split).take(n_targets)
+    trainings = {
+        words: " ".join(str(training[word]) for training in about)
+        for words, word in zip(TRAININGS, KEY[1:], strict=True)
+    }
     prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
     through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
     each = [one for found in through for one in (found.each if isinstance(found, EnsemblePredictor) else [found])]
@@ -60,11 +65,8 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
     plan = cem(judge, task.reward, space, len(task), **options)
     trial = execute(task, plan)
     cost = -trial.executed_return
-    about = [described(path) for path in files]
-    return {
-        "name": name, "models": " ".join(str(each["model"]) for each in about),
-        "seeds": " ".join(str(each["seed"]) for each in about),
-        "seconds": " ".join(str(each["seconds"]) for each in about), "split": split, "decoders": len(plan.states),
+    return trainings | {
+        "name": name, "env": env, "split": split, "screened": screened, "decoders": len(plan.states),
         "targets": len(task),
         "cpu_seconds": f"{time.process_time() - began:.0f}", "cost": f"{cost.mean():.4g}",
         "cost_sem": f"{cost.std() / len(task) ** 0.5:.3g}",
@@ -77,8 +79,8 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
 def compared(lines: pd.DataFrame, name: str) -> pd.DataFrame:
     """The lines of as many targets as line ``name`` has, the cheapest first, with the paired difference to it."""
     costs = {other: np.array(texts.split(), float) for other, texts in zip(lines["name"], lines["costs"], strict=True)}
-    of = dict(zip(lines["name"], lines["split"], strict=True))
-    same = lines[[len(costs[other]) == len(costs[name]) and of[other] == of[name] for other in lines["name"]]]
+    of = {line.name: (line.env, line.split, len(costs[line.name])) for line in lines.itertuples(index=False)}
+    same = lines[[of[other] == of[name] for other in lines["name"]]]
     same = same.sort_values("cost", key=lambda texts: texts.astype(float))
     minus = [
         "" if other == name else table.spell(costs[name] - costs[other], "{:+.2f} ± {:.2f}") for other in same["name"]
@@ -95,18 +97,26 @@ def alone(lines: pd.DataFrame, singles: pd.DataFrame) -> pd.DataFrame:
 
     lines: of this table. singles: of ``quality.csv``; of as many targets.
     """
-    found = []
+    single, found = singles.set_index(KEY), []
     for line in lines[lines["split"] == "validation"].dropna(subset=["models"]).itertuples():
-        word, *others = set(zip(line.models.split(), line.seconds.split(), strict=True))
-        costs = np.array(line.costs.split(), float)
-        own = singles[(singles["model"] == word[0]) & (singles["seconds"].astype(str) == word[1])]
-        own = own[own["seed"].astype(str).isin(line.seeds.split()) & (own["targets"] == len(costs))]
-        if others or len(own) != len(set(line.seeds.split())) or len(own) < 2:
+        words = (getattr(line, each).split() for each in TRAININGS)
+        trainings = [
+            (line.env, model, int(seed), int(seconds), float(muon))
+            for model, seed, seconds, muon in zip(*words, strict=True)
+        ]
+        costs, kinds = np.array(line.costs.split(), float), {(model, *how) for _, model, _, *how in trainings}
+        if len(kinds) > 1 or len(set(trainings)) < 2 or int(line.decoders) != len(set(trainings)):
             continue
+        if missing := [each for each in trainings if each not in single.index]:
+            raise ValueError(f"quality.csv has no line of {missing[0]}; run: quality.py measure FILE, of that training")
+        own = single.loc[trainings]
         each = np.array([texts.split() for texts in own["costs"]], float)
+        if each.shape != (len(trainings), len(costs)):
+            continue  # of other targets
         found.append({
-            "model": word[0], "seconds": word[1], "networks": len(own), "one by one": f"{each.mean():.2f}",
-            "together": f"{costs.mean():.2f}", "difference": table.spell(costs - each.mean(axis=0), "{:+.2f} ± {:.2f}"),
+            "model": trainings[0][1], "seconds": trainings[0][3], "networks": len(own),
+            "one by one": f"{each.mean():.2f}", "together": f"{costs.mean():.2f}",
+            "difference": table.spell(costs - each.mean(axis=0), "{:+.2f} ± {:.2f}"),
             "within 5 cm, one by one": f"{own['within'].mean():.0%}",
             "within 5 cm, together": f"{float(line.within_5cm):.0%}", "predicted beyond executed": line.gap_judge,
         })  # fmt: skip
@@ -136,7 +146,9 @@ def main() -> None:
         print(table.markdown(compared(lines, given.compare)))
         return
     if given.alone:
-        print(table.markdown(alone(lines, pd.read_csv(HERE / "quality.csv"))))
+        if not len(lines) or not len(found := alone(lines, pd.read_csv(HERE / "quality.csv"))):
+            parser.error(f"{given.out} has no line of several trainings of one model; add one by --name and --files")
+        print(table.markdown(found))
         return
     if not given.files:
         parser.error("--name wants --files: the models that a candidate is judged by")

@@ -71,7 +71,7 @@ def described(path: Path) -> dict[str, object]:
     env = header["fingerprint"]["env"]
     whole = zoo.find(header["model"]).schedule(EnvSpec.parse(env))
     schedule = zoo.stated(header.get("schedule", [stage.stated() for stage in whole]))
-    share = round(schedule[0]["steps"] / whole[0].steps, 2)  # updates are in tens
+    share = round(schedule[0]["steps"] / whole[0].steps, 4)  # updates are in tens
     curves = list(header["curves"].values())[: len(schedule)]  # of the first decoder
     return {
         "env": env, "model": header["model"], "seed": header["seed"],

@@ -12,9 +12,8 @@ export const LESSONS = [
     math: math('P of X plus given X minus, U minus, U plus and Z',
       `${i('P')}${o('(')}${sup('X', '+')}${o('|')}${sup('X', '−')}${o(',')}${sup('U', '−')}${o(',')}${sup('U', '+')}${o(',')}${i('Z')}${o(')')}`),
     text: 'A segment model predicts the next ten states X⁺ as a whole, from the ten before, the torques before, and the torques '
-      + 'to come U⁺. Chained, ten segments make two seconds. Here these are the TSM of the paper and our recurrent TSM, which for '
-      + 'pushing is three networks: plans are judged by their mean, and the arm shows the first. The one-step model and the LSTM '
-      + 'predict one state after the other.',
+      + 'to come U⁺. Chained, ten segments make two seconds. Here these are the TSM of the paper and our recurrent TSM. The one-step '
+      + 'model and the LSTM predict one state after the other.',
   },
   {
     title: '2. Code Z',
@@ -48,33 +47,34 @@ export const LESSONS = [
 export const TOUR = [
   {
     title: 'An easy push',
-    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
+    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=-1.17,-2.46&target=0.15,-0.04&block=-0.03,0.12',
     text: 'The recurrent TSM predicts, the planner picks torques, and MuJoCo executes them without looking again. '
       + 'The two agree: predicted and executed return are close, and the object arrives. Turn a knob of the code Z: another Z, '
       + 'another future of the same torques.',
   },
   {
     title: 'A bounce',
-    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=1.53,-0.4&target=-0.15,-0.1&block=0.17,-0.01',
+    link: '#task=push&model=rtsm&space=latent&replan=0&seed=1&arm=-0.94,1.8&target=0.16,-0.09&block=-0.05,-0.15',
     text: 'Here the object meets a wall and bounces off it. What happens then depends on the last millimetre, which the past does not '
       + 'tell: that is left to the code Z, and the thin lines, one for each random Z, spread. The model is less certain, and the '
       + 'execution falls among its futures rather than on their middle. Turn both knobs of Z.',
   },
   {
     title: 'A fooled one-step model',
-    link: '#task=push&model=onestep&space=direct&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
+    link: '#task=push&model=onestep&space=direct&replan=0&seed=1&arm=-1.17,-2.46&target=0.15,-0.04&block=-0.03,0.12',
     text: 'The first scene again, with two changes: a model that predicts one state at a time (it has no code Z, so no thin lines), and a '
       + 'planner free to choose any torques. It found a plan whose prediction is good and wrong: the predicted return is far above the executed one.',
   },
   {
     title: 'What the prior forbids',
-    link: '#task=push&model=onestep&space=latent&replan=0&seed=1&arm=1.7,-1.4&target=-0.12,-0.11&block=0.06,-0.08',
+    link: '#task=push&model=onestep&space=latent&replan=0&seed=1&arm=-1.17,-2.46&target=0.15,-0.04&block=-0.03,0.12',
     text: 'One of the two changes taken back: the same one-step model, but the planner searches codes c, which the action prior turns into torques like those of the '
-      + 'training data. Others, such as those that fooled the model, are out of its reach: the gap is much smaller, and the object arrives.',
+      + 'training data. Here the gap is nearly gone, and the object arrives. Other random numbers can turn this round: over 100 '
+      + 'targets this model is fooled about as often with codes.',
   },
   {
     title: 'Planning again',
-    link: '#task=push&model=rtsm&space=latent&replan=1&seed=2&arm=-1.68,-2.45&target=0,-0.11&block=0.05,0.09',
+    link: '#task=push&model=rtsm&space=latent&replan=1&seed=1&arm=-2.44,-0.85&target=0.04,0.08&block=-0.1,-0.11',
     text: 'A long way round. One plan, executed without looking, misses by about 10 cm (untick “Plan again” and see). Looking every ten '
       + 'steps (0.2 s) and planning the rest anew, it ends far nearer, on a slow machine less so. Each faint line is what an earlier plan '
       + 'predicted, from the dot where it was made.',

@@ -2,57 +2,75 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tsmlib.models.base import EnsembleModel, Model, Step, as_dynamics, rollout, stepper
 from tsmlib.models.features import Features
-from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise, draw_members
+from tsmlib.sampling import Noise, SeparateNoise, SharedNoise, draw_members
 from tsmlib.trajectory import Segment
 
 
 @dataclass(frozen=True)
-class Share:
+class _Share:
     """Rows of a batch (n,), the member that predicts them, and its noise."""
 
     rows: Tensor
     member: int
-    noise: Noise | None
+    noise: torch.Generator | SharedNoise | None
 
 
-class Mixture(EnsembleModel):
-    """An equal mixture of models of one environment: a sample is a rollout of one of them, drawn once per rollout.
+class Mixture(nn.Module, EnsembleModel):
+    """An equal mixture of M models of one environment: p(X+ | X-, U-, U+) = 1/M sum_m p_m(X+ | X-, U-, U+).
 
-    Its mode is the mean of theirs; planners judge a candidate by its mean return over the modes of all
-    (``model_predictor``), which is harder to exploit than one model. Models may be of any kinds and have segments of
-    any lengths; one that stands there twice counts twice. It is not trained: its models are.
+    A sample is a rollout of one of them, drawn once per rollout. The mode is the mean of theirs; planners judge a
+    candidate by its mean return over the modes of all (``model_predictor``), which is harder to exploit than one model.
+    Models may be of any kinds, with segments of any lengths; one that is given twice counts twice. Weights stay those
+    of the models, which are trained and stored one by one.
 
-    segment_len: steps for which a model is kept, at least a horizon. ValueError for no models, or for states of other
-    sizes.
+    TypeError where no sequence of models is given; ValueError for none, or for states of other sizes or angles. Models
+    do not know their robot, so another one with the same states is not noticed.
     """
 
-    def __init__(self, models: Sequence[Model], *, segment_len: int = 1000) -> None:
-        if not models:
-            raise ValueError("a mixture of no models; give at least one, as in Mixture([one, another])")
-        if segment_len < 1:
-            raise ValueError(f"segment_len is {segment_len}, expected a positive number of steps")
-        known = [model.features for model in map(as_dynamics, models) if hasattr(model, "features")]
-        if len(sizes := sorted({len(features.step_std) for features in known})) > 1:
-            raise ValueError(
-                f"models predict states of {' and '.join(map(str, sizes))} dimensions; expected models of one "
-                "environment"
+    segment_len = sys.maxsize  # a rollout of any length is one segment
+
+    def __init__(self, models: Iterable[Model]) -> None:
+        if not isinstance(models, Iterable) or isinstance(models, nn.Module):
+            raise TypeError(
+                f"a mixture of a {type(models).__name__}; expected a list of models, as in Mixture([one, another])"
             )
-        self.models, self.members, self.segment_len = tuple(models), len(models), segment_len
-        self.past_len = max(as_dynamics(model).past_len for model in models)
-        self.stochastic = self.members > 1 or as_dynamics(models[0]).stochastic
+        super().__init__()
+        self.models = tuple(models)
+        if not self.models:
+            raise ValueError("a mixture of no models; expected at least one, as in Mixture([one, another])")
+        dynamics = [as_dynamics(model) for model in self.models]
+        self.parts = nn.ModuleList([model for model in self.models if isinstance(model, nn.Module)])
+        self.members, self.past_len = len(self.models), max(model.past_len for model in dynamics)
+        self.stochastic = self.members > 1 or dynamics[0].stochastic
+        states = {(len(features.step_std), tuple(features.angles)) for features in self._known()}
+        if len(states) > 1:
+            found = " and ".join(f"{n} dimensions with angles {list(angles)}" for n, angles in sorted(states))
+            raise ValueError(f"models predict states of {found}; expected models of one environment")
+
+    def _known(self) -> list[Features]:
+        """The statistics of those models that have some."""
+        found = (getattr(model, "features", None) for model in self.models)
+        return [features for features in found if isinstance(features, Features)]
 
     @property
     def features(self) -> Features:
-        """Statistics of the first model's training data, in whose units scores are; AttributeError without them."""
-        return as_dynamics(self.models[0]).features
+        """Statistics of the first model that has some, in whose units scores are.
+
+        AttributeError without any: then scores need features of their own (``tsmlib.score``).
+        """
+        if not (known := self._known()):
+            raise AttributeError("no model of this mixture has features (statistics of its training data)")
+        return known[0]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Read the past (B, L, .). No generator: the mode; with one: a sample."""
@@ -61,9 +79,12 @@ class Mixture(EnsembleModel):
             stepper(self.models[share.member], Segment(*(part[share.rows] for part in past)), generator=share.noise)
             for share in shares
         ]
-        return lambda u: self._joined(
-            [step(u[share.rows]) for step, share in zip(steps, shares, strict=True)], shares, generator
-        )
+
+        def step(u: Tensor) -> Tensor:
+            states = [step(u[share.rows]) for step, share in zip(steps, shares, strict=True)]
+            return _joined(states, shares, mode=generator is None)
+
+        return step
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """States (B, K, dx) under ``actions`` (B, K, du)."""
@@ -75,30 +96,47 @@ class Mixture(EnsembleModel):
             )
             for share in shares
         ]  # fmt: skip
-        return self._joined(states, shares, generator)
+        return _joined(states, shares, mode=generator is None)
 
-    def _shares(self, like: Tensor, noise: Noise | None) -> Iterator[Share]:
+    def loss(self, *_: object) -> NoReturn:
+        """TypeError: what is trained is each model."""
+        raise TypeError("a Mixture is not trained; train or fine-tune each of its models, then make it of them")
+
+    def config(self) -> NoReturn:
+        """TypeError: what is stored is each model."""
+        raise TypeError("a Mixture is not stored; save each of its models, then make it of what load_model gives")
+
+    def _shares(self, like: Tensor, noise: Noise | None) -> Iterator[_Share]:
         """The rows of each member, for the mode all of them."""
         rows = torch.arange(len(like), device=like.device)
         if noise is None:
-            yield from (Share(rows, k, None) for k in range(self.members))
+            yield from (_Share(rows, k, None) for k in range(self.members))
         elif isinstance(noise, SeparateNoise):
             for part, own in zip(rows.split(len(rows) // len(noise.generators)), noise.generators, strict=True):
-                yield from (Share(part[share.rows], share.member, own) for share in self._shares(like[part], own))
+                yield from (
+                    _Share(part[share.rows], share.member, share.noise) for share in self._shares(like[part], own)
+                )
         else:
             member = draw_members(self.members, len(rows), noise, like[:, 0])
             for k in member.unique().tolist():
-                yield Share(rows[member == k], k, _of_share(noise, member == k))
-
-    def _joined(self, states: Iterable[Tensor], shares: Sequence[Share], noise: Noise | None) -> Tensor:
-        """The members' states as rows (B, ..., dx)."""
-        if noise is None:
-            return torch.stack(list(states)).mean(0)
-        return torch.cat(list(states))[torch.cat([share.rows for share in shares]).argsort()]
+                yield _Share(rows[member == k], k, _of_share(noise, member == k))
 
 
-def _of_share(noise: Noise, chosen: Tensor) -> Noise | None:
-    """The noise of some rows: members predict by their modes without any, and share it where all rows do."""
-    if isinstance(noise, NoNoise):
-        return None
-    return SharedNoise(noise.generator, int(chosen[: noise.period].sum())) if isinstance(noise, SharedNoise) else noise
+def _of_share(noise: Noise, chosen: Tensor) -> torch.Generator | SharedNoise:
+    """The noise of one member's rows: a generator of its own, so that members draw in any order.
+
+    chosen: (B,), which rows they are. Rows that share noise are chosen together.
+    """
+    if not isinstance(noise, (torch.Generator, SharedNoise)):
+        raise TypeError(f"a Mixture draws by a generator or SharedNoise, not by {type(noise).__name__}")
+    source = noise.generator if isinstance(noise, SharedNoise) else noise
+    seed = int(torch.randint(2**62, (), generator=source, device=source.device))
+    own = torch.Generator(device=source.device).manual_seed(seed)
+    return SharedNoise(own, int(chosen[: noise.period].sum())) if isinstance(noise, SharedNoise) else own
+
+
+def _joined(states: Sequence[Tensor], shares: Sequence[_Share], *, mode: bool) -> Tensor:
+    """The members' states as rows (B, ..., dx): of the mode their mean, else each in its place."""
+    if mode:
+        return torch.stack(list(states)).mean(0)
+    return torch.cat(list(states))[torch.cat([share.rows for share in shares]).argsort()]

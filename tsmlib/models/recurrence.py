@@ -133,9 +133,9 @@ class Recurrence(torch.autograd.Function):
         (steps, batch, dz), n, after = codes.shape, h.shape[1], len(cell)
         kept, inner = steps if keep else min(1, steps), 0 if hidden is None else hidden.shape[1]
         sizes = [dz, n, after - dz - n - given.shape[2], given.shape[2], n]  # [z, h_{t-1}, s, [u, 1], h_t]
-        # Zeros, also behind each row: products in bfloat16 may read beyond the part of a row that they are given, by
-        # whole registers (oneDNN on AMX), and what is no number there would spread.
-        rows = h.new_zeros(kept, batch, sum(sizes) + 64, dtype=kind)[..., : sum(sizes)]
+        # Zeros: products in bfloat16 read the part of a row that they are given up to the next multiple of 32 columns
+        # (oneDNN on AMX), and what is no number there spreads.
+        rows = h.new_zeros(kept, batch, sum(sizes), dtype=kind)
         gates = h.new_empty(kept, batch, 4 * n)
         cell, hidden = cell.to(kind), None if hidden is None else hidden.to(kind)
         tanhs, cells = h.new_empty(2, kept, batch, n).unbind(0)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import chain
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from tsmlib.collection import collect, open_loop
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import UnsupportedEnvironment, continued, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
+from tsmlib.models.mixture import Mixture
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.sampling import Noise, NoNoise, SharedNoise
@@ -26,7 +28,8 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     """Predict by rolling out ``model`` from ``past`` (B, L, .): its mode, or samples of it.
 
     samples: 0 rolls out the mode (z = 0) of every candidate, S = 1, or of an ensemble the mode of each member, S of
-    them; n draws n samples of each, S = n, with the same noise, a function of ``seed``, for every candidate and call.
+    them, of a ``Mixture`` those of all its models; n draws n samples of each, S = n, with the same noise, a function of
+    ``seed``, for every candidate and call.
     ValueError for samples of a deterministic model.
     """
     if samples < 0:
@@ -36,6 +39,10 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
             f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
             "mode, samples=0"
         )
+    if not samples and isinstance(model, Mixture):
+        judges = (model_predictor(each, past) for each in model.models)
+        every = ([judge] if not isinstance(judge, EnsemblePredictor) else judge.each for judge in judges)
+        return EnsemblePredictor(tuple(chain.from_iterable(every)))
     if not samples and members(model) > 1:
         n = members(model)
         alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))

@@ -99,7 +99,7 @@ def adapted(
     (train, validation), began, title = data, time.process_time(), f"{env} {word}: {way}"
     if way == "scratch":
         spec = zoo.find(word)
-        arguments = {k: v for k, v in spec.arguments(EnvSpec.parse(env)).items() if k != "members"}
+        arguments = spec.arguments(EnvSpec.parse(env))
         net = cast(type[RecurrentTSM], spec.load()).for_data(train, seed=seed, **arguments)
         fit(net, net.loss, train, validation, options(net, word, way, share), seed=seed, progress=title)
     else:

@@ -210,10 +210,9 @@ def _share(run: Run) -> float:
 
 
 def training_seconds(run: Run, env: str, model: str) -> float:
-    """The budget of a training, of all its parts."""
+    """The budget of a training."""
     spec = zoo.find(model)
-    seconds = _share(run) * (zoo.BUDGET[EnvSpec.parse(env).standard.name] if spec.budget is None else spec.budget)
-    return seconds * cast(int, spec.arguments(EnvSpec.parse(env)).get("members", 1))
+    return _share(run) * (zoo.BUDGET[EnvSpec.parse(env).standard.name] if spec.budget is None else spec.budget)
 
 
 def _duration(run: Run, env: str, model: str) -> str:

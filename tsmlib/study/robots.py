@@ -34,7 +34,7 @@ class Recipe(NamedTuple):
 
 
 def _stage(loss: str, share: float = 1.0, **options: Any) -> Stage:
-    """Muon at the best rate of the baselines at pushing. The rate of updates is measured."""
+    """Muon at the best rate of short trainings of the baselines at pushing. The rate of updates is measured."""
     return Stage(loss, rate=0.0, share=share, muon=0.02, **options)
 
 

@@ -142,7 +142,7 @@ def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> 
 
 
 def _muon(stage: Stage) -> Stage:
-    """The stage with Muon, at half the best rate of a quarter of the time (``benchmarks/settings``, sections 4, 7)."""
+    """The stage with Muon, at half the best rate of a quarter of the time (``benchmarks/settings``, sections 5, 7)."""
     return replace(stage, muon=0.01, lr=2e-3)
 
 
