@@ -220,6 +220,14 @@ def test_a_doubling_of_the_training_time_is_read_from_neighbouring_lines_of_a_mo
     assert np.allclose(found[list(quality.MEASURES)], -0.5)
 
 
+def test_a_line_without_violations_is_spelled_without_them() -> None:
+    line = {"env": "e", "model": "tsm", "seconds": 80, "cpu_seconds": 70, "updates": 9, "muon": 0.0, "coverage80": 0.8}
+    whole = pd.DataFrame([line | dict.fromkeys([*quality.MEASURES, "within"], 0.5)])
+    violations = quality.MEASURES["violations"]
+    assert violations in quality.spelled(whole)
+    assert violations not in quality.spelled(whole.assign(violations=float("nan")))
+
+
 def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as_long() -> None:
     trained = [("tsm", 580, 0.3), ("lstm", 580, 0.4), ("onestep", 580, 0.2), ("tsm", 2320, 0.1), ("lstm", 2320, 0.2)]
     about = [{"env": "e", "model": model, "seconds": s} | dict.fromkeys(quality.SCORES, x) for model, s, x in trained]

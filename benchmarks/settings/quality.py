@@ -21,8 +21,8 @@ together prints the same of recurrent TSMs whose first decoders judge and predic
 table prints the lines of training seed 0 as Markdown, with the cost of the recurrent TSM minus that of each model
 trained as long, paired by target with half the 95 % t interval over targets, and what a doubling of the time buys, from
 each line of a model to the next. Of a training with several seeds follow means with half the 95 % t interval over
-seeds, and each model with codes against every baseline, paired by seed. figure draws all lines into
-figures/training_time.
+seeds, and each model with codes against every baseline, paired by seed. lines prints the lines alone, of any
+environments. figure draws all lines into figures/training_time.
 """
 
 from __future__ import annotations
@@ -204,6 +204,16 @@ def against_baselines(lines: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
+def spelled(lines: pd.DataFrame) -> pd.DataFrame:
+    """Each line as texts; measures that it has nothing of are left out."""
+    measures = {name: title for name, title in MEASURES.items() if lines[name].notna().any()}
+    return lines[["env", "model", "seconds", "cpu_seconds", "updates", "muon"]].assign(
+        **{title: lines[name].map("{:.3g}".format) for name, title in measures.items()},
+        **{"80 % coverage": lines["coverage80"].map("{:.0%}".format)},
+        **{"within 5 cm": lines["within"].map("{:.0%}".format)},
+    )
+
+
 def tables(every: pd.DataFrame) -> str:
     """All tables, as Markdown."""
     lines = every[every["seed"] == 0]
@@ -215,12 +225,7 @@ def tables(every: pd.DataFrame) -> str:
         "" if model == zoo.OURS or (ours := costs.get((env, zoo.OURS, seconds))) is None
         else table.spell(ours - own, "{:+.2f} ± {:.2f}") for (env, model, seconds), own in costs.items()
     ]  # fmt: skip
-    spelled = values[["model", "seconds", "cpu_seconds", "updates", "muon"]].assign(
-        **{title: values[name].map("{:.3g}".format) for name, title in MEASURES.items()},
-        **{"80 % coverage": values["coverage80"].map("{:.0%}".format)},
-        **{"within 5 cm": values["within"].map("{:.0%}".format), f"cost of {zoo.OURS} minus this": minus},
-    )
-    parts = [table.markdown(spelled)]
+    parts = [table.markdown(spelled(values).drop(columns="env").assign(**{f"cost of {zoo.OURS} minus this": minus}))]
     if not changes.empty:
         each = changes[["model", "from", "to"]].assign(
             **{title: changes[name].map("{:+.0%}".format) for name, title in MEASURES.items()}
@@ -257,7 +262,7 @@ def stamp(lines: pd.DataFrame) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("measure", "together", "table", "figure"))
+    parser.add_argument("what", choices=("measure", "together", "table", "lines", "figure"))
     parser.add_argument("files", nargs="*", type=Path, help="trained models")
     parser.add_argument("--targets", type=int, default=100, help="of validation (default 100)")
     parser.add_argument(
@@ -283,6 +288,9 @@ def main() -> None:
         print({name: value for name, value in line.items() if name != "costs"}, flush=True)
     if given.what == "table":
         print(tables(pd.read_csv(given.out)))
+    elif given.what == "lines":
+        found = pd.read_csv(given.out)
+        print(table.markdown(spelled(found.sort_values(["env", "model", "seconds", "muon"], kind="stable"))))
     elif given.what == "figure":
         lines = pd.read_csv(given.out)
         curves = {
