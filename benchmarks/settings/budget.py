@@ -35,7 +35,7 @@ def main() -> None:
     shipped = artifacts.read_header(run.shipped / EnvSpec.parse(arguments.env).name / f"{model}.safetensors")["curves"]
     path, rows = arguments.out or run.metrics / "02_budget.csv", []
     for condition, (batches, updates) in TRIES.items():
-        net, stages = study.parts(study.initialise(run, model, data))[0], study.schedule(run, arguments.env, model)
+        net, stages = study.initialise(run, model, data), study.schedule(run, arguments.env, model)
         for key, stage in list(zip(zoo.keys(stages), stages, strict=True))[: arguments.stages]:
             curve = fit(
                 net, getattr(net, stage.loss), data, held_out,

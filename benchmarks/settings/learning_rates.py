@@ -40,7 +40,7 @@ def main() -> None:
     for model in arguments.models:
         data, held_out = study.training_data(run, arguments.env, model)
         for factor in FACTORS:
-            net = study.parts(study.initialise(run, model, data))[0]
+            net = study.initialise(run, model, data)
             for stage in study.schedule(run, arguments.env, model):
                 steps = max(1, round(stage.steps * arguments.share))
                 curve = fit(

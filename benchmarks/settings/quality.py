@@ -72,7 +72,7 @@ def described(path: Path) -> dict[str, object]:
     whole = zoo.find(header["model"]).schedule(EnvSpec.parse(env))
     schedule = zoo.stated(header.get("schedule", [stage.stated() for stage in whole]))
     share = round(schedule[0]["steps"] / whole[0].steps, 4)  # updates are in tens
-    curves = list(header["curves"].values())[: len(schedule)]  # of the first decoder
+    curves = list(header["curves"].values())[: len(schedule)]
     return {
         "env": env, "model": header["model"], "seed": header["seed"],
         "seconds": round(share * zoo.BUDGET[EnvSpec.parse(env).standard.name]), "muon": schedule[0]["muon"],

@@ -16,7 +16,6 @@ from .models import described as described
 from .models import initialise as initialise
 from .models import load_or_train as load_or_train
 from .models import load_prior as load_prior
-from .models import parts as parts
 from .models import schedule as schedule
 from .models import train_all as train_all
 from .models import training_data as training_data

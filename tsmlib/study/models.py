@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, TypedDict, cast
 
@@ -18,7 +17,6 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
-from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import Json, StoreError
@@ -169,12 +167,11 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves, checkpoints = schedule(run, env, model), {}, []
     fewer = {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
-    for (k, part), (key, stage) in product(enumerate(parts(net)), zip(zoo.keys(stages), stages, strict=True)):
-        key += f"@{k}" * bool(k)
+    for key, stage in zip(zoo.keys(stages), stages, strict=True):
         checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
-            cast(torch.nn.Module, part), getattr(part, stage.loss), data, held_out,
-            stage.options(net.past_len, **fewer), seed=run.seed + 1000 * k,
+            cast(torch.nn.Module, net), getattr(net, stage.loss), data, held_out,
+            stage.options(net.past_len, **fewer), seed=run.seed,
             device=run.device, checkpoint=checkpoints[-1], progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
@@ -197,11 +194,6 @@ def training_data(run: Run, env: str, model: str) -> tuple[Trajectories, Traject
     """What a model is trained on, with the symmetric copies where there are some; and the validation data."""
     data, held_out = dataset(run, env, "train"), dataset(run, env, "validation")
     return symmetric(data) if _symmetries(env, model) > 1 else data, held_out
-
-
-def parts(net: TrainedModel) -> list[TrainedModel]:
-    """What is trained by itself, one after another: the decoders of a recurrent model, else the model."""
-    return [net.alone(k) for k in range(net.members)] if isinstance(net, RecurrentTSM) and net.members > 1 else [net]
 
 
 def _share(run: Run) -> float:
