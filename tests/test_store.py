@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from filelock import FileLock
 
 from tsmlib.storage import artifacts, files, tables
 from tsmlib.storage import manifest as manifest_storage
@@ -586,6 +587,16 @@ def test_a_lock_ends_with_its_holder_and_names_it_meanwhile(tmp_path: Path) -> N
     with files.writer_lock(run, "another"):
         pass
     refused("cannot write in .*TSM_RUN_DIR", Path("/proc/nowhere"))
+
+
+def test_a_holder_that_writes_its_name_late_is_named(tmp_path: Path) -> None:
+    with FileLock(tmp_path / ".lock"):
+        late = threading.Timer(0.5, (tmp_path / ".writer").write_text, ["pid 7 on a busy machine"])
+        late.start()
+        with pytest.raises(StoreError, match=r"another process \(pid 7 on a busy machine\)"):
+            with files.writer_lock(tmp_path, "a test"):
+                pass
+        late.join()
 
 
 def test_a_lock_of_one_part_leaves_the_others_alone_and_may_be_waited_for(

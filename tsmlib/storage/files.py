@@ -128,18 +128,12 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
     lock, holder = FileLock(Path(folder) / f"{hidden}.lock"), Path(folder) / f"{hidden}.writer"
     try:
         _make(Path(folder))
-        try:
-            lock.acquire(timeout=0.2)  # in which a new holder writes its name
-        except Timeout:
-            try:
-                who = holder.read_text()
-            except OSError:  # it may end at any moment
-                who = "unknown"
+        if who := _acquired(lock, holder):
             if not wait:
                 raise StoreError(
                     f"{Path(folder) / name} is being written by another process ({who}). Wait for it or end it, or "
                     "take another seed, or another folder with TSM_RUN_DIR."
-                ) from None
+                )
             sys.stderr.write(f"waiting for {who}, which writes {Path(folder) / name}\n")
             lock.acquire(poll_interval=0.5)
     except OSError as error:
@@ -153,6 +147,18 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
         with contextlib.suppress(OSError):
             holder.unlink()
         lock.release()
+
+
+def _acquired(lock: FileLock, holder: Path) -> str:
+    """Acquire the lock: ''; or who holds it, unknown where that is not said within two seconds."""
+    for _ in range(10):  # a new holder writes its name at once, on a busy machine a little later
+        with contextlib.suppress(Timeout):
+            lock.acquire(timeout=0.2)
+            return ""
+        with contextlib.suppress(OSError):
+            if who := holder.read_text():
+                return who
+    return "unknown"
 
 
 def alive(pid: object, host: object = None) -> bool:
