@@ -593,9 +593,9 @@ def test_a_holder_that_writes_its_name_late_is_named(tmp_path: Path) -> None:
     with FileLock(tmp_path / ".lock"):
         late = threading.Timer(0.5, (tmp_path / ".writer").write_text, ["pid 7 on a busy machine"])
         late.start()
-        with pytest.raises(StoreError, match=r"another process \(pid 7 on a busy machine\)"):
-            with files.writer_lock(tmp_path, "a test"):
-                pass
+        said = pytest.raises(StoreError, match=r"another process \(pid 7 on a busy machine\)")
+        with said, files.writer_lock(tmp_path, "a test"):
+            pass
         late.join()
 
 
