@@ -6,10 +6,9 @@ each be trained for that, what does more training buy a baseline, and must all j
     python benchmarks/settings/decoders.py --alone
 
 The cross-entropy method over codes of the prior, 96 x 10, on validation targets (or by --split test on the frozen ones,
-by which nothing is chosen), executed open loop; a candidate is
-judged by its mean return over the modes of all files' models, or only the share --screened that the first likes best.
-A line in decoders.csv per call: cost with its standard error, share within 5 cm, what the judge predicted beyond the
-executed return, and the costs of the single targets.
+by which nothing is chosen), executed open loop; a candidate is judged by its mean return over the modes of all files'
+models, or only the share --screened that the first likes best. A line in decoders.csv per call: cost with its standard
+error, share within 5 cm, what the judge predicted beyond the executed return, and the costs of the single targets.
 --compare prints the table: the cost of that line minus those of the others, paired by target, with half the 95 % t
 interval over targets. --alone prints another, of lines whose files are trainings of one model that differ in the seed:
 their cost minus the mean cost of the same trainings one by one, which ``quality.py measure`` planned with, paired by
@@ -21,31 +20,24 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pandas as pd
 import torch
-from quality import KEY, described
+from quality import KEY, described, load
 
 from tsmlib import study
-from tsmlib.models.base import Model
+from tsmlib.models.mixture import Mixture
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import cem
-from tsmlib.planning.predictors import EnsemblePredictor, model_predictor
+from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
-from tsmlib.storage import artifacts
-from tsmlib.study import runs, zoo
+from tsmlib.study import runs
 from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 
 HERE = Path(__file__).resolve().parent
 TRAININGS = ("models", "seeds", "seconds", "muons")  # columns: of each file in turn
-
-
-def load(path: Path) -> Model:
-    """The model in a file, of the class that the file names."""
-    return cast(Model, artifacts.load_model(path, zoo.find(artifacts.read_header(path)["model"]).load()))
 
 
 def planned(name: str, files: list[Path], env: str, n_targets: int, screened: float, split: str) -> dict[str, object]:
@@ -56,11 +48,10 @@ def planned(name: str, files: list[Path], env: str, n_targets: int, screened: fl
         for words, word in zip(TRAININGS, KEY[1:], strict=True)
     }
     prior = load_prior(runs.resolve("05_control", scale="laptop"), env)
-    through = [model_predictor(model, task.past(model.past_len)) for model in map(load, files)]
-    each = [one for found in through for one in (found.each if isinstance(found, EnsemblePredictor) else [found])]
+    model = Mixture(map(load, files))
+    judge = model_predictor(model, task.past(model.past_len))
     began = time.process_time()
     space = LatentActions(prior, task.horizon)
-    judge = EnsemblePredictor(tuple(each))
     options = dict(candidates=96, elites=9, iterations=10, screened=screened, seed=0)
     plan = cem(judge, task.reward, space, len(task), **options)
     trial = execute(task, plan)

@@ -6,8 +6,7 @@
     python benchmarks/settings/quality.py figure
 
 measure adds a line to quality.csv for each file, trained by ``budgets.py`` or shipped (``data/pretrained``); a line
-that is there already is not made again. Of a recurrent TSM with several decoders it measures the first alone, so that
-all lines are of one network. Nothing is taken from the test split:
+that is there already is not made again. Nothing is taken from the test split:
 
     energy, nrmse   10 and 80 steps ahead and the mean over 90, of 200 fresh episodes, 32 samples of each; residual
                     noise is fitted on the validation split
@@ -16,7 +15,7 @@ all lines are of one network. Nothing is taken from the test split:
     gap             mean size of predicted minus executed return, predicted by 32 samples that had no part in planning
     violations      share of those samples' steps that violate physics
 
-together prints the same of recurrent TSMs whose first decoders judge and predict as those of one model.
+together prints the same of several models as one.
 
 table prints the lines of training seed 0 as Markdown, with the cost of the recurrent TSM minus that of each model
 trained as long, paired by target with half the 95 % t interval over targets, and what a doubling of the time buys, from
@@ -42,7 +41,7 @@ from tsmlib.evaluation import exploitation, prediction
 from tsmlib.figures import prediction as drawings
 from tsmlib.figures import style
 from tsmlib.models.base import DynamicsModel
-from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.models.mixture import Mixture
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor
@@ -63,6 +62,11 @@ MEASURES = {  # column -> title and unit; of each a smaller value is better
 }  # fmt: skip
 KEY = ["env", "model", "seed", "seconds", "muon"]
 SCORES = ("energy_10", "energy_80")  # set against those of the best baseline
+
+
+def load(path: Path) -> DynamicsModel:
+    """The model in a file, of the class that the file names."""
+    return cast(DynamicsModel, artifacts.load_model(path, zoo.find(artifacts.read_header(path)["model"]).load()))
 
 
 def described(path: Path) -> dict[str, object]:
@@ -121,17 +125,8 @@ def measured(path: Path, n_targets: int, n_episodes: int) -> dict[str, object]:
     """A line of the table."""
     said = described(path)
     env = str(said["env"])
-    net = artifacts.load_model(path, zoo.find(str(said["model"])).load())
-    one = net.alone(0) if isinstance(net, RecurrentTSM) else cast(DynamicsModel, net)
-    return said | predicted(one, env, n_episodes) | planned(one, env, n_targets)
-
-
-def together(paths: list[Path]) -> tuple[RecurrentTSM, str]:
-    """The first decoders of several recurrent TSMs as one model, with the features of the first; its environment."""
-    nets = [artifacts.load_model(path, RecurrentTSM).alone(0) for path in paths]
-    net = RecurrentTSM(**{**nets[0].config(), "members": len(nets), "angles": tuple(nets[0].features.angles)})  # type: ignore[arg-type]
-    net.features, net.decoders = nets[0].features, torch.nn.ModuleList([each.decoders[0] for each in nets])
-    return net, str(described(paths[0])["env"])
+    net = load(path)
+    return said | predicted(net, env, n_episodes) | planned(net, env, n_targets)
 
 
 def doublings(lines: pd.DataFrame) -> pd.DataFrame:
@@ -274,7 +269,7 @@ def main() -> None:
     if given.what in ("measure", "together") and not given.files:
         parser.error(f"{given.what} wants files of models, such as data/pretrained/ReacherPush/rtsm.safetensors")
     if given.what == "together":
-        net, env = together(given.files)
+        net, env = Mixture(map(load, given.files)), str(described(given.files[0])["env"])
         print({**predicted(net, env, given.episodes), **planned(net, env, given.targets), "costs": ""})
     for path in given.files if given.what == "measure" else ():
         known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame(columns=KEY)

@@ -128,7 +128,7 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
     lock, holder = FileLock(Path(folder) / f"{hidden}.lock"), Path(folder) / f"{hidden}.writer"
     try:
         _make(Path(folder))
-        if who := _acquired(lock, holder):
+        if who := _acquire_or_name(lock, holder):
             if not wait:
                 raise StoreError(
                     f"{Path(folder) / name} is being written by another process ({who}). Wait for it or end it, or "
@@ -149,8 +149,8 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
         lock.release()
 
 
-def _acquired(lock: FileLock, holder: Path) -> str:
-    """Acquire the lock: ''; or who holds it, unknown where that is not said within two seconds."""
+def _acquire_or_name(lock: FileLock, holder: Path) -> str:
+    """Who holds the lock, "unknown" where that is not said within two seconds; '' once it is acquired."""
     for _ in range(10):  # a new holder writes its name at once, on a busy machine a little later
         with contextlib.suppress(Timeout):
             lock.acquire(timeout=0.2)

@@ -203,8 +203,7 @@ def _share(run: Run) -> float:
 
 def training_seconds(run: Run, env: str, model: str) -> float:
     """The budget of a training."""
-    spec = zoo.find(model)
-    return _share(run) * (zoo.BUDGET[EnvSpec.parse(env).standard.name] if spec.budget is None else spec.budget)
+    return _share(run) * zoo.find(model).seconds(EnvSpec.parse(env))
 
 
 def _duration(run: Run, env: str, model: str) -> str:

@@ -126,11 +126,14 @@ class ModelSpec:
         module, _, name = self.cls.partition(":")
         return getattr(import_module(module), name)
 
+    def seconds(self, env: EnvSpec) -> float:
+        """Its whole budget, on an imperfect arm as on the plain one."""
+        return BUDGET[env.standard.name] if self.budget is None else self.budget
+
     def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
-        """How the model is trained in a share of its budget, on an imperfect arm as on the plain one."""
-        seconds = share * (BUDGET[env.standard.name] if self.budget is None else self.budget)
+        """How the model is trained in a share of its budget."""
         stages = (env.task == "push" and self.pushing) or self.stages
-        return [stage.within(seconds, env.has_block) for stage in stages]
+        return [stage.within(share * self.seconds(env), env.has_block) for stage in stages]
 
 
 # Training stages and arguments ----------------------------------------------------------------------------------------
