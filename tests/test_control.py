@@ -259,7 +259,7 @@ def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> 
     late = torch.cat([torch.zeros(4, DELAY, 2), actions], 1)[:, :20]
     assert torch.equal(trial.states, execute(some_task(env), late).states)
     assert torch.equal(trial.actions, actions)
-    charged = task.reward(trial.states[:, 1:], actions).sum(-1)  # also of the last torques, which never arrive
+    charged = task.reward(trial.states[:, 1:], late).sum(-1)  # what arrives, as the environment's own reward
     torch.testing.assert_close(trial.executed_return, charged)
     at_once = execute(some_task(env), actions)
     assert torch.equal(trial.states[:, : DELAY + 1], execute(some_task(env), 0 * actions).states[:, : DELAY + 1])

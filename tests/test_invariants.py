@@ -9,7 +9,7 @@ import torch
 
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
-from tsmlib.evaluation.actions import novelty, roughness, typical, within
+from tsmlib.evaluation.actions import novelty, roughness, spectrum, typical, within
 from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
@@ -143,11 +143,21 @@ def test_states_without_an_object_or_a_number_are_refused() -> None:
 # Actions -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_constant_torque_weighs_double_in_roughness_as_it_is_stated() -> None:
-    wave = 0.2 * torch.sin(2 * torch.pi * 10 * torch.arange(200) * 0.02)  # of 10 Hz; mean square 0.02
-    found = roughness((0.2 + wave)[None, :, None])  # and 0.04 of the constant part
-    torch.testing.assert_close(found["fast"], torch.tensor([0.02 / (2 * 0.04 + 0.02)]))
-    torch.testing.assert_close(found["centroid"], torch.tensor([10 * 0.02 / (2 * 0.04 + 0.02)]))
+def test_every_frequency_weighs_in_roughness_as_in_the_mean_square() -> None:
+    steps = torch.arange(200)
+    wave = 0.2 * torch.sin(2 * torch.pi * 10 * steps * 0.02)  # of 10 Hz; mean square 0.02
+    highest = 0.3 * (-1.0) ** steps  # of 25 Hz, the highest; mean square 0.09
+    found = roughness((0.2 + wave + highest)[None, :, None])  # and 0.04 of the constant part
+    torch.testing.assert_close(found["fast"], torch.tensor([(0.02 + 0.09) / 0.15]))
+    torch.testing.assert_close(found["centroid"], torch.tensor([(10 * 0.02 + 25 * 0.09) / 0.15]))
+
+
+@pytest.mark.parametrize("steps", [49, 50])
+def test_the_power_density_integrates_to_the_mean_square_without_the_constant_part(steps: int) -> None:
+    torques = torch.randn(3, steps, 2, generator=torch.Generator().manual_seed(0)).double()
+    frequency, density = spectrum(torques)
+    varying = torques - torques.mean(1, keepdim=True)
+    assert density.sum() * (frequency[1] - frequency[0]) == pytest.approx(varying.square().mean().item())
 
 
 def test_a_typical_plan_is_the_one_of_median_size() -> None:

@@ -70,6 +70,16 @@ def test_noise_does_not_alter_the_world(actions: np.ndarray) -> None:
     assert (noisy_states != states).all()
 
 
+@pytest.mark.parametrize("seed", [0, 7, 12345])
+def test_noise_shares_no_random_numbers_with_starts(seed: int) -> None:
+    env = SensorNoise(gymnasium.make(ENV), 0.25, SCALE)
+    noisy, info = env.reset(seed=seed)
+    drawn = (noisy - info["state"]) / (0.25 * SCALE)
+    for resets in range(4):  # an arm begins by its seed, how often it was reset, and its number
+        begun = np.random.default_rng((seed, resets, 0)).standard_normal(len(drawn))
+        assert np.abs(drawn - begun).max() > 0.1
+
+
 def test_noise_has_mean_zero_and_the_given_size() -> None:
     env = SensorNoise(gymnasium.make(ENV, max_episode_steps=10_000), 0.25, SCALE)
     noisy, _, infos = episode(env, np.zeros((1_500, 2), np.float32))

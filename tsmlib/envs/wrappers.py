@@ -13,7 +13,7 @@ from tsmlib.envs.geometry import HALF_RANGE
 from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
 
-NOISE_STREAM = 1  # keeps the noise apart from the draws that the environment makes from the same seed
+NOISE_STREAM = 2**32 - 1  # keeps the noise apart from the starts and targets of any reset, counted from 0, of this seed
 
 
 class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):

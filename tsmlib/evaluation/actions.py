@@ -25,11 +25,17 @@ def traits(actions: Tensor, *, shape: bool = False) -> Tensor:
 def spectrum(actions: Tensor, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (F,) in Hz and the mean power density (F,) of torques (B, T, du), per Hz; it integrates to the mean
     square torque (without the constant part, which is left out)."""
+    frequency, power = _power(actions, dt)
+    density = power.mean(0) * (dt / (actions.shape[1] * actions.shape[2]))
+    return frequency.numpy()[1:], density.numpy()[1:]
+
+
+def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Frequencies (F,) in Hz and the power (B, F) of torques (B, T, du): T times what each adds to their squares."""
     steps = actions.shape[1]
-    power = torch.fft.rfft(actions.double(), dim=1).abs().square().mean((0, 2)) * (2 * dt / steps)
-    if steps % 2 == 0:
-        power[-1] /= 2  # the highest frequency has no mirror image
-    return torch.fft.rfftfreq(steps, dt).numpy()[1:], power.numpy()[1:]
+    power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)
+    power[:, 1 : (steps + 1) // 2] *= 2  # all but the constant part and the highest of even T have a mirror image
+    return torch.fft.rfftfreq(steps, dt).double(), power
 
 
 @torch.no_grad()
@@ -68,14 +74,9 @@ def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
 
     ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power. ``fast``: share of power
     above 5 Hz. ``autocorrelation``: of successive torques. Without any torque all are zero.
-
-    Power is here |FFT|^2 of the frequencies from 0 on, each counted once. Of the mean square torque all have a mirror
-    image except the constant part and, of an even number of steps, the highest frequency: in ``centroid`` and ``fast``
-    these two therefore weigh double. Published rows are made so.
     """
     tiny = 1e-12
-    power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)  # (B, F)
-    frequency = torch.fft.rfftfreq(actions.shape[1], dt).double()
+    frequency, power = _power(actions, dt)
     total = power.sum(1) + tiny
     successive = (actions[:, 1:] * actions[:, :-1]).sum((1, 2))
     return {

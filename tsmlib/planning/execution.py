@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from tsmlib.collection import Controller, collect, open_loop
@@ -34,8 +35,7 @@ class Trial:
     (B,): metres, or as the task's measure of success has it, NaN where it has none; plan: where the actions came from,
     with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
 
-    Behind delayed actions ``actions`` are those that were given, and the executed return is of the states that were and
-    of these: each is charged at the step at which it is given, also the last ones, which never arrive.
+    Behind delayed actions ``actions`` are those that were given, and the executed return charges what arrived.
 
     success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
     returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none. seen: the
@@ -206,7 +206,9 @@ def _measured(task: Task, run: Simulation, seen: Trajectories, actions: Tensor, 
     arms = run.env if isinstance(run, Arms) else None
     if isinstance(arms, ImperfectArms) and arms.sigma:
         states = torch.from_numpy(arms.truth).float()
-    per_step = rewarded(task.reward, states[:, 1:], actions)
+    late = arms.tau if isinstance(arms, ImperfectArms) else 0
+    arrived = F.pad(actions, (0, 0, late, 0))[:, : actions.shape[1]]
+    per_step = rewarded(task.reward, states[:, 1:], arrived)
     if seen.lengths or missing:
         per_step = per_step * real_steps(seen.steps.tolist(), actions.shape[1])
     final_distance, success = task.judged(states)

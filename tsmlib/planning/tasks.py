@@ -195,7 +195,10 @@ def zero_torques(task: Task) -> Tensor:
     return torch.zeros(len(task), task.horizon, task.action_dim)
 
 
+APART = 1 << 40  # keeps random torques apart from those that ``collect_random`` draws from the same seed
+
+
 def random_torques(task: Task, *, seed: int = 0) -> Tensor:
     """Torques like the arm's training data's. (B, T, du)."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(APART + seed)
     return smooth_torques(len(task), task.horizon, generator=generator, action_dim=task.action_dim)

@@ -53,7 +53,7 @@ def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajec
     parts = [("open loop", "", open_loop, whole), ("segments", "", segments, torch.ones_like(segments.pit[..., 0] > 0))]
     if EnvSpec.parse(test.env).has_block:
         touched = touches(test, segments, SEGMENTS).any(1, keepdim=True)
-        parts.append(("open loop", "contact", open_loop, after_first(touches(test, open_loop))))
+        parts.append(("open loop", "contact", open_loop, since_touch(test, open_loop)))
         parts.append(("segments", "contact", segments, touched.expand(-1, segments.pit.shape[1])))
     found = []
     for execution, subset, scores, where in parts:
@@ -99,9 +99,18 @@ def means(scores: Scores, where: Tensor | None = None) -> dict[str, float]:
 
 def touches(test: Trajectories, scores: Scores, starts: Sequence[int] = (10,)) -> Tensor:
     """(N, T) bool in the order of ``scores``: the arm touches the obstacle or object. ValueError for noisy states."""
+    return cut(_contacts(test), starts, scores.pit.shape[1])
+
+
+def since_touch(test: Trajectories, scores: Scores, starts: Sequence[int] = (10,)) -> Tensor:
+    """(N, T) bool: it touches now or has in the episode, also before the prediction began. As ``touches`` otherwise."""
+    return cut(after_first(_contacts(test)), starts, scores.pit.shape[1])
+
+
+def _contacts(test: Trajectories) -> Tensor:
     if EnvSpec.parse(test.env).noise:
         raise ValueError(f"noisy states of {test.env} do not tell what touches; give the same episodes without noise")
-    return cut(contact_steps(test.states, test.env), starts, scores.pit.shape[1])
+    return contact_steps(test.states, test.env)
 
 
 def extremes(test: Trajectories, scores: Scores) -> tuple[np.ndarray, np.ndarray | None]:
