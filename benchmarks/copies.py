@@ -87,7 +87,7 @@ def ways(word: str, stage: Updates, copies: int, device: str) -> dict[str, Calla
 
 def step(net: Any, copies: int, rows: int, device: str) -> Callable[[], float]:
     """A step of a decoder of rtsm and its backward pass, ten times: of one copy, or of several stacked ones."""
-    decoder = net.decoders[0].over(net.features)
+    decoder = net.decoder.over(net.features)
     stack = (copies,) if copies > 1 else ()
     product: Callable[..., Tensor] = torch.baddbmm if stack else torch.addmm
     cell, hidden, out = (w.detach().expand(*stack, *w.shape).clone().requires_grad_() for w in

@@ -27,16 +27,16 @@ from tsmlib.models.base import DynamicsModel
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.features import Features
 from tsmlib.models.layers import CausalDecoder
-from tsmlib.models.recurrent import Decoder, RecurrentTSM
+from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.tasks import HORIZON, TOLERANCE
 from tsmlib.storage import files
 from tsmlib.storage.files import Json
 from tsmlib.study import zoo
-from tsmlib.study.models import TrainedModel, load_pretrained
+from tsmlib.study.models import load_pretrained
 from tsmlib.study.tasks import draw_task
 
-FORMAT = 2  # of the manifest and of the files that it names; src/files.js asks for the same
+FORMAT = 3  # of the manifest and of the files that it names; src/files.js asks for the same
 PAST_LEN = 10
 TASKS = {"push": "tsm/ReacherPush-v1", "obstacle": "tsm/ReacherObstacle-v0", "reach": "tsm/Reacher-v0"}
 MODELS = ("rtsm", "tsm", "lstm", "onestep")
@@ -97,9 +97,8 @@ def network(model: nn.Module) -> tuple[dict[str, Json], Arrays]:
                 model.decoder, model.features.step_std
             )
         case RecurrentTSM():
-            decoder = cast(Decoder, model.decoders[0])
-            hidden, _, out = decoder.head
-            arrays = of_cell(decoder.cell, model.features) | linear("codes", decoder.codes.weight, None)
+            hidden, _, out = model.decoder.head
+            arrays = of_cell(model.decoder.cell, model.features) | linear("codes", model.decoder.codes.weight, None)
             arrays |= of_layer("hidden", hidden) | of_layer("last", out, model.features.step_std)
             return {"kind": "recurrent", "codes": model.latent_dim, "hold": model.code_len}, (
                 statistics(model.features) | arrays
@@ -172,13 +171,6 @@ def write_physics(folder: Path, name: str, env: str) -> dict[str, Json]:
     return {"file": f"{name}.xml", "substeps": round(geometry.DT / model.opt.timestep), "exact": cast(Json, exact)}
 
 
-def decoders(model: TrainedModel) -> list[nn.Module]:
-    """Each decoder of a recurrent TSM as a model of its own; any other model alone."""
-    if isinstance(model, RecurrentTSM):
-        return [model.alone(k) for k in range(model.members)]
-    return [cast(nn.Module, model)]
-
-
 def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
     """Write everything, the manifest last."""
     described: dict[str, Json] = {}
@@ -191,11 +183,9 @@ def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
             except ValueError:  # none ships
                 continue
             look = zoo.look(word)
-            networks = [write_network(folder, f"{spec.name}-{word}-{k}", one) for k, one in enumerate(decoders(model))]
+            network = write_network(folder, f"{spec.name}-{word}", cast(nn.Module, model))
             knobs = strongest_codes(model, env)
-            models[word] = cast(Json, {
-                "decoders": networks, "name": look.name, "colour": look.colour, "knobs": knobs,
-            })  # fmt: skip
+            models[word] = cast(Json, {"network": network, "name": look.name, "colour": look.colour, "knobs": knobs})
         prior = write_network(folder, f"{spec.name}-prior", cast(nn.Module, load_pretrained("prior", env=env)))
         described[task] = {
             "env": env, "stateDim": spec.state_dim, "models": models, "prior": prior,

@@ -77,15 +77,11 @@ MODELS = {
     "lstm": Case(lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False),
     "rtsm": Case(
         lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20, mode_weight=0.5),
-        losses=(("loss", ()), ("point_loss", ("decoders.0.codes",))),
-    ),
-    "rtsm, three decoders": Case(
-        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, members=3, hidden=16, segment_len=20),
-        losses=(("loss", ()), ("point_loss", tuple(f"decoders.{k}.codes" for k in range(3)))),
+        losses=(("loss", ()), ("point_loss", ("decoder.codes",))),
     ),
     "rtsm, obstacle": Case(
         lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20), state_dim=10, constant=(6, 7, 8, 9),
-        losses=(("loss", ()), ("point_loss", ("decoders.0.codes",))),
+        losses=(("loss", ()), ("point_loss", ("decoder.codes",))),
     ),
     "ensemble": Case(lambda dx: Ensemble(dx, DU, angles=ANGLES, hidden=16, layers=2, segment_len=10)),
     "ensemble+mse, obstacle": Case(

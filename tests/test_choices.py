@@ -61,10 +61,10 @@ def test_tries_are_trained_on_the_data_that_the_study_trains_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    seen = list[tuple[int, int]]()
+    seen = list[int]()
 
     def episodes(model: Any, loss: Any, data: Any, held_out: Any, options: Any, **more: Any) -> Any:
-        seen.append((model.config().get("members", 1), len(data)))
+        seen.append(len(data))
         return TrainingHistory(seconds=[0.0], step=[1], train=[0.0], validation=[0.0])
 
     monkeypatch.setattr(fit_module, "fit", episodes)
@@ -75,7 +75,7 @@ def test_tries_are_trained_on_the_data_that_the_study_trains_on(
         )
     run = runs.resolve("02_train", scale="smoke")
     assert len(study.dataset(run, "tsm/ReacherPush-v1", "train")) == 20
-    assert seen == [(1, 8 * 20)] * (2 * 3 + 3 * 3)
+    assert seen == [8 * 20] * (2 * 3 + 3 * 3)
     assert len(study.training_data(run, "tsm/ReacherObstacle-v0", "prior")[0]) == 20
 
 
@@ -241,8 +241,7 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
     trained = [("lstm", 580, 0), ("tsm", 580, 0), ("lstm", 2320, 0), *(("tsm", 2320, seed) for seed in (0, 2, 1))]
     lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
     rest = (
-        "; one network each, of a recurrent TSM one decoder; predictions: n = 200 fresh episodes, plans and violations:"
-        " n = 100 validation targets"
+        "; one network each; predictions: n = 200 fresh episodes, plans and violations: n = 100 validation targets"
     )
     assert quality.stamp(lines) == (
         f"ReacherPush, training seed 0 (after 2320 s seeds 0, 1, 2 of TSM: small marks, the line joins means){rest}"

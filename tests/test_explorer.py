@@ -53,12 +53,6 @@ pytestmark = [
 ]
 
 
-def decoders(word: str, env: str) -> list[Any]:
-    """Each decoder of a shipped model as a model of its own."""
-    model = load_pretrained(word, env=env)
-    return [model.alone(k) for k in range(model.members)] if isinstance(model, RecurrentTSM) else [model]
-
-
 def ask(*questions: dict[str, Any]) -> list[Any]:
     """The answers of explorer/test/engine.mjs."""
     command = [str(NODE), str(ROOT / "explorer" / "test" / "engine.mjs")]
@@ -110,12 +104,12 @@ def test_networks_in_the_page_predict_as_in_torch(task: str) -> None:
     actions = torques(len(frozen), STEPS)
     exact = Segment(*(part.double() for part in past))
     for word in MODELS:
-        for k, decoder in enumerate(decoders(word, ENVS[task])):
-            states = rollout(decoder, past, actions)
-            rounded = states - rollout(copy.deepcopy(decoder).double(), exact, actions.double())
-            expected.append((states, rounded.abs().amax((1, 2)).numpy()))
-            asked = {"what": "rollout", "task": task, "model": word, "decoder": k, "pasts": as_pasts(past)}
-            questions.append(asked | {"actions": actions.flatten(1).tolist()})
+        model = load_pretrained(word, env=ENVS[task])
+        states = rollout(model, past, actions)
+        rounded = states - rollout(copy.deepcopy(model).double(), exact, actions.double())
+        expected.append((states, rounded.abs().amax((1, 2)).numpy()))
+        asked = {"what": "rollout", "task": task, "model": word, "pasts": as_pasts(past)}
+        questions.append(asked | {"actions": actions.flatten(1).tolist()})
     for found, (states, rounding) in zip(ask(*questions), expected, strict=True):
         apart = np.array(found).reshape(states.shape) - states.numpy()
         assert (np.abs(apart).max((1, 2)) > 1e-4).sum() <= 1  # of 100 episodes
@@ -131,7 +125,8 @@ def test_codes_and_a_past_in_motion_are_read_as_in_torch() -> None:
     codes = torch.randn(8, 3, 8, generator=torch.Generator().manual_seed(1))
     asked = {"what": "rollout", "task": "push", "pasts": as_pasts(past), "codes": codes.flatten(1).tolist()}
     asked["actions"] = actions[:, 30:].flatten(1).tolist()
-    (recurrent,), (tsm,) = (decoders(word, ENVS["push"]) for word in ("rtsm", "tsm"))
+    recurrent, tsm = (load_pretrained(word, env=ENVS["push"]) for word in ("rtsm", "tsm"))
+    assert isinstance(recurrent, RecurrentTSM)
     assert isinstance(tsm, TSM)
     chained, before = [], past
     for k in range(3):
@@ -157,10 +152,10 @@ def test_a_candidate_is_worth_what_its_mode_returns() -> None:
 def test_candidates_are_judged_alike_by_any_number_of_workers() -> None:
     task = load_task(ENVS["push"]).take(1)
     codes = torch.randn(64, 80, generator=torch.Generator().manual_seed(4)).tolist()
-    asked = {"what": "sorted", "task": "push", "model": "rtsm", "past": as_pasts(task.past(10))[0], "codes": codes}
-    alone, *shared = ask(*(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4)))
-    assert sum(value is not None for value in alone) == 64  # one decoder sorts nothing out
-    assert all(found == alone for found in shared)
+    asked = {"what": "shared", "task": "push", "model": "rtsm", "past": as_pasts(task.past(10))[0], "codes": codes}
+    alone, *others = ask(*(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4)))
+    assert len(alone) == 64
+    assert all(found == alone for found in others)
 
 
 @torch.no_grad()

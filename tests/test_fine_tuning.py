@@ -22,7 +22,7 @@ from tsmlib.trajectory import Segment, initial_past
 ARM, WEAK = "tsm/Reacher-v0", "tsm/Reacher-gain0.7-v0"
 OPTIONS = tsm.TrainingOptions(past_len=10, future_len=10, steps=8, batch_size=32, validate_every=2, lr=3e-3, warmup=1)
 HEADS = {
-    "rtsm": ("decoders.0.head", "decoders.1.head"), "tsm": ("decoder.head",), "lstm": ("out",), "onestep": ("net.4",),
+    "rtsm": ("decoder.head",), "tsm": ("decoder.head",), "lstm": ("out",), "onestep": ("net.4",),
     "ensemble": ("weights.2", "biases.2"),
 }  # fmt: skip
 
@@ -34,7 +34,7 @@ def data(env: str) -> tsm.Trajectories:
 
 def model(word: str) -> Any:
     made: dict[str, Callable[[], Any]] = {
-        "rtsm": lambda: tsm.RecurrentTSM.for_data(data(ARM), hidden=8, members=2),
+        "rtsm": lambda: tsm.RecurrentTSM.for_data(data(ARM), hidden=8),
         "tsm": lambda: tsm.TSM.for_data(data(ARM), channels=8, dilations=(1, 2)),
         "lstm": lambda: tsm.LSTM.for_data(data(ARM), hidden=8),
         "onestep": lambda: tsm.OneStep.for_data(data(ARM), hidden=8, layers=2),
@@ -94,7 +94,7 @@ def test_a_learned_distribution_is_another_code_of_the_same_decoder() -> None:
     mean, deviation = torch.randn(net.latent_dim), torch.rand(net.latent_dim) + 0.5
     future = torch.from_numpy(window.states[:, 10:20])
     expected, (m, v) = net.decode(past, actions, mean + deviation * z), net.encode(future)
-    with torch.no_grad(), learned_codes(net) as (found,):
+    with torch.no_grad(), learned_codes(net) as found:
         found.mean.copy_(mean)
         found.log_deviation.copy_(deviation.log())
     torch.testing.assert_close(net.decode(past, actions, z), expected, rtol=1e-4, atol=1e-5)
@@ -108,7 +108,7 @@ def test_a_learned_distribution_is_another_code_of_the_same_decoder() -> None:
 def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself() -> None:
     net, arm = tsm.RecurrentTSM.for_data(data(ARM), hidden=8), data(ARM)
     with torch.no_grad():
-        net.decoders[0].codes.weight.mul_(5)  # so that a code says much
+        net.decoder.codes.weight.mul_(5)  # so that a code says much
     past = initial_past(torch.from_numpy(arm.states[:, 0]), 10, 2)
     actions = torch.from_numpy(arm.actions)
 
@@ -118,7 +118,7 @@ def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself(
 
     expected = mode()
     drawn = replace(arm, states=expected.numpy())
-    with torch.no_grad(), learned_codes(net) as (codes,):
+    with torch.no_grad(), learned_codes(net) as codes:
         codes.mean.fill_(1.0)
     before = (mode() - expected).norm()
     options = tsm.TrainingOptions(10, 20, steps=80, batch_size=32, lr=0.1, warmup=1, validate_every=10)

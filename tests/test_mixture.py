@@ -29,11 +29,10 @@ def one_step(seed: int) -> tsm.OneStep:
     return in_units(tsm.OneStep(DX, DU, angles=(0, 1), hidden=16, layers=2)).double().eval()
 
 
-def recurrent(seed: int, members: int = 1) -> tsm.RecurrentTSM:
+def recurrent(seed: int) -> tsm.RecurrentTSM:
     torch.manual_seed(seed)
-    net = tsm.RecurrentTSM(DX, DU, angles=(0, 1), hidden=16, members=members)
-    for decoder in net.decoders:
-        decoder.codes.weight.data.mul_(20)  # so that a code says much
+    net = tsm.RecurrentTSM(DX, DU, angles=(0, 1), hidden=16)
+    net.decoder.codes.weight.data.mul_(20)  # so that a code says much
     return in_units(net).double().eval()
 
 
@@ -58,16 +57,16 @@ def test_a_sample_is_a_rollout_of_one_of_the_models_to_its_end() -> None:
     assert of.argmin(0).bincount(minlength=3).min() > 8
 
 
-def test_decoders_as_models_of_their_own_predict_and_are_judged_as_the_one_model() -> None:
-    net, (past, actions) = recurrent(0, members=3), given()
-    mixture, candidates = tsm.Mixture([net.alone(k) for k in range(3)]), actions[None].repeat(4, 1, 1, 1)
-    assert torch.allclose(tsm.rollout(mixture, past, actions), tsm.rollout(net, past, actions))
-    judged, ours = (tsm.model_predictor(model, past) for model in (net, mixture))
-    assert isinstance(ours, EnsemblePredictor)
-    assert len(ours.each) == 3
-    assert torch.allclose(ours(candidates), judged(candidates))
-    for one, other in zip(ours.each, judged.each, strict=True):
-        assert torch.allclose(one(candidates), other(candidates))
+def test_planners_are_shown_the_mode_of_each_model() -> None:
+    models, (past, actions) = [one_step(0), recurrent(1), recurrent(2)], given()
+    candidates = torch.stack([actions, -actions])  # (C, B, T, du)
+    judge = tsm.model_predictor(tsm.Mixture(models), past)
+    assert isinstance(judge, EnsemblePredictor)
+    assert judge(candidates).shape == (3, 2, B, T, DX)
+    for one, found, model in zip(judge.each, judge(candidates), models, strict=True):
+        alone = tsm.model_predictor(model, past)(candidates)
+        assert torch.allclose(found, alone[0])
+        assert torch.allclose(one(candidates), alone)
 
 
 @pytest.mark.parametrize(
@@ -127,10 +126,9 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
 
 
 def test_each_member_of_each_model_judges_a_candidate() -> None:
-    models, (past, actions) = [recurrent(0, members=3), tsm.Mixture([one_step(1), one_step(2)])], given()
-    judge = tsm.model_predictor(tsm.Mixture(models), past)
+    (past, actions), alone = given(), [recurrent(0), one_step(1), one_step(2)]
+    judge = tsm.model_predictor(tsm.Mixture([alone[0], tsm.Mixture(alone[1:])]), past)
     assert isinstance(judge, EnsemblePredictor)
-    alone = [models[0].alone(k) for k in range(3)] + [one_step(1), one_step(2)]
     for found, model in zip(judge(actions[None]), alone, strict=True):
         assert torch.allclose(found[0], tsm.rollout(model, past, actions))
 

@@ -23,7 +23,7 @@ ANGLES = pytest.mark.parametrize("angles", [(0, 1), (), (3, 1)], ids=str)
 
 def plain(net: Any, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
     """The equations of ``models.recurrence``, one operation after the other."""
-    layers = net.decoders[0] if isinstance(net, RecurrentTSM) else net
+    layers = net.decoder if isinstance(net, RecurrentTSM) else net
 
     def advance(x: Tensor, u: Tensor, h: Tensor, c: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = torch.cat([net.features(x), u], dim=-1)
@@ -159,5 +159,5 @@ def test_nothing_depends_on_memory_that_was_never_written(batch: int, monkeypatc
     monkeypatch.setattr(torch, "empty_like", spoiled(empty_like))
     with torch.autocast("cpu", torch.bfloat16):
         states = net.decode(past, actions, torch.randn(batch, 2, 3))
-    gradients = torch.autograd.grad(states.square().sum(), net.decoders.parameters())
+    gradients = torch.autograd.grad(states.square().sum(), net.decoder.parameters())
     assert all(torch.isfinite(part).all() for part in (states, *gradients))

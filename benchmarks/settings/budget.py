@@ -2,8 +2,7 @@
 
 Each try changes one of the two in every stage: twice the batch for half the updates, as many windows altogether; or
 half the batch for as many updates. What counts is the best validation loss of a stage, beside that in the header of
-the shipped model. The first stage decides little of the last, so read both. Of a model with several decoders the first
-is trained.
+the shipped model. The first stage decides little of the last, so read both.
 
     python benchmarks/settings/budget.py
 """

@@ -1,4 +1,4 @@
-"""Planning through models from files: do errors that a plan exploits average out over several decoders, how well must
+"""Planning through models from files: do errors that a plan exploits average out over several networks, how well must
 each be trained for that, what does more training buy a baseline, and must all judge every candidate?
 
     python benchmarks/settings/decoders.py --name "three, full budget" --files a.safetensors b.safetensors c.safetensors
@@ -120,7 +120,7 @@ def main() -> None:
     what.add_argument("--name", help="of the line that is added")
     what.add_argument("--compare", metavar="NAME", help="print the table, every line against this one")
     what.add_argument("--alone", action="store_true", help="print the table of trainings together and one by one")
-    parser.add_argument("--files", nargs="+", type=Path, default=[], help="models, each with one decoder or several")
+    parser.add_argument("--files", nargs="+", type=Path, default=[], help="models")
     parser.add_argument("--screened", type=float, default=1.0, help="share that all judge (default 1: all candidates)")
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
     parser.add_argument("--split", default="validation", choices=("validation", "test"), help="default validation")

@@ -2,7 +2,7 @@
 
 Every model gets the same three tries at the same share of its budget (`study.BUDGET`); what counts is the best
 validation loss of its last stage. Losses of different models are not to be compared. Data are those of the study, with
-their symmetric copies; of a model with several decoders the first is trained.
+their symmetric copies.
 
     python benchmarks/settings/learning_rates.py
 """

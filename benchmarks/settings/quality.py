@@ -250,7 +250,7 @@ def stamp(lines: pd.DataFrame) -> str:
     return (
         f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed 0"
         + f" (after {more} seeds {seeds} of {models}: small marks, the line joins means)" * bool(more)
-        + f"; one network each, of a recurrent TSM one decoder; predictions: n = {EPISODES} fresh episodes, plans and "
+        + f"; one network each; predictions: n = {EPISODES} fresh episodes, plans and "
         f"violations: n = {targets} validation targets"
     )
 

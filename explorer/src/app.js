@@ -289,9 +289,8 @@ function legend() {
 
 /** What the knobs do. */
 function turned() {
-  const { scene } = state, many = look(scene.model).decoders.length > 1;
-  if (scene.replan) return 'For a plan that is made once: untick “Plan again every ten steps”.';
-  return `Another Z, another future of the same torques, in purple${many ? ' (by the first of the model’s networks)' : ''}. These are two of its eight numbers; the planner does not search them.`;
+  if (state.scene.replan) return 'For a plan that is made once: untick “Plan again every ten steps”.';
+  return `Another Z, another future of the same torques, in purple. These are two of its eight numbers; the planner does not search them.`;
 }
 
 function verdict() {

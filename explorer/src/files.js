@@ -1,5 +1,5 @@
 // Files of the page: fetched, and refused where they are of another format or version than this code.
-const FORMAT = 2; // as in export.py
+const FORMAT = 3; // as in export.py
 
 /** A failure that a person can do something about; its message is one sentence that says what. */
 export class PageError extends Error {}

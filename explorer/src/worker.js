@@ -69,7 +69,7 @@ onmessage = async ({ data }) => {
       await Promise.all([files.model(data.task, data.model), files.prior(data.task), files.world(data.task)]);
       postMessage({ type: 'loaded' });
     }
-    if (data.type === 'imagine' && kept?.id === data.id && kept.decoder.about.codes) {
+    if (data.type === 'imagine' && kept?.id === data.id && kept.network.about.codes) {
       postMessage({ type: 'imagined', id: data.id, from: kept.from, states: imagine(kept, data.knobs, data.values) });
     }
   } catch (error) {

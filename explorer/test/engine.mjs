@@ -1,5 +1,5 @@
 // node test/engine.mjs < questions.json > answers.json: what the page computes, for tests in Python to compare.
-// Each question is { what: 'physics' | 'rollout' | 'decode' | 'judge' | 'sorted' | 'plan' | 'link', task, ... }; see the functions below.
+// Each question is { what: 'physics' | 'rollout' | 'decode' | 'judge' | 'shared' | 'plan' | 'link', task, ... }; see the functions below.
 import { readFileSync } from 'node:fs';
 import { readManifest } from '../dist/src/files.js';
 import { loadMujoco } from '../dist/src/physics.js';
@@ -25,9 +25,9 @@ async function physics({ task, starts, actions }) {
 
 const asPast = ({ states, actions }) => ({ states: Float32Array.from(states), actions: Float32Array.from(actions) });
 
-/** { model, decoder?, pasts (N of { states, actions }), actions (N, T * 2), codes (N, K * dz)? } -> states (N, T * dx) */
-async function rollout({ task, model, decoder = 0, pasts, actions, codes }) {
-  const net = (await library.model(task, model))[decoder];
+/** { model, pasts (N of { states, actions }), actions (N, T * 2), codes (N, K * dz)? } -> states (N, T * dx) */
+async function rollout({ task, model, pasts, actions, codes }) {
+  const net = await library.model(task, model);
   return pasts.map((past, i) => {
     const T = actions[i].length / 2, states = net.rollout(4, asPast(past), repeated(actions[i], 4), T, codes ? repeated(codes[i], 4) : null);
     return [...states.subarray(0, states.length / 4)];
@@ -43,7 +43,7 @@ async function decode({ task, past, codes }) {
   });
 }
 
-/** { model, pasts, targets, codes (N, K * dz) } -> returns (N), the mean over the modes of all decoders */
+/** { model, pasts, targets, codes (N, K * dz) } -> returns (N) over the model's mode */
 async function judged({ task, model, pasts, targets, codes }) {
   const { horizon } = library.manifest.tasks[task];
   return Promise.all(pasts.map(async (past, i) => {
@@ -52,8 +52,8 @@ async function judged({ task, model, pasts, targets, codes }) {
   }));
 }
 
-/** { model, past, target, codes (N, K * dz), workers } -> returns (N) by which CEM judges candidates, null: sorted out */
-async function sorted({ task, model, past, target, codes, workers }) {
+/** { model, past, target, codes (N, K * dz), workers } -> returns (N) by which CEM judges candidates */
+async function shared({ task, model, past, target, codes, workers }) {
   const question = { task, model, space: 'latent', past: asPast(past), horizon: library.manifest.tasks[task].horizon, target };
   library.helpers = Array(workers - 1).fill((...job) => evaluate(library, ...job));
   const found = await judge(library, question, codes.length, Float32Array.from(codes.flat()));
@@ -82,7 +82,7 @@ function marks({ links }) {
   return links.map(one => fromLink(one, library.manifest).scene).map(scene => outside(scene, library.manifest.tasks[scene.task]));
 }
 
-const answers = [], ask = { physics, rollout, decode, judge: judged, sorted, plan, link, marks };
+const answers = [], ask = { physics, rollout, decode, judge: judged, shared, plan, link, marks };
 for (const question of JSON.parse(readFileSync(0))) {
   answers.push(await ask[question.what](question));
 }

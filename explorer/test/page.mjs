@@ -186,8 +186,8 @@ const steps = {
     assert.match(await text(bad, '#notice'), /link cannot be restored: its target is not two numbers/);
     await bad.close();
     const spoiled = [
-      ['**/manifest.json', route => route.fulfill({ json: { format: 0 } }), /format 0, this page reads 2; build it again/],
-      ['**/manifest.json', route => route.fulfill({ body: '{"format": 2, ' }), /manifest.json is damaged; build the page again/],
+      ['**/manifest.json', route => route.fulfill({ json: { format: 0 } }), /format 0, this page reads 3; build it again/],
+      ['**/manifest.json', route => route.fulfill({ body: '{"format": 3, ' }), /manifest.json is damaged; build the page again/],
       ['**/manifest.json', route => route.fulfill({ status: 404 }), /manifest.json did not come; reload the page/],
       ['**/ReacherPush-rtsm-0.f32', route => route.fulfill({ body: Buffer.alloc(8) }), /not the file that belongs to this page/],
       ['**/ReacherPush-rtsm-2.f32', async route => route.fulfill({ body: (await (await route.fetch()).body()).fill(0) }), /not the file that belongs to this page/],

@@ -20,14 +20,14 @@ from torch.nn.utils import parametrize
 class CodeLayers(Protocol):
     """A model with codes.
 
-    ``code_layers``, for each decoder: V, without a bias, and the layers to whose outputs V z is added, in the order of
-    its rows. ``code_statistics``: the layer that gives an encoder's means and log variances, if there is an encoder.
+    ``code_layers``: V, without a bias, and the layers to whose outputs V z is added, in the order of its rows.
+    ``code_statistics``: the layer that gives an encoder's means and log variances, if there is an encoder.
     """
 
     code_statistics: nn.Linear | None
 
     @property
-    def code_layers(self) -> Sequence[tuple[nn.Linear, Sequence[nn.Linear]]]: ...
+    def code_layers(self) -> tuple[nn.Linear, Sequence[nn.Linear]]: ...
 
 
 class CodeDistribution(nn.Module):
@@ -80,30 +80,25 @@ class _Standardised(nn.Module):
 
 
 @contextmanager
-def learned_codes(model: CodeLayers) -> Iterator[list[CodeDistribution]]:
-    """The distribution of each decoder's codes as parameters of ``model``; its own weights again at the end.
-
-    An encoder sees those of the only decoder.
-    """
+def learned_codes(model: CodeLayers) -> Iterator[CodeDistribution]:
+    """The distribution of the codes as parameters of ``model``; its own weights again at the end."""
     changed: list[tuple[nn.Module, str]] = []
-    distributions = []
+    codes, layers = model.code_layers
+    found = CodeDistribution(codes.in_features).to(codes.weight)
 
     def change(layer: nn.Module, name: str, by: nn.Module) -> None:
         parametrize.register_parametrization(layer, name, by)
         changed.append((layer, name))
 
     try:
-        for codes, layers in model.code_layers:
-            found = CodeDistribution(codes.in_features).to(codes.weight)
-            distributions.append(found)
-            rows = codes.weight.split([layer.out_features for layer in layers])
-            for layer, own in zip(layers, rows, strict=True):
-                change(layer, "bias", _Shifted(found, own))
-            change(codes, "weight", _Scaled(found))
-            if model.code_statistics is not None:
-                for name in ("weight", "bias"):
-                    change(model.code_statistics, name, _Standardised(found))
-        yield distributions
+        rows = codes.weight.split([layer.out_features for layer in layers])
+        for layer, own in zip(layers, rows, strict=True):
+            change(layer, "bias", _Shifted(found, own))
+        change(codes, "weight", _Scaled(found))
+        if model.code_statistics is not None:
+            for name in ("weight", "bias"):
+                change(model.code_statistics, name, _Standardised(found))
+        yield found
     finally:
         for module, name in changed:
             parametrize.remove_parametrizations(module, name)

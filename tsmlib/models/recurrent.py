@@ -4,27 +4,23 @@
     x_{t+1}  = x_t + s * head(h_t, x_t, u_t)                            s: deviation of one step
 
 The hidden state reads the past with z = 0 and is then carried on from code to code, so that nothing is forgotten where
-one ends and the next begins. All that is uncertain about one decoder lives in the codes. There is no encoder: it is
-trained by the energy score of its own free-running samples.
-
-Several decoders are an ensemble: a sample is one of them, drawn once per rollout, with codes. Each is trained by itself
-(``alone``), so that they differ in first weights and windows; ``loss`` trains all of them on the same windows.
+one ends and the next begins. All that is uncertain lives in the codes. There is no encoder: it is trained by the energy
+score of its own free-running samples.
 """
 
-from functools import partial
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.models.base import EnsembleModel, Step
-from tsmlib.models.config import Configured, weights_from
+from tsmlib.models.base import Step
+from tsmlib.models.config import Configured
 from tsmlib.models.energy import distance, energy_score
 from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Memory, Recurrent
-from tsmlib.sampling import Noise, draw_members, standard_normal
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window
 
 SAMPLES = 2  # of the energy score
@@ -51,10 +47,10 @@ class Decoder(nn.Module):
         return Recurrent.of(features, **layers)
 
 
-class RecurrentTSM(Featured, Configured, EnsembleModel):
+class RecurrentTSM(Featured, Configured):
     """Recurrent segment model of one environment.
 
-    state_dim, action_dim: dx, du. angles: state dimensions in radians. members: decoders. hidden: size of h and c.
+    state_dim, action_dim: dx, du. angles: state dimensions in radians. hidden: size of h and c.
     code_len: H, steps for which a code is held: the segment of the analyses of codes, as TSM's own.
     segment_len: as the LSTM, it keeps its hidden state for as many steps as one call asks for, so a whole horizon is
     one segment; within it ``begin`` draws a new code every H steps.
@@ -69,7 +65,6 @@ class RecurrentTSM(Featured, Configured, EnsembleModel):
         action_dim: int,
         *,
         angles: tuple[int, ...] = (),
-        members: int = 1,
         hidden: int = 160,
         latent_dim: int = 8,
         past_len: int = 10,
@@ -77,103 +72,56 @@ class RecurrentTSM(Featured, Configured, EnsembleModel):
         segment_len: int = 100,  # the length of an episode
         mode_weight: float = 0.0,
     ) -> None:
-        if members < 1:
-            raise ValueError(f"members is {members}, expected at least one decoder")
         super().__init__()
-        self.members, self.hidden, self.latent_dim, self.mode_weight = members, hidden, latent_dim, mode_weight
+        self.hidden, self.latent_dim, self.mode_weight = hidden, latent_dim, mode_weight
         self.past_len, self.code_len, self.segment_len = past_len, code_len, segment_len
         self.features = Features(state_dim, tuple(angles))
         seen = self.features.dim + action_dim
-        self.decoders = nn.ModuleList(
-            Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim) for _ in range(members)
-        )
-        self.output_layers = tuple(f"decoders.{k}.head" for k in range(members))
-        # Not Muon: their columns are the codes' dimensions, of which some go unused.
-        self.adam_only = tuple(f"decoders.{k}.codes" for k in range(members))
+        self.decoder = Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim)
+        self.output_layers = ("decoder.head",)
+        self.adam_only = ("decoder.codes",)  # not Muon: its columns are the codes' dimensions, of which some go unused
 
     @property
-    def code_layers(self) -> list[tuple[nn.Linear, list[nn.Linear]]]:
-        """V and the gates, of each decoder."""
-        return [(decoder.codes, [decoder.cell]) for decoder in cast(list[Decoder], self.decoders)]
-
-    def alone(self, k: int) -> "RecurrentTSM":
-        """Decoder ``k`` as a model of its own, whose weights and features are these."""
-        config = {**self.config(), "members": 1, "angles": tuple(self.features.angles)}
-        with weights_from(0):
-            single = RecurrentTSM(**config)  # type: ignore[arg-type]  # they are its own arguments
-        single.features, single.decoders = self.features, nn.ModuleList([self.decoders[k]])
-        return single
+    def code_layers(self) -> tuple[nn.Linear, list[nn.Linear]]:
+        """V and the gates."""
+        return self.decoder.codes, [self.decoder.cell]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Read the past (B, L, .). No generator: z = 0; with one: z ~ N(0, I), a new one every H steps."""
         x, taken = past.states[:, -1], 0
-        shares = self._shares(x, generator)
         codes = x.new_zeros(len(x), self.latent_dim)
-
-        def code(share: Tensor | slice) -> Tensor:
-            return codes if generator is None else codes[share]
-
-        steps = [
-            decoder.begin(Segment(*(part[share] for part in past)), partial(code, share))
-            for decoder, share in zip(self._decoders(), shares, strict=True)
-        ]
+        advance = self._recurrent().begin(past, lambda: codes)
 
         def step(u: Tensor) -> Tensor:
             nonlocal codes, taken
             if generator is not None and taken % self.code_len == 0:
                 codes = self._draw(x, generator)
             taken += 1
-            states = [step(u[share]) for step, share in zip(steps, shares, strict=True)]
-            return self._joined(states, shares, generator)
+            return advance(u)
 
         return step
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
-        x = past.states[:, -1]
-        shares = self._shares(x, generator)
-        z = self._codes(x, actions.shape[1], generator)
-        states = [
-            chunked(partial(self._decode, decoder), *(part[share] for part in (*past, actions, z)))
-            for decoder, share in zip(self._decoders(), shares, strict=True)
-        ]
-        return self._joined(states, shares, generator)
+        return chunked(self._decode, *past, actions, self._codes(past.states[:, -1], actions.shape[1], generator))
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """States (B, K, dx) under ``actions`` (B, K, du) and codes: free-running, each from the predicted one before.
 
-        z: (B, dz), of the first H steps, or (B, n, dz), of the first n times H; z = 0 after them. Codes of several
-        decoders do not mean the same, so it is the first that decodes.
+        z: (B, dz), of the first H steps, or (B, n, dz), of the first n times H; z = 0 after them.
         """
-        return chunked(partial(self._decode, self._decoders()[0]), *past, actions, z if z.ndim == 3 else z[:, None])
+        return chunked(self._decode, *past, actions, z if z.ndim == 3 else z[:, None])
 
-    def _decode(self, decoder: Recurrent, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+    def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
+        decoder = self._recurrent()
         return self._run(decoder, states[:, -1], decoder.read(Segment(states, before)), actions, z)
 
-    def _decoders(self) -> list[Recurrent]:
-        return [cast(Decoder, decoder).over(self.features) for decoder in self.decoders]
-
-    def _shares(self, x: Tensor, generator: Noise | None) -> list[Tensor | slice]:
-        """The rows (B_k,) of each decoder: all of them for the mode, which is the decoders' mean."""
-        if generator is None or self.members == 1:
-            return [slice(None)] * self.members
-        member = draw_members(self.members, len(x), generator, x)
-        return [(member == k).nonzero()[:, 0] for k in range(self.members)]
-
-    def _joined(self, states: list[Tensor], shares: list[Tensor | slice], generator: Noise | None) -> Tensor:
-        """The decoders' states as rows (B, ..., dx)."""
-        if self.members == 1:
-            return states[0]
-        if generator is None:
-            return torch.stack(states).mean(0)
-        return torch.cat(states)[torch.cat(cast(list[Tensor], shares)).argsort()]
+    def _recurrent(self) -> Recurrent:
+        return self.decoder.over(self.features)
 
     def point_loss(self, window: Window, generator: Noise) -> Tensor:
-        """|m - x|, m the mode (z = 0) of a decoder, of each H steps as a whole, and the mean of these."""
-        return torch.stack([self._point_loss(decoder, window) for decoder in self._decoders()]).mean()
-
-    def _point_loss(self, decoder: Recurrent, window: Window) -> Tensor:
-        (past, future), x = window, window.past.states[:, -1]
+        """|m - x|, m the mode (z = 0), of each H steps as a whole, and the mean of these."""
+        (past, future), x, decoder = window, window.past.states[:, -1], self._recurrent()
         states = self._run(decoder, x, decoder.read(past), future.actions, self._codes(x, 0, None))
         parts = self._parts(states, future.states)
         return torch.stack([distance(mode, x) for mode, x in parts]).mean()
@@ -181,13 +129,9 @@ class RecurrentTSM(Featured, Configured, EnsembleModel):
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| of each H steps as a whole, and the mean of these.
 
-        X_1, X_2: samples of one decoder. m: its mode. w: ``mode_weight``. All of them free-running through the whole
-        future.
+        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All of them free-running through the whole future.
         """
-        return torch.stack([self._loss(decoder, window, generator) for decoder in self._decoders()]).mean()
-
-    def _loss(self, decoder: Recurrent, window: Window, generator: Noise) -> Tensor:
-        (past, future), draws = window, SAMPLES + (self.mode_weight > 0)
+        (past, future), draws, decoder = window, SAMPLES + (self.mode_weight > 0), self._recurrent()
         n, steps = future.actions.shape[:2]
         x = past.states[:, -1].repeat(draws, 1)
         z = self._codes(x[: SAMPLES * n], steps, generator)

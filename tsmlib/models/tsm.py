@@ -67,9 +67,9 @@ class TSM(Featured, Configured):
         self.decoder = CausalDecoder(self.features.dim + action_dim, state_dim, latent_dim, **decoder)
 
     @property
-    def code_layers(self) -> list[tuple[nn.Linear, list[nn.Linear]]]:
+    def code_layers(self) -> tuple[nn.Linear, list[nn.Linear]]:
         """V and the two taps of every layer."""
-        return [(self.decoder.codes, [cast(nn.Linear, layer.taps) for layer in self.decoder.layers])]
+        return self.decoder.codes, [cast(nn.Linear, layer.taps) for layer in self.decoder.layers]
 
     @property
     def code_statistics(self) -> nn.Linear:
