@@ -142,14 +142,19 @@ def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path
     model, space = RecurrentTSM(10, 2, hidden=8), DirectActions(20)
     model.features.step_std.fill_(0.01)
     rows = []
-    for name in ("mode", "mean of 2", "fresh mean of 2", "median of 6", "mode and mean of 2"):
+    names = ("mode", "mean of 2", "fresh mean of 2", "median of 6", "mode and mean of 2", "screened mean of 4")
+    for name in names:
         way = judge.Way(name, seed=0, candidates=4, iterations=2, again=1)
         rows += [
-            {"env": task.env, "model": "rtsm"} | row for row in judge.measured(task, model, space, way, closed=True)
+            {"env": task.env, "model": "rtsm", "model_seed": "0"} | row
+            for row in judge.measured(task, model, space, way, closed=True)
         ]
     judge.write(tmp_path / "judge.csv", judge.with_differences(rows))
     found = judge.read(tmp_path / "judge.csv")
-    assert [row["closed"] for row in found] == 5 * ["0", "1"]
+    assert [row["closed"] for row in found] == 6 * ["0", "1"]
+    shown = judge.summary(found, 2)
+    assert shown["judge"].tolist() == list(names)
+    assert float(shown["minus the mode's"][1]) == pytest.approx(float(found[2]["more_than_mode"]), abs=0.006)
     mode, other = (np.array(found[i]["costs"].split(), float) for i in (0, 2))
     assert float(found[2]["more_than_mode"]) == pytest.approx(float((other - mode).mean()), rel=0.01, abs=1e-3)
     (zero,) = judge.reference("zero", task, space, way)
@@ -240,9 +245,7 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
     about = {"env": "tsm/ReacherPush-v1", "targets": 100}
     trained = [("lstm", 580, 0), ("tsm", 580, 0), ("lstm", 2320, 0), *(("tsm", 2320, seed) for seed in (0, 2, 1))]
     lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
-    rest = (
-        "; one network each; predictions: n = 200 fresh episodes, plans and violations: n = 100 validation targets"
-    )
+    rest = "; one network each; predictions: n = 200 fresh episodes, plans and violations: n = 100 validation targets"
     assert quality.stamp(lines) == (
         f"ReacherPush, training seed 0 (after 2320 s seeds 0, 1, 2 of TSM: small marks, the line joins means){rest}"
     )

@@ -34,7 +34,13 @@ from tsmlib.planning.planners import (
     reevaluate,
     sampled_starts,
 )
-from tsmlib.planning.predictors import EnsemblePredictor, fresh_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.predictors import (
+    EnsemblePredictor,
+    expected_predictor,
+    fresh_predictor,
+    model_predictor,
+    simulator_predictor,
+)
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward
@@ -425,6 +431,49 @@ def test_a_finished_plan_meets_futures_that_its_planner_did_not_see() -> None:
     judged = reevaluate(plan, fresh, reward)
     torch.testing.assert_close(judged.predicted_return, expected_return(fresh(actions), actions, reward)[0])
     assert not torch.isclose(judged.predicted_return, plan.predicted_return).any()
+
+
+def test_an_expectation_is_over_the_mode_and_samples_that_no_fresh_one_repeats() -> None:
+    past, actions = initial_past(START, 1, 1), torch.full((2, B, T, 1), 0.3)
+    judge = expected_predictor(Cart(0.3), past, samples=3, seed=1)
+    assert isinstance(judge, EnsemblePredictor)
+    states = judge(actions)
+    assert states.shape == (4, 2, B, T, 2)
+    torch.testing.assert_close(states[0], predictor(0.0)(actions)[0])
+    assert torch.equal(states[:, 0], states[:, 1])  # common random numbers
+    assert torch.equal(states, judge(actions))
+    others = [expected_predictor(Cart(0.3), past, samples=3, seed=2)(actions)[1:]]
+    others += [fresh_predictor(Cart(0.3), past, seed=seed)(actions) for seed in range(9)]
+    apart = (torch.cat(others)[:, None] - states[1:]).abs().amax((2, 3, 4, 5))
+    assert apart.min() > 1e-3
+
+
+def test_a_plan_by_expectation_keeps_away_from_an_edge_and_one_by_the_mode_does_not() -> None:
+    def edge(states: Tensor, actions: Tensor) -> Tensor:
+        """The nearer to 0.5 at the end the better, but 10 less beyond it."""
+        end = states[..., -1:, 0]
+        return (end.minimum(torch.tensor(0.5)) - 10.0 * (end > 0.5)) / states.shape[-2] + 0 * states[..., 0]
+
+    past, space, truth = initial_past(START, 1, 1), DirectActions(T, 1, rms=0.5), fresh_predictor
+    found = []
+    for judge in (expected_predictor(Cart(0.1), past), model_predictor(Cart(0.1), past)):
+        plan = cem(judge, edge, space, B, candidates=60, elites=6, iterations=8, screened=0.5)
+        fresh = reevaluate(plan, truth(Cart(0.1), past, seed=3, samples=400), edge)
+        found.append(fresh.predicted_return)
+    assert (found[0] > found[1] + 0.5).all()
+
+
+@pytest.mark.parametrize("build", [OneStep, LSTM, Ensemble])
+def test_of_what_has_modes_alone_an_expectation_is_over_these(build: Any) -> None:
+    torch.manual_seed(0)
+    model, past = in_units(build(6, 2, hidden=16)), initial_past(torch.zeros(B, 6), 10, 2)
+    actions = torch.full((1, B, T, 2), 0.3)
+    assert torch.equal(expected_predictor(model, past)(actions), model_predictor(model, past)(actions))
+
+
+def test_an_expectation_over_no_sample_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"samples is 0, expected at least 1; the mode alone is model_predictor"):
+        expected_predictor(Cart(), initial_past(START, 1, 1), samples=0)
 
 
 @pytest.mark.parametrize("build", [OneStep, LSTM])

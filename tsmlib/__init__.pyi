@@ -24,6 +24,7 @@ from .planning.planners import adam as adam
 from .planning.planners import cem as cem
 from .planning.planners import mppi as mppi
 from .planning.planners import reevaluate as reevaluate
+from .planning.predictors import expected_predictor as expected_predictor
 from .planning.predictors import fresh_predictor as fresh_predictor
 from .planning.predictors import model_predictor as model_predictor
 from .planning.predictors import simulator_predictor as simulator_predictor

@@ -5,6 +5,8 @@
     fresh mean of S   the same, with other noise in every iteration; the plan with the best return by its own noise wins
     median of S       median return over S samples, the same noise for every candidate and iteration
     mode and mean of S    half the mode's return, half the mean's
+    screened mean of S    mean return over the mode and S samples (``expected_predictor``), of the quarter of the
+                          candidates whose modes return most: the study's, with S = 8, for models with codes
 
 All with the cross-entropy method over the codes of the action prior, on validation targets, executed open loop; and
 with --closed planning again every 10 steps too, from what is left of the plan before. Models are those of the run
@@ -15,8 +17,10 @@ Among --models, ``oracle`` is the true simulator in the model's place and ``zero
 
     python benchmarks/settings/judge.py --models rtsm lstm --targets 100 --seeds 0 1 2 --closed
     python benchmarks/settings/judge.py --models rtsm --envs tsm/ReacherPush-noise0.25-v1 --judges mode "mean of 6"
+    python benchmarks/settings/judge.py --table --targets 100
 
-A line that the table has already is not measured again.
+A line that the table has already is not measured again. --table prints the open-loop lines of as many targets, means
+over training seeds with half the 95 % t interval; the cost minus the mode's is paired by target.
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -38,21 +43,27 @@ from tsmlib.models.base import DynamicsModel, Model
 from tsmlib.planning.base import Judge, Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import cem, reevaluate
-from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.predictors import (
+    expected_predictor,
+    fresh_predictor,
+    model_predictor,
+    simulator_predictor,
+)
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.rewards import Reward
 from tsmlib.study import plans, runs
 from tsmlib.study.models import load_prior
+from tsmlib.study.results import table
 from tsmlib.trajectory import Segment
 
 HERE, EVERY = Path(__file__).resolve().parent, 10
 JUDGES = (
     "mode", "mean of 2", "fresh mean of 2", "mode and mean of 2", "mean of 6", "fresh mean of 6", "median of 6",
-    "mean of 16", "median of 16",
+    "mean of 16", "median of 16", "screened mean of 4", "screened mean of 8", "screened mean of 16",
 )  # fmt: skip
 REFERENCES = ("zero", "oracle")
-KEY = ("env", "model", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
+KEY = ("env", "model", "model_seed", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
 COLUMNS = (
     *KEY, "cpu_seconds", "cost", "cost_sem", "more_than_mode", "more_than_mode_sem", "within_5cm", "final_mean",
     "gap_judge", "gap_fresh", "gap_fresh_abs", "costs",
@@ -64,6 +75,8 @@ def judged_by(words: str, candidates: int) -> Judge:
     """A judge by its name."""
     n = 0 if words == "mode" else int(words.split()[-1])
     common: Judge = partial(model_predictor, samples=n)
+    if words.startswith("screened"):
+        return partial(expected_predictor, samples=n)
     if words.startswith("fresh"):
         return partial(Fresh, samples=n, population=candidates + 1)
     if not words.startswith("mode and"):
@@ -113,7 +126,7 @@ class Way:
     def named(self, task: Task, *, closed: bool) -> Row:
         """Its columns of the key."""
         values = (self.judge, int(closed), self.seed, len(task), self.candidates, self.iterations, self.again)
-        return dict(zip(KEY[2:], map(str, values), strict=True))
+        return dict(zip(KEY[3:], map(str, values), strict=True))
 
     def search(
         self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /, *, iterations: int
@@ -121,8 +134,10 @@ class Way:
         """A ``Planner``."""
         judged = by_median(reward) if "median" in self.judge else reward
         elites = max(2, self.candidates // 10)
-        return cem(predict, judged, space, start, candidates=self.candidates, elites=elites, iterations=iterations,
-                   seed=self.seed)  # fmt: skip
+        return cem(
+            predict, judged, space, start, candidates=self.candidates, elites=elites, iterations=iterations,
+            screened=plans.SCREENED if self.judge.startswith("screened") else 1.0, seed=self.seed,
+        )  # fmt: skip
 
     def opened(self, task: Task, model: DynamicsModel, space: SearchSpace) -> Plan:
         """The plan of the whole episode, with the return that its judge predicts."""
@@ -193,6 +208,23 @@ def _rest(row: Row) -> tuple[str, ...]:
     return tuple(row[word] for word in KEY if word not in ("judge", "closed"))
 
 
+def summary(rows: list[Row], targets: int) -> pd.DataFrame:
+    """Open-loop lines of models for as many targets, over their training seeds, as texts."""
+    lines = pd.DataFrame([row for row in rows if row["closed"] == "0" and row["targets"] == str(targets)])
+    numbers = list(COLUMNS[len(KEY) : -1])
+    lines[numbers] = lines[numbers].replace("", "nan").astype(float)
+    groups = lines[~lines["model"].isin(REFERENCES)].groupby(["env", "model", "judge"], sort=False)
+    return pd.DataFrame([
+        {"env": env, "model": model, "judge": judge, "seeds": len(group)}
+        | {"cost (m)": table.spell(group["cost"])}
+        | {"minus the mode's": "" if judge == "mode" else table.spell(group["more_than_mode"], "{:+.2f} ± {:.2f}")}
+        | {"within 5 cm": table.spell(100 * group["within_5cm"], "{:.0f} ± {:.0f} %")}
+        | {"size of the gap (m)": table.spell(group["gap_fresh_abs"], "{:.2f} ± {:.2f}")}
+        | {"CPU s": f"{group['cpu_seconds'].mean():.0f}"}
+        for (env, model, judge), group in groups
+    ])  # fmt: skip
+
+
 def read(path: Path) -> list[Row]:
     """The table in ``path``, or an empty one. ValueError for one of other columns."""
     if not path.exists():
@@ -224,8 +256,12 @@ def main() -> None:
     parser.add_argument("--closed", action="store_true", help="plan again every 10 steps too")
     parser.add_argument("--scale", default="", help="of the models; default TSM_SCALE, else laptop")
     parser.add_argument("--model-seed", type=int, default=0, help="of the models (default 0)")
+    parser.add_argument("--table", action="store_true", help="print the table")
     parser.add_argument("--out", type=Path, default=HERE / "judge.csv", help="default judge.csv beside this script")
     arguments = parser.parse_args()
+    if arguments.table:
+        print(table.markdown(summary(read(arguments.out), arguments.targets)))
+        return
     torch.set_num_threads(1)
     run = runs.resolve("05_control", scale=arguments.scale, seed=arguments.model_seed)
     for env in arguments.envs:
@@ -236,7 +272,7 @@ def main() -> None:
             for seed in arguments.seeds if word != "zero" else (0,):
                 for judge in ("",) if model is None else arguments.judges if model.stochastic else ("mode",):
                     way = Way(judge, seed, arguments.candidates, arguments.iterations, arguments.again)
-                    known, common = read(arguments.out), {"env": env, "model": word}
+                    known, common = read(arguments.out), {"env": env, "model": word, "model_seed": str(run.seed)}
                     wanted = common | way.named(task, closed=arguments.closed and model is not None)
                     if any(all(row[key] == value for key, value in wanted.items()) for row in known):
                         continue

@@ -99,8 +99,8 @@ def cem(
 
     The mean begins at the best of ``start`` (C, B, *shape), or at zero for as many targets.
 
-    screened: where an ensemble judges (``EnsemblePredictor``), the share of the candidates that all members judge,
-    those that are best by the first member; never fewer than the elites. 1: all candidates.
+    screened: where several judge (``EnsemblePredictor``: an ensemble's members, or a model's mode and samples), the
+    share of the candidates that all judge, those best by the first; never fewer than the elites. 1: all candidates.
     """
     if not 2 <= elites <= candidates or iterations < 1 or not 0 <= screened <= 1:
         raise ValueError(

@@ -22,10 +22,10 @@ from .models import training_data as training_data
 from .needed import needs as needs
 from .parallel import precompute as precompute
 from .plans import along_the_way as along_the_way
-from .plans import as_judged as as_judged
 from .plans import plan as plan
 from .plans import trial as trial
 from .plans import trials as trials
+from .plans import with_modes as with_modes
 from .policies import Budget as Budget
 from .policies import assess as assess
 from .policies import execute_policy as execute_policy

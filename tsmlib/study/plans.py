@@ -17,10 +17,16 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES, Method
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import members
-from tsmlib.planning.base import Plan, Planner, Predictor, SearchSpace
+from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi, plan_at, reevaluate, sampled_starts
-from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.predictors import (
+    EXPECTED,
+    expected_predictor,
+    fresh_predictor,
+    model_predictor,
+    simulator_predictor,
+)
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import artifacts
@@ -36,8 +42,7 @@ ITERATIONS = {  # of an open-loop plan
 AGAIN = {  # of each later plan of a closed loop, which starts from what is left of the one before
     "cem": {"smoke": 1, "laptop": 3, "paper": 4}, "adam": {"smoke": 2, "laptop": 20, "paper": 20},
 }  # fmt: skip
-SAMPLES = 0  # by which a candidate is judged: its mode (benchmarks/settings, section 3)
-SCREENED = 0.25  # of the candidates of cem, which all members of an ensemble judge (benchmarks/settings, section 6)
+SCREENED = 0.25  # of the candidates of cem, which all samples or members judge (benchmarks/settings, sections 3, 6)
 KEPT = 4  # samples of the predicted states, of those behind a predicted return
 TORQUES: dict[str, Callable[[Task], Tensor]] = {"random": random_torques, "zero": zero_torques}
 
@@ -123,16 +128,15 @@ def along_the_way(run: Run, task: Task, method: Method, *, iterations: int, at: 
     return {i: execute(task, plan_at(whole, i, fresh, task.reward, problem.space())) for i in at}
 
 
-def as_judged(run: Run, task: Task, method: Method, trial: Trial) -> Trial:
-    """The trial of an open-loop plan with the rollout that its planner saw in place of fresh samples: the mode's.
+def with_modes(run: Run, task: Task, method: Method, trial: Trial) -> Trial:
+    """The trial of an open-loop plan with the mode's rollout, of an ensemble its members', in place of fresh samples.
 
     For films; the predicted return stays that of the fresh samples.
     """
     if trial.plan is None:
         raise ValueError("these actions were not planned, so there is no predicted rollout")
-    predict, _ = _Problem.of(run, task, method, 0, 0).predictors()
     with torch.no_grad():
-        seen = predict(trial.plan.actions[None])[:, 0]
+        seen = _Problem.of(run, task, method, 0, 0).modes()(trial.plan.actions[None])[:, 0]
     return replace(trial, plan=replace(trial.plan, states=seen))
 
 
@@ -163,16 +167,27 @@ class _Problem:
     def made_from(self) -> dict[str, Json]:
         """All that the plan is a function of."""
         nets = {"prior": self.prior, "model": self.model}
-        judge: dict[str, Json] = {} if self.model is None else {"samples": SAMPLES}
-        if self.model is not None and members(self.model) > 1:
+        judge: dict[str, Json] = {} if self.model is None else {"samples": EXPECTED if self.expects else 0}
+        several = self.model is not None and members(self.model) > 1
+        if self.model is not None and several:
             judge["members"] = members(self.model)
-            if self.method.planner == "cem":
-                judge["screened"] = SCREENED
+        if self.method.planner == "cem" and (several or self.expects):
+            judge["screened"] = SCREENED
         return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
             "every": self.every, "seed": self.run.seed, "candidates": self.candidates, "iterations": self.iterations,
             "weights": {word: artifacts.digest(net.state_dict()) for word, net in nets.items() if net is not None},
         }  # fmt: skip
+
+    @property
+    def expects(self) -> bool:
+        """Whether candidates are judged by samples, beside the mode: by cem, which screens them, of a single model."""
+        net = self.model
+        return self.method.planner == "cem" and net is not None and net.stochastic and members(net) == 1
+
+    @property
+    def judge(self) -> Judge:
+        return partial(expected_predictor, samples=EXPECTED) if self.expects else model_predictor
 
     def space(self) -> SearchSpace:
         if self.prior is None:
@@ -182,11 +197,16 @@ class _Problem:
     def predictors(self) -> tuple[Predictor, Predictor]:
         """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
-            simulator = simulator_predictor(self.task.env, self.task.start)
-            return simulator, simulator
+            return self.modes(), self.modes()
         net, seed = self.model.to(self.run.device), self.run.seed
         past = self.task.past(net.past_len)
-        return model_predictor(net, past, samples=SAMPLES, seed=seed), fresh_predictor(net, past, seed=seed + 1)
+        return self.judge(net, past, seed=seed), fresh_predictor(net, past, seed=seed + 1)
+
+    def modes(self) -> Predictor:
+        """A model's mode; the true simulator."""
+        if self.model is None:
+            return simulator_predictor(self.task.env, self.task.start)
+        return model_predictor(self.model.to(self.run.device), self.task.past(self.model.past_len))
 
     def planner(self, progress: str = "") -> Planner:
         word, seed, candidates = self.method.planner, self.run.seed, self.candidates
@@ -222,7 +242,7 @@ class _Problem:
         net = None if self.model is None else self.model.to(self.run.device)
         done = mpc(
             self.task, net, self.space(), self.planner(), every=self.every, plan=first,
-            judge=partial(model_predictor, samples=SAMPLES), seed=self.run.seed, progress=self.title(),
+            judge=self.judge, seed=self.run.seed, progress=self.title(),
         ).plan  # fmt: skip
         assert done is not None
         return replace(done, seconds=first.seconds + done.seconds)
