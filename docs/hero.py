@@ -22,8 +22,10 @@ def frames(env: str, targets: int, model: Path | None) -> np.ndarray:
     net = tsm.load_model(model, tsm.RecurrentTSM) if model else tsm.load_pretrained("rtsm", env=env)
     task = tsm.load_task(env).take(targets)
     space = tsm.LatentActions(tsm.load_pretrained("prior", env=env), task.horizon)
-    predict = tsm.model_predictor(net, task.past(net.past_len))
-    trial = tsm.execute(task, tsm.cem(predict, task.reward, space, targets, candidates=96, progress="planning"))
+    past, options = task.past(net.past_len), dict(candidates=96, screened=0.25, progress="planning")
+    plan = tsm.cem(tsm.expected_predictor(net, past), task.reward, space, targets, **options)
+    plan = tsm.reevaluate(plan, tsm.model_predictor(net, past), task.reward)  # shown is the mode
+    trial = tsm.execute(task, plan)
     order = by_final_distance(task, trial)
     return tsm.film(task, trial, order[len(order) // 2])
 

@@ -8,6 +8,7 @@ from typing import cast
 import pandas as pd
 
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.planning.predictors import EXPECTED
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import plans, rounds, zoo
@@ -117,7 +118,7 @@ def readme_training(env: str) -> str:
     return (
         f"[Training time](benchmarks/settings/README.md) decides: after {shorter / shipped:g} of it → as shipped "
         f"({_seeds(before)}, validation), energy score over the best baseline's at 10, 80 steps {scores}; "
-        f"cost of plans {costs}.{_against(trained[shipped], 'onestep')}"
+        f"cost of plans by the mode {costs}.{_against(trained[shipped], 'onestep')}"
     )
 
 
@@ -250,8 +251,9 @@ Pushing, seed by seed: the energy score of `{OURS}` over that of the best other 
 
 Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
-over steps. A candidate is judged by the mode of the model; of an ensemble, the first member sorts the candidates and
-the best quarter is judged by the mean over all members (`cem(screened=)`).
+over steps. Pushing: the mode of a model with codes sorts the candidates, and the best quarter is judged by the mean
+over the mode and {EXPECTED} samples (`expected_predictor`, `cem(screened=)`); reaching: by the mode alone. Of an
+ensemble the first member sorts, and the mean over all members judges. A model without samples has its one rollout.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
