@@ -183,6 +183,15 @@ def test_a_reward_has_a_finite_slope_at_its_target() -> None:
     assert torch.isfinite(states.grad).all()
 
 
+@pytest.mark.parametrize("env", ["tsm/Reacher-v0", "tsm/ReacherPush-v1"])
+def test_random_torques_are_none_of_the_training_data(env: str) -> None:
+    known, task = torch.from_numpy(study.random_data(env, 200, seed=0).actions), study.load_task(env)
+    torques = random_torques(task)
+    assert (torques[:, None] - known[:, : task.horizon]).abs().amax((2, 3)).min() > 0.01
+    of_data = smooth_torques(len(task), task.horizon, generator=torch.Generator().manual_seed(0))
+    assert not torch.allclose(torques, of_data)  # their noise, cut into episodes of the task's length
+
+
 def test_the_gap_is_predicted_minus_true() -> None:
     task = some_task()
     actions = random_torques(task)

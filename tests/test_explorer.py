@@ -155,6 +155,7 @@ def test_candidates_are_judged_alike_by_any_number_of_workers() -> None:
     asked = {"what": "shared", "task": "push", "model": "rtsm", "past": as_pasts(task.past(10))[0], "codes": codes}
     alone, *others = ask(*(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4)))
     assert len(alone) == 64
+    assert all(value is not None for value in alone)
     assert all(found == alone for found in others)
 
 

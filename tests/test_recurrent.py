@@ -122,4 +122,4 @@ def test_an_update_fetches_no_memory_anew() -> None:
         net.zero_grad(set_to_none=True)
         net.loss(wide, rng(n)).backward()
         fetched.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-    assert min(fetched[4:]) < 500  # of thousands; a thread that joins late fetches its own
+    assert sorted(fetched[4:])[1] < 500  # of thousands; a thread that joins late fetches its own

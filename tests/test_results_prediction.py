@@ -76,6 +76,13 @@ def test_contact_rows_average_from_the_first_touch_on(found: pd.DataFrame) -> No
     assert n.get(1, 0) == int(after[:, 0].sum())
 
 
+def test_a_touch_before_the_prediction_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    test, steps = study.random_data(ENV, 2, seed=0), torch.zeros(2, 100, dtype=torch.bool)
+    steps[0, 3], steps[1, 50] = True, True
+    monkeypatch.setattr(prediction_results, "contact_steps", lambda *_: steps)
+    assert prediction_results.since_touch(test, scores(2, T)).sum(1).tolist() == [90, 50]
+
+
 def test_what_touches_is_told_by_true_states() -> None:
     noisy = study.random_data("tsm/ReacherPush-noise0.25-v1", 2, seed=0)
     with pytest.raises(ValueError, match=r"noisy states of tsm/ReacherPush-noise0.25-v1 do not tell what touches"):

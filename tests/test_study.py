@@ -18,8 +18,8 @@ from tsmlib.envs.spec import DELAY, NOISE, EnvSpec
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning import tasks
-from tsmlib.planning.planners import adam, cem, sampled_starts
-from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.planners import adam, cem, expected_return, sampled_starts
+from tsmlib.planning.predictors import expected_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import StoreError
@@ -287,9 +287,16 @@ def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_ve
 
 def test_plans_judged_by_other_samples_are_made_again(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     first = study.plan(run, some_task(), LATENT)
-    monkeypatch.setattr(study.plans, "EXPECTED", 2)
+    monkeypatch.setattr(study.plans, "JUDGING", 2)
     second = study.plan(run, some_task(), LATENT)
     assert second.seconds != first.seconds
+
+
+def test_a_plan_is_chosen_by_mode_and_samples(made: Run) -> None:
+    plan, net = study.plan(made, some_task(), LATENT), study.load_or_train(made, some_task().env, LATENT.model).model
+    judge = expected_predictor(net, some_task().past(net.past_len), seed=made.seed)
+    judged = expected_return(judge(plan.actions[None]), plan.actions[None], some_task().reward)[0]
+    torch.testing.assert_close(judged, plan.curve[-1], rtol=1e-4, atol=1e-4)
 
 
 def test_a_film_shows_the_mode_of_a_plan(made: Run) -> None:

@@ -1,5 +1,6 @@
 """SensorNoise and ActionDelay do what they say to the signals, and nothing to the world."""
 
+import itertools
 import warnings
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise
+from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise, imperfect_arms
 
 ENV = "tsm/PymunkPush-v1"
 SCALE = np.array([3.0, 2.0, 8.0, 6.0, 0.2, 0.2, 0.25, 0.25, 1.0, 1.0])
@@ -78,6 +79,16 @@ def test_noise_shares_no_random_numbers_with_starts(seed: int) -> None:
     for resets in range(4):  # an arm begins by its seed, how often it was reset, and its number
         begun = np.random.default_rng((seed, resets, 0)).standard_normal(len(drawn))
         assert np.abs(drawn - begun).max() > 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_noise_of_many_arms_shares_no_random_numbers_with_starts(seed: int) -> None:
+    arms = imperfect_arms(2, "tsm/Reacher-v0", noise=0.25, delay=0)
+    noisy, info = arms.reset(seed=seed)
+    drawn = (noisy - info["state"]) / (arms.sigma * arms.scale)
+    for resets, number in itertools.product(range(4), range(2)):
+        begun = np.random.default_rng((seed, resets, number)).standard_normal(drawn.shape[1])
+        assert np.abs(drawn - begun).max(1).min() > 0.1
 
 
 def test_noise_has_mean_zero_and_the_given_size() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,6 +35,14 @@ class NoNoise:
 
 
 Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
+
+
+def generator_of(*key: int) -> torch.Generator:
+    """Random numbers of their own for every key.
+
+    Seeds that differ by a sum could meet; and on a CPU torch keeps the low 32 bits of a seed alone.
+    """
+    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
 def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:

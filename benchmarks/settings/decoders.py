@@ -120,7 +120,9 @@ def main() -> None:
     what.add_argument("--name", help="of the line that is added")
     what.add_argument("--compare", metavar="NAME", help="print the table, every line against this one")
     what.add_argument("--alone", action="store_true", help="print the table of trainings together and one by one")
-    parser.add_argument("--files", nargs="+", type=Path, default=[], help="models")
+    parser.add_argument(
+        "--files", nargs="+", type=Path, default=[], help="files of trained models, which judge together"
+    )
     parser.add_argument("--screened", type=float, default=1.0, help="share that all judge (default 1: all candidates)")
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
     parser.add_argument("--split", default="validation", choices=("validation", "test"), help="default validation")

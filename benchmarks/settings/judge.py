@@ -213,15 +213,17 @@ def summary(rows: list[Row], targets: int) -> pd.DataFrame:
     lines = pd.DataFrame([row for row in rows if row["closed"] == "0" and row["targets"] == str(targets)])
     numbers = list(COLUMNS[len(KEY) : -1])
     lines[numbers] = lines[numbers].replace("", "nan").astype(float)
-    groups = lines[~lines["model"].isin(REFERENCES)].groupby(["env", "model", "judge"], sort=False)
+    key = ["env", "model", "judge", "candidates", "iterations"]
+    means = lines[~lines["model"].isin(REFERENCES)].groupby([*key, "model_seed"], sort=False)[numbers].mean()
     return pd.DataFrame([
-        {"env": env, "model": model, "judge": judge, "seeds": len(group)}
-        | {"cost (m)": table.spell(group["cost"])}
-        | {"minus the mode's": "" if judge == "mode" else table.spell(group["more_than_mode"], "{:+.2f} ± {:.2f}")}
-        | {"within 5 cm": table.spell(100 * group["within_5cm"], "{:.0f} ± {:.0f} %")}
-        | {"size of the gap (m)": table.spell(group["gap_fresh_abs"], "{:.2f} ± {:.2f}")}
-        | {"CPU s": f"{group['cpu_seconds'].mean():.0f}"}
-        for (env, model, judge), group in groups
+        dict(zip(key, what, strict=True)) | {
+            "seeds": len(own), "cost (m)": table.spell(own["cost"]),
+            "minus the mode's": "" if "mode" in what else table.spell(own["more_than_mode"], "{:+.2f} ± {:.2f}"),
+            "within 5 cm (%)": table.spell(100 * own["within_5cm"], "{:.0f} ± {:.0f}"),
+            "size of the gap (m)": table.spell(own["gap_fresh_abs"], "{:.2f} ± {:.2f}"),
+            "CPU s": f"{own['cpu_seconds'].mean():.0f}",
+        }
+        for what, own in means.groupby(key, sort=False)
     ])  # fmt: skip
 
 

@@ -97,7 +97,7 @@ export async function* cem(space, judge, { start = new Float32Array(space.size),
       parameters.set(best.parameters, 0);
       found[0] = best.value;
     }
-    const worst = Math.min(0, ...found.filter(Number.isFinite)); // a candidate on which the model diverges, or that was sorted out
+    const worst = Math.min(0, ...found.filter(Number.isFinite)); // a candidate on which the model diverges
     const order = [...found.keys()].sort((a, b) => (Number.isFinite(found[b]) ? found[b] : worst) - (Number.isFinite(found[a]) ? found[a] : worst));
     for (let i = 0; i < n; i++) {
       let average = 0, square = 0;

@@ -7,7 +7,7 @@ import { normal } from './random.js';
 
 export const SAMPLES = 32; // futures of the fan, and behind a predicted return, as in tsmlib.planning.predictors
 export const EVERY = 10; // steps executed before the next plan
-const FEWEST = 12; // candidates
+const FEWEST = 12; // candidates of a later plan, at least
 const ALONE = 8; // rows in which CEM judges its start and its last mean
 const L = 10, DU = 2;
 

@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, generator_of, measure
+from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, measure
 from tsmlib.models.base import DynamicsModel, Model, as_dynamics, predict_segment, rollout
 from tsmlib.models.features import Features
 from tsmlib.models.tsm import TSM
+from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 VERSION = 2  # raise it when a score changes: scores that are kept are found again only by the version that made them

@@ -22,9 +22,10 @@ residual noise it becomes S noisy copies.
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
+
+from tsmlib.sampling import generator_of
 
 SHIFTS = 4  # pairs (s, s + 1), ..., (s, s + 4) of samples estimate the spread E|X - X'|
 LEVELS = torch.arange(1, 20) / 20  # 0.05 .. 0.95, the nominal levels of a calibration curve
@@ -185,11 +186,6 @@ def rank(samples: Tensor, truth: Tensor, generator: torch.Generator) -> Tensor:
 def coverage(pit: Tensor, level: float) -> Tensor:
     """Share of dimensions (N, T) in which the truth lies within the central interval of ``level``."""
     return ((2 * pit - 1).abs() <= level).float().mean(-1)
-
-
-def generator_of(*key: int) -> torch.Generator:
-    """Random numbers of their own for every key; seeds that differ by a sum could meet."""
-    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
 def _lengths(difference: Tensor) -> tuple[Tensor, Tensor]:

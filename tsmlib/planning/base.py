@@ -17,7 +17,7 @@ Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled state
 
 
 class Judge(Protocol):
-    """What candidates are judged by: ``model_predictor`` for the mode, ``partial(model_predictor, samples=2)``, ..."""
+    """What candidates are judged by: ``model_predictor``, the mode; ``expected_predictor``, mode and samples; ..."""
 
     def __call__(self, model: Model, past: Segment, /, *, seed: int) -> Predictor:
         """The predictor through ``model`` from ``past`` (B, L, .); what is drawn is a function of ``seed``."""

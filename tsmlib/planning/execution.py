@@ -35,7 +35,8 @@ class Trial:
     (B,): metres, or as the task's measure of success has it, NaN where it has none; plan: where the actions came from,
     with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
 
-    Behind delayed actions ``actions`` are those that were given, and the executed return charges what arrived.
+    Behind delayed actions ``actions`` are those that were given. The executed return charges those that arrived, a
+    predicted return those given, so that the gap holds the penalty of the last tau torques.
 
     success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
     returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none. seen: the

@@ -22,8 +22,7 @@ from tsmlib.sampling import Noise, NoNoise, SharedNoise
 from tsmlib.trajectory import Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
-EXPECTED = 8  # samples by which a candidate is judged (benchmarks/settings, section 3)
-_APART = 1 << 41  # keeps them apart from the fresh samples of any seed
+JUDGING = 8  # samples beside the mode, by which a candidate is judged (benchmarks/settings, section 3)
 
 
 def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
@@ -57,20 +56,23 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     return partial(_predict, model, past, max(1, samples), common if samples else None)
 
 
-def expected_predictor(model: Model, past: Segment, *, samples: int = EXPECTED, seed: int = 0) -> Predictor:
+def expected_predictor(model: Model, past: Segment, *, samples: int = JUDGING, seed: int = 0) -> Predictor:
     """Predict for an expectation over the model's futures (Eqs. 2 and 3): its mode and ``samples`` samples.
 
     An ``EnsemblePredictor``, whose first member is the mode, so that ``cem(screened=0.25)`` sorts the candidates by the
-    mode and judges the best quarter by the mean over all. Samples have the same noise, a function of ``seed``, for
-    every candidate and call. A deterministic model has its one rollout, an ensemble the modes of its members.
+    mode and judges the best quarter by the mean over all. A deterministic model has its one rollout, an ensemble the
+    modes of its members.
+
+    Samples have the same noise, a function of ``seed``, for every candidate and call. ``fresh_predictor`` needs a seed
+    that is none of ``samples * seed`` and the ``samples - 1`` after it.
     """
     if samples < 1:
         raise ValueError(f"samples is {samples}, expected at least 1; the mode alone is model_predictor(model, past)")
-    if not as_dynamics(model).stochastic or members(model) > 1:
-        return model_predictor(model, past)
-    seeds = range(_APART + samples * seed, _APART + samples * (seed + 1))
-    drawn = (model_predictor(model, past, samples=1, seed=each) for each in seeds)
-    return EnsemblePredictor((model_predictor(model, past), *drawn))
+    mode = model_predictor(model, past)
+    if not as_dynamics(model).stochastic or isinstance(mode, EnsemblePredictor):
+        return mode
+    seeds = range(samples * seed, samples * (seed + 1))
+    return EnsemblePredictor((mode, *(model_predictor(model, past, samples=1, seed=each) for each in seeds)))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, make_simulation
 from tsmlib.rewards import Reward, rewarded
+from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Segment, initial_past
 
 HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
@@ -195,10 +196,10 @@ def zero_torques(task: Task) -> Tensor:
     return torch.zeros(len(task), task.horizon, task.action_dim)
 
 
-APART = 1 << 40  # keeps random torques apart from those that ``collect_random`` draws from the same seed
+RANDOM_TORQUES = 1  # first part of the key of their random numbers, which no data are drawn from
 
 
 def random_torques(task: Task, *, seed: int = 0) -> Tensor:
     """Torques like the arm's training data's. (B, T, du)."""
-    generator = torch.Generator().manual_seed(APART + seed)
+    generator = generator_of(RANDOM_TORQUES, seed)
     return smooth_torques(len(task), task.horizon, generator=generator, action_dim=task.action_dim)

@@ -8,7 +8,7 @@ from typing import cast
 import pandas as pd
 
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.planning.predictors import EXPECTED
+from tsmlib.planning.predictors import JUDGING
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import plans, rounds, zoo
@@ -266,8 +266,9 @@ Pushing, seed by seed: the energy score of `{OURS}` over that of the best other 
 Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
 over steps. Pushing: the mode of a model with codes sorts the candidates, and the best quarter is judged by the mean
-over the mode and {EXPECTED} samples (`expected_predictor`, `cem(screened=)`); reaching: by the mode alone. Of an
-ensemble the first member sorts, and the mean over all members judges. A model without samples has its one rollout.
+over the mode and {JUDGING} samples (`expected_predictor`, `cem(screened=)`). Rows of reaching are older: by the mode
+alone. Of an ensemble the first member sorts, and the mean over all members judges. A model without samples has its
+one rollout.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 

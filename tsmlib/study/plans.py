@@ -21,7 +21,7 @@ from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi, plan_at, reevaluate, sampled_starts
 from tsmlib.planning.predictors import (
-    EXPECTED,
+    JUDGING,
     expected_predictor,
     fresh_predictor,
     model_predictor,
@@ -167,11 +167,11 @@ class _Problem:
     def made_from(self) -> dict[str, Json]:
         """All that the plan is a function of."""
         nets = {"prior": self.prior, "model": self.model}
-        judge: dict[str, Json] = {} if self.model is None else {"samples": EXPECTED if self.expects else 0}
+        judge: dict[str, Json] = {} if self.model is None else {"samples": JUDGING if self.by_expectation else 0}
         several = self.model is not None and members(self.model) > 1
         if self.model is not None and several:
             judge["members"] = members(self.model)
-        if self.method.planner == "cem" and (several or self.expects):
+        if self.method.planner == "cem" and (several or self.by_expectation):
             judge["screened"] = SCREENED
         return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
@@ -180,14 +180,15 @@ class _Problem:
         }  # fmt: skip
 
     @property
-    def expects(self) -> bool:
+    def by_expectation(self) -> bool:
         """Whether candidates are judged by samples, beside the mode: by cem, which screens them, of a single model."""
         net = self.model
         return self.method.planner == "cem" and net is not None and net.stochastic and members(net) == 1
 
     @property
     def judge(self) -> Judge:
-        return partial(expected_predictor, samples=EXPECTED) if self.expects else model_predictor
+        """What candidates are judged by."""
+        return partial(expected_predictor, samples=JUDGING) if self.by_expectation else model_predictor
 
     def space(self) -> SearchSpace:
         if self.prior is None:
@@ -203,7 +204,7 @@ class _Problem:
         return self.judge(net, past, seed=seed), fresh_predictor(net, past, seed=seed + 1)
 
     def modes(self) -> Predictor:
-        """A model's mode; the true simulator."""
+        """Predicts the mode, of an ensemble that of each member; without a model, the true simulator."""
         if self.model is None:
             return simulator_predictor(self.task.env, self.task.start)
         return model_predictor(self.model.to(self.run.device), self.task.past(self.model.past_len))
