@@ -210,7 +210,11 @@ def _rest(row: Row) -> tuple[str, ...]:
 
 def summary(rows: list[Row], targets: int) -> pd.DataFrame:
     """Open-loop lines of models for as many targets, over their training seeds, as texts."""
-    lines = pd.DataFrame([row for row in rows if row["closed"] == "0" and row["targets"] == str(targets)])
+    wanted = [row for row in rows if row["closed"] == "0" and row["targets"] == str(targets)]
+    if not wanted:
+        there = sorted({int(row["targets"]) for row in rows})
+        raise ValueError(f"no open-loop lines of {targets} targets; there are lines of {', '.join(map(str, there))}")
+    lines = pd.DataFrame(wanted)
     numbers = list(COLUMNS[len(KEY) : -1])
     lines[numbers] = lines[numbers].replace("", "nan").astype(float)
     key = ["env", "model", "judge", "candidates", "iterations"]
@@ -262,7 +266,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE / "judge.csv", help="default judge.csv beside this script")
     arguments = parser.parse_args()
     if arguments.table:
-        print(table.markdown(summary(read(arguments.out), arguments.targets)))
+        try:
+            print(table.markdown(summary(read(arguments.out), arguments.targets)))
+        except ValueError as error:
+            parser.error(str(error))
         return
     torch.set_num_threads(1)
     run = runs.resolve("05_control", scale=arguments.scale, seed=arguments.model_seed)

@@ -272,7 +272,8 @@ one rollout.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
-By gradients, as the paper plans (Adam, {plans.ITERATIONS["adam"]["paper"]} iterations from zero), where there are rows:
+By gradients (Adam, as in the paper, {plans.ITERATIONS["adam"]["paper"]} iterations from zero, judged by the
+mode), where there are rows:
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"], planner="adam")}
 
