@@ -157,6 +157,10 @@ def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path
     assert float(shown["minus the mode's"][1]) == pytest.approx(float(found[2]["more_than_mode"]), abs=0.006)
     mode, other = (np.array(found[i]["costs"].split(), float) for i in (0, 2))
     assert float(found[2]["more_than_mode"]) == pytest.approx(float((other - mode).mean()), rel=0.01, abs=1e-3)
+    study_way = [row | {"judge": judge.STUDY} for row in found if row["judge"] == "mean of 2"]
+    (line,) = judge.against([*found, *study_way], 2).to_dict("records")
+    assert (line["model"], line["minus"], line["seeds"]) == ("rtsm", "rtsm", 1)
+    assert float(line["cost (m)"].split()[0]) == pytest.approx(float(found[2]["more_than_mode"]), abs=0.006)
     with pytest.raises(ValueError, match="no open-loop lines of 100 targets; there are lines of 2"):
         judge.summary(found, 100)
     (zero,) = judge.reference("zero", task, space, way)

@@ -20,7 +20,8 @@ Among --models, ``oracle`` is the true simulator in the model's place and ``zero
     python benchmarks/settings/judge.py --table --targets 100
 
 A line that the table has already is not measured again. --table prints the open-loop lines of as many targets, means
-over training seeds with half the 95 % t interval; the cost minus the mode's is paired by target.
+over training seeds with half the 95 % t interval; the cost minus the mode's is paired by target. A second table has
+what models judged as in the study cost minus what others cost by their modes, with the interval over targets.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +65,7 @@ JUDGES = (
     "mean of 16", "median of 16", "screened mean of 4", "screened mean of 8", "screened mean of 16",
 )  # fmt: skip
 REFERENCES = ("zero", "oracle")
+STUDY = "screened mean of 8"  # the study's judge of models with codes
 KEY = ("env", "model", "model_seed", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
 COLUMNS = (
     *KEY, "cpu_seconds", "cost", "cost_sem", "more_than_mode", "more_than_mode_sem", "within_5cm", "final_mean",
@@ -208,14 +211,42 @@ def _rest(row: Row) -> tuple[str, ...]:
     return tuple(row[word] for word in KEY if word not in ("judge", "closed"))
 
 
-def summary(rows: list[Row], targets: int) -> pd.DataFrame:
-    """Open-loop lines of models for as many targets, over their training seeds, as texts."""
+def opened(rows: list[Row], targets: int) -> pd.DataFrame:
+    """Open-loop lines for as many targets; ValueError without any."""
     wanted = [row for row in rows if row["closed"] == "0" and row["targets"] == str(targets)]
     if not wanted:
         there = sorted({int(row["targets"]) for row in rows})
         raise ValueError(f"no open-loop lines of {targets} targets; there are lines of {', '.join(map(str, there))}")
-    lines = pd.DataFrame(wanted)
-    numbers = list(COLUMNS[len(KEY) : -1])
+    return pd.DataFrame(wanted)
+
+
+def against(rows: list[Row], targets: int) -> pd.DataFrame:
+    """What models judged by ``STUDY`` cost minus what others cost that are judged by their modes, paired by target.
+
+    Means over training seeds that both have, with half the 95 % t interval over targets.
+    """
+    costs = {
+        (line.env, line.planner_seed, line.model, line.judge, line.candidates, line.model_seed):
+            np.array(str(line.costs).split(), float)
+        for line in opened(rows, targets).itertuples()
+    }  # fmt: skip
+    kinds, found = dict.fromkeys(key[:-1] for key in costs), []
+    for ours, theirs in product(kinds, kinds):
+        if ours[:2] == theirs[:2] and ours[3] == STUDY and theirs[3] == "mode":
+            seeds = [key[-1] for key in costs if key[:-1] == ours and (*theirs, key[-1]) in costs]
+            apart = [costs[*ours, seed] - costs[*theirs, seed] for seed in seeds]
+            if apart:
+                found.append({
+                    "model": ours[2], "minus": theirs[2], "its candidates": theirs[4], "seeds": len(seeds),
+                    "cost (m)": table.spell(np.mean(apart, axis=0), "{:+.2f} ± {:.2f}"),
+                    "in each seed": ", ".join(f"{each.mean():+.2f}" for each in apart),
+                })  # fmt: skip
+    return pd.DataFrame(found)
+
+
+def summary(rows: list[Row], targets: int) -> pd.DataFrame:
+    """Open-loop lines of models for as many targets, over their training seeds, as texts."""
+    lines, numbers = opened(rows, targets), list(COLUMNS[len(KEY) : -1])
     lines[numbers] = lines[numbers].replace("", "nan").astype(float)
     key = ["env", "model", "judge", "candidates", "iterations"]
     means = lines[~lines["model"].isin(REFERENCES)].groupby([*key, "model_seed"], sort=False)[numbers].mean()
@@ -267,7 +298,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.table:
         try:
-            print(table.markdown(summary(read(arguments.out), arguments.targets)))
+            rows = read(arguments.out)
+            print(table.markdown(summary(rows, arguments.targets)))
+            print(table.markdown(against(rows, arguments.targets)))
         except ValueError as error:
             parser.error(str(error))
         return
