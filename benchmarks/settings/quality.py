@@ -20,8 +20,8 @@ together prints the same of several models as one.
 table prints the lines of training seed 0 as Markdown, with the cost of the recurrent TSM minus that of each model
 trained as long, paired by target with half the 95 % t interval over targets, and what a doubling of the time buys, from
 each line of a model to the next. Of a training with several seeds follow means with half the 95 % t interval over
-seeds, and each model with codes against every baseline, paired by seed. lines prints the lines alone, of any
-environments. figure draws all lines into figures/training_time.
+seeds, and each model with codes against every baseline, paired by seed. lines prints the lines of training seed 0 of
+any environments, and the same of several seeds. figure draws all lines into figures/training_time.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def over_the_best(lines: pd.DataFrame) -> pd.DataFrame:
 
 def several(lines: pd.DataFrame) -> pd.DataFrame:
     """The lines of those trainings that were made with more than one seed."""
-    return lines[lines.groupby(["env", "model", "seconds"])["seed"].transform("nunique") > 1]
+    return lines[lines.groupby(["env", "model", "seconds", "muon"])["seed"].transform("nunique") > 1]
 
 
 def over_seeds(lines: pd.DataFrame) -> pd.DataFrame:
@@ -199,6 +199,24 @@ def against_baselines(lines: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
+def seed_tables(every: pd.DataFrame) -> list[str]:
+    """Tables of trainings of one environment with several seeds, as Markdown; none without any."""
+    if not len(lines := several(every)):
+        return []
+    return [
+        "Several training seeds, mean and half the 95 % t interval over them:",
+        table.markdown(_known(over_seeds(lines))),
+        "Models with codes against each baseline trained as long, paired by seed:",
+        table.markdown(_known(against_baselines(lines))),
+    ]
+
+
+def _known(texts: pd.DataFrame) -> pd.DataFrame:
+    """Without the environment, and without measures that it has nothing of."""
+    nothing = [name for name in texts if texts[name].astype(str).str.contains("nan").all()]
+    return texts.drop(columns=["env", *nothing])
+
+
 def spelled(lines: pd.DataFrame) -> pd.DataFrame:
     """Each line as texts; measures that it has nothing of are left out."""
     measures = {name: title for name, title in MEASURES.items() if lines[name].notna().any()}
@@ -231,13 +249,7 @@ def tables(every: pd.DataFrame) -> str:
             "A doubling of the time changes these by:",
             table.markdown(each),
         ]
-    if len(seeds := several(every)):
-        parts += [
-            "Several training seeds, mean and half the 95 % t interval over them:",
-            table.markdown(over_seeds(seeds).drop(columns="env")),
-            "Models with codes against each baseline trained as long, paired by seed:",
-            table.markdown(against_baselines(seeds).drop(columns="env")),
-        ]
+    parts += seed_tables(every)
     return "\n\n".join(parts)
 
 
@@ -285,7 +297,11 @@ def main() -> None:
         print(tables(pd.read_csv(given.out)))
     elif given.what == "lines":
         found = pd.read_csv(given.out)
-        print(table.markdown(spelled(found.sort_values(["env", "model", "seconds", "muon"], kind="stable"))))
+        one = found[found["seed"] == 0].sort_values(["env", "model", "seconds", "muon"], kind="stable")
+        parts = [table.markdown(spelled(one))]
+        for env, lines in found.groupby("env"):
+            parts += [f"{env}:" * (len(several(lines)) > 0), *seed_tables(lines)]
+        print("\n\n".join(filter(None, parts)))
     elif given.what == "figure":
         lines = pd.read_csv(given.out)
         curves = {
