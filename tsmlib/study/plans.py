@@ -168,10 +168,10 @@ class _Problem:
         """All that the plan is a function of."""
         nets = {"prior": self.prior, "model": self.model}
         judge: dict[str, Json] = {} if self.model is None else {"samples": JUDGING if self.by_expectation else 0}
-        several = self.model is not None and members(self.model) > 1
-        if self.model is not None and several:
-            judge["members"] = members(self.model)
-        if self.method.planner == "cem" and (several or self.by_expectation):
+        n = 1 if self.model is None else members(self.model)
+        if n > 1:
+            judge["members"] = n
+        if self.method.planner == "cem" and (n > 1 or self.by_expectation):
             judge["screened"] = SCREENED
         return judge | {
             "version": VERSION, "task": self.task.name, "env": self.task.env, "horizon": self.task.horizon,
@@ -198,7 +198,8 @@ class _Problem:
     def predictors(self) -> tuple[Predictor, Predictor]:
         """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
-            return self.modes(), self.modes()
+            simulator = self.modes()
+            return simulator, simulator
         net, seed = self.model.to(self.run.device), self.run.seed
         past = self.task.past(net.past_len)
         return self.judge(net, past, seed=seed), fresh_predictor(net, past, seed=seed + 1)
