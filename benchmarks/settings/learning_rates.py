@@ -1,5 +1,7 @@
 """Learning rate of each model: half, once and twice that of its schedule, on validation data.
 
+Both rates of a schedule are scaled, Muon's and that of Adam beside it; the table names Muon's where there is one.
+
 Every model gets the same three tries at the same share of its budget (`study.BUDGET`); what counts is the best
 validation loss of its last stage. Losses of different models are not to be compared. Data are those of the study, with
 their symmetric copies.
@@ -46,13 +48,13 @@ def main() -> None:
                 curve = fit(
                     net, getattr(net, stage.loss), data, held_out,
                     stage.options(
-                        net.past_len, steps=steps, lr=factor * stage.lr, muon=0.0, validate_every=50, bf16=True
+                        net.past_len, steps=steps, lr=factor * stage.lr, muon=factor * stage.muon, validate_every=50
                     ),
                     seed=run.seed, progress=f"{model}, {factor:g} times the rate: {stage.loss}",
                 )  # fmt: skip
-            best = min(curve.validation)
-            print(f"{model:20} last stage at {factor * stage.lr:.0e}: best validation loss {best:.4f}", flush=True)
-            rows.append(dict(common, model=model, n=len(held_out), value=best, rate=factor * stage.lr))
+            best, rate = min(curve.validation), factor * (stage.muon or stage.lr)
+            print(f"{model:20} last stage at {rate:.0e}: best validation loss {best:.4f}", flush=True)
+            rows.append(dict(common, model=model, n=len(held_out), value=best, rate=rate))
             tables.save(path, rows, extra=["rate"])
     print(path)
 

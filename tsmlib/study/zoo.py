@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from tsmlib.training.fit import TrainingOptions
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
-    "Reacher": 80.0, "ReacherObstacle": 120.0, "ReacherPush": 2320.0,
-    "PymunkReacher": 40.0, "PymunkObstacle": 40.0, "PymunkPush": 2320.0,
+    "Reacher": 320.0, "ReacherObstacle": 480.0, "ReacherPush": 2320.0,
+    "PymunkReacher": 160.0, "PymunkObstacle": 160.0, "PymunkPush": 2320.0,
 }  # fmt: skip
 
 
@@ -31,11 +31,10 @@ class Stage:
     """One part of a training: a loss of the model, minimised for a share of the budget.
 
     rate: updates per second on one core of the machine that the published models were trained on, on the plain arm and
-    where there is a block. future_len: steps ahead, 2 H. lr: the best of 1e-3, 2e-3 and 4e-3 for every baseline, on
-    validation. bf16: whether products in bfloat16 are faster and teach as much, on a processor that has them
-    (``training.precision``; elsewhere float32): not where a gated stack is run step by step, nor of the LSTM. muon,
-    weight_decay, patience and span: of ``TrainingOptions``; stages that share one schedule have spans that follow each
-    other, as (0, 0.6) and (0.6, 1) do.
+    where there is a block. future_len: steps ahead, 2 H. lr: of Adam, which trains what Muon does not. bf16: whether
+    products in bfloat16 are faster and teach as much, on a processor that has them (``training.precision``; elsewhere
+    float32): not where a gated stack is run step by step, nor of the LSTM. muon, weight_decay, patience and span: of
+    ``TrainingOptions``; stages that share one schedule have spans that follow each other, as (0, 0.6) and (0.6, 1) do.
     """
 
     loss: str
@@ -140,26 +139,21 @@ class ModelSpec:
 
 
 def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> Stage:
-    """Free-running over two chained segments."""
-    return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False)
+    """TSM's, free-running over two chained segments. Its rate of Muon is lower: it diverges at a higher."""
+    return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False, muon=0.003)
 
 
-def _muon(stage: Stage) -> Stage:
-    """The stage with Muon, at half the best rate of a quarter of the time (``benchmarks/settings``, sections 5, 7)."""
-    return replace(stage, muon=0.01, lr=2e-3)
+def _baseline(loss: str, rate: float, *, bf16: bool = True) -> Stage:
+    """With Muon at half the best rate of a quarter of the time (``benchmarks/settings``, sections 5, 7 and 8)."""
+    return Stage(loss, rate, lr=2e-3, bf16=bf16, muon=0.01)
 
 
-def _slower(*stages: Stage) -> tuple[Stage, ...]:
-    """TSM's stages for pushing and those of its variants: with Muon at a lower rate, since TSM diverges at a higher."""
-    return tuple(replace(stage, muon=0.003) for stage in stages)
-
-
-TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10)
-LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10)
+TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10, muon=0.003)
+LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10, muon=0.003)
 RECURRENT = (  # the mode first, since a sample costs less than two; at last over longer windows
-    replace(_free("point_loss", 17, 0.5), muon=0.006, bf16=True, span=(0.0, 0.5)),
-    replace(_free("loss", 11, 0.35), muon=0.006, bf16=True, span=(0.5, 0.85)),
-    replace(_free("loss", 7.5, 0.15), muon=0.006, bf16=True, span=(0.85, 1.0), future_len=30),
+    replace(_free("point_loss", 17, 0.5), muon=0.01, bf16=True, span=(0.0, 0.5)),
+    replace(_free("loss", 11, 0.35), muon=0.01, bf16=True, span=(0.5, 0.85)),
+    replace(_free("loss", 7.5, 0.15), muon=0.01, bf16=True, span=(0.85, 1.0), future_len=30),
 )
 PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
 
@@ -184,7 +178,6 @@ def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
         PAPER,
         lambda env: _wide(env) | arguments,
         "choice",
-        pushing=_slower(*PAPER),
     )
 
 
@@ -200,7 +193,6 @@ _TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
 _MODELS = (
     ModelSpec(
         "tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True,
-        pushing=_slower(*PAPER),
     ),
     ModelSpec(
         "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT,
@@ -208,39 +200,36 @@ _MODELS = (
     ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy", Look("TSM + energy", "#56B4E9", "p"), _TSM, (TEACHER, _free("energy_loss", (11, 6.9))), _wide,
-        "ablation", pushing=_slower(TEACHER, _free("energy_loss", (11, 6.9))),
+        "ablation",
     ),
     ModelSpec(  # the same with the state skip, and more teacher forcing
         "tsm+energy+direct", Look("TSM + energy + skip", "#4F7FBF", ">"), _TSM, (LONGER, _free("energy_loss", 8, 0.6)),
-        _skip, "ablation", pushing=_slower(LONGER, _free("energy_loss", 8, 0.6)),
+        _skip, "ablation",
     ),
     ModelSpec(
         "tsm+teacher", Look("TSM, teacher forcing only", "#1B2A5C", "<"), _TSM, (replace(TEACHER, share=1.0),), _wide,
-        "ablation", pushing=_slower(replace(TEACHER, share=1.0)),
+        "ablation",
     ),
     ModelSpec(  # the state skip with the paper's loss
         "tsm+direct", Look("TSM + skip", "#7BA7D9", "h"), _TSM, (LONGER, _free("loss", 11, 0.6)), _skip, "ablation",
-        pushing=_slower(LONGER, _free("loss", 11, 0.6)),
     ),
     ModelSpec(
-        "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (Stage("loss", 36),), planned=True,
-        pushing=(_muon(Stage("loss", 36)),),
+        "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (_baseline("loss", 36),), planned=True,
     ),
     ModelSpec(  # free-running over 2 H steps
-        "multistep", Look("multi-step", "#D55E00", "^"), _ONE_STEP, (Stage("multi_step_loss", 21),), planned=True,
-        pushing=(_muon(Stage("multi_step_loss", 21)),),
+        "multistep", Look("multi-step", "#D55E00", "^"), _ONE_STEP, (_baseline("multi_step_loss", 21),),
+        planned=True,
     ),
     ModelSpec(
-        "lstm", Look("LSTM", "#009E73", "v"), _LSTM, (Stage("loss", 14.5, bf16=False),), planned=True,
-        pushing=(_muon(Stage("loss", 14.5, bf16=False)),),
+        "lstm", Look("LSTM", "#009E73", "v"), _LSTM, (_baseline("loss", 14.5, bf16=False),), planned=True,
     ),
     ModelSpec(
-        "ensemble", Look("ensemble (Gaussian)", "#CC79A7", "P"), _ENSEMBLE, (Stage("loss", 33.3),),
-        lambda env: {"gaussian": True}, pushing=(_muon(Stage("loss", 33.3)),),
+        "ensemble", Look("ensemble (Gaussian)", "#CC79A7", "P"), _ENSEMBLE, (_baseline("loss", 33.3),),
+        lambda env: {"gaussian": True},
     ),
     ModelSpec(
-        "ensemble+mse", Look("ensemble (squared error)", "#6A2BD9", "X"), _ENSEMBLE, (Stage("loss", 33.3),),
-        lambda env: {"gaussian": False}, planned=True, pushing=(_muon(Stage("loss", 33.3)),),
+        "ensemble+mse", Look("ensemble (squared error)", "#6A2BD9", "X"), _ENSEMBLE, (_baseline("loss", 33.3),),
+        lambda env: {"gaussian": False}, planned=True,
     ),
     ModelSpec(
         "prior", Look("action prior", "#882255"), _PRIOR, (Stage("loss", 30, lr=1e-3, bf16=False),), group="prior",
@@ -254,7 +243,6 @@ _MODELS = (
     replace(
         _choice("tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)),  # receptive field 2 H
         stages=(replace(TEACHER, future_len=20), PAPER[1]),
-        pushing=_slower(replace(TEACHER, future_len=20), PAPER[1]),
     ),
 )  # fmt: skip
 ZOO = {spec.word: spec for spec in _MODELS}
