@@ -444,6 +444,19 @@ def test_an_expectation_is_over_the_mode_and_common_samples() -> None:
     assert torch.equal(states, judge(actions))
 
 
+def test_each_judging_sample_is_drawn_as_one_alone_would_be() -> None:
+    past, actions = initial_past(START, 1, 1), torch.full((2, B, T, 1), 0.3)
+    together = expected_predictor(Cart(0.3), past, samples=3, seed=1)(actions)[1:]
+    alone = [model_predictor(Cart(0.3), past, samples=1, seed=seed)(actions)[0] for seed in (3, 4, 5)]
+    assert torch.equal(together, torch.stack(alone))
+
+
+def test_in_screening_every_judging_sample_counts_as_much_as_the_mode() -> None:
+    judge = expected_predictor(Cart(0.3), initial_past(START, 1, 1), samples=3)
+    plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
+    torch.testing.assert_close(plan.curve[-1], plan.predicted_return)  # of the mode and three samples at once
+
+
 def test_samples_by_which_plans_are_judged_are_none_of_the_fresh_ones() -> None:
     start = torch.zeros(20, 2)  # of fewer numbers torch draws in another order
     past, actions = initial_past(start, 1, 1), torch.zeros(1, 20, 4, 1)

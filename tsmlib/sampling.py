@@ -9,21 +9,22 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class SharedNoise:
-    """Common random numbers: rows b, b + period, b + 2 period, ... of every batch draw the same noise.
-
-    Planners lay candidates out as (C, B) and use a period of B, so that candidates are compared in the same futures.
-    """
-
-    generator: torch.Generator
-    period: int
-
-
-@dataclass(frozen=True)
 class SeparateNoise:
     """Independent copies: rows are laid out copy by copy, (M, B), and each copy draws from a generator of its own."""
 
     generators: tuple[torch.Generator, ...]
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """Common random numbers: rows b, b + period, b + 2 period, ... of every batch draw the same noise.
+
+    Planners lay candidates out as (C, B) and use a period of B, so that candidates are compared in the same futures.
+    The generator may be several, each of its own copy within the period.
+    """
+
+    generator: torch.Generator | SeparateNoise
+    period: int
 
 
 @dataclass(frozen=True)

@@ -253,8 +253,13 @@ def _decoded(space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK) -> Te
 
 def _returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
     """Expected return (C, B) of actions (C, B, T, du), predicted up to ``rows`` at a time."""
+    return _sample_returns(predict, reward, actions, rows=rows).mean(0)
+
+
+def _sample_returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
+    """Return of each sample, (S, C, B)."""
     chunks = actions.split(max(1, rows // actions.shape[1]))
-    return torch.cat([expected_return(predict(chunk), chunk, reward) for chunk in chunks])
+    return torch.cat([rewarded(reward, predict(chunk), chunk).sum(-1) for chunk in chunks], dim=1)
 
 
 class _Search:
@@ -293,8 +298,8 @@ class _Search:
         rough = rough.where(torch.isfinite(rough), -torch.inf)
         best = rough.topk(self.judged, dim=0).indices
         chosen = actions.gather(0, _like(best, actions).expand(-1, -1, *actions.shape[2:]))
-        judged = [_returns(other, self.reward, chosen) for other in others]
-        returns = torch.stack([rough.gather(0, best), *judged]).mean(0)
+        judged = [_sample_returns(other, self.reward, chosen) for other in others]
+        returns = torch.cat([rough.gather(0, best)[None], *judged]).mean(0)
         judged_by_all = torch.zeros_like(rough, dtype=torch.bool).scatter(0, best, True)
         return torch.full_like(rough, -torch.inf).scatter(0, best, returns), judged_by_all
 

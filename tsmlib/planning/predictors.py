@@ -18,7 +18,7 @@ from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.models.mixture import Mixture
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
-from tsmlib.sampling import Noise, NoNoise, SharedNoise
+from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise
 from tsmlib.trajectory import Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
@@ -71,15 +71,20 @@ def expected_predictor(model: Model, past: Segment, *, samples: int = JUDGING, s
     mode = model_predictor(model, past)
     if not as_dynamics(model).stochastic or isinstance(mode, EnsemblePredictor):
         return mode
-    seeds = range(samples * seed, samples * (seed + 1))
-    return EnsemblePredictor((mode, *(model_predictor(model, past, samples=1, seed=each) for each in seeds)))
+
+    def common() -> Noise:
+        seeds = range(samples * seed, samples * (seed + 1))
+        each = SeparateNoise(tuple(torch.Generator().manual_seed(one) for one in seeds))
+        return SharedNoise(each, samples * len(past.states))
+
+    return EnsemblePredictor((mode, partial(_predict, model, past, samples, common)))
 
 
 @dataclass(frozen=True)
 class EnsemblePredictor:
-    """Predict by several predictors, S of them: by the mode of each member of an ensemble, or by samples.
+    """Predict by several predictors: by the mode of each member of an ensemble, or by a model's mode and its samples.
 
-    each: by themselves, S = 1; ``cem`` screens by the first. together: all at once, where one rollout can.
+    each: by themselves, the first S = 1, by which ``cem`` screens. together: all at once, where one rollout can.
     """
 
     each: tuple[Predictor, ...]
