@@ -110,7 +110,7 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     trials, rows = study.trials(run, tasks, ways), list[Row]()
     for task in tasks:
         rows += action_prior.task_rows(study.task_torques(run, task), trials[task.env], run)
-        rows += study.signal_rows(run, task.take(50), models, samples=32)
+        rows += study.signal_rows(run, task.take(50), [word for word in models if word != "oracle"], samples=32)
     return rows
 
 
@@ -171,7 +171,8 @@ def main() -> None:
     parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "peers"))
     parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
     parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, rounds.PENDULUM), metavar="ENV")
-    parser.add_argument("--models", nargs="+", default=[], choices=zoo.words(), metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL",
+                        help="of control and torques also oracle, the true simulator")  # fmt: skip
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
@@ -193,6 +194,8 @@ def main() -> None:
         return
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
+    if "oracle" in given.models and given.part not in ("control", "torques"):
+        parser.error(f"{given.part} takes no oracle; --models are some of {', '.join(zoo.words())}")
     if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     if rounds.PENDULUM in given.envs and given.part != "rounds":

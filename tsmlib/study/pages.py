@@ -252,8 +252,7 @@ def results_page() -> str:
 {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
 observed ones; means over steps, in standardised units, with half the 95 % t interval where there are several training
 seeds. Higher is better for the likelihoods `ll_`, lower for the others, and `coverage80` should be 0.80. The models
-of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`). Pushing is trained by
-Muon; elsewhere `{OURS}` is, and all other models by Adam.{peers}
+of an environment got as many updates as fit into the same time on one idle core (`study.BUDGET`), all by Muon.{peers}
 
 {scores}
 
@@ -265,10 +264,9 @@ Pushing, seed by seed: the energy score of `{OURS}` over that of the best other 
 
 Training {planned}; frozen targets, T = {HORIZON["reach"]} steps for reaching and {HORIZON["push"]} for
 pushing, the cross-entropy method through each model, executed open loop; means over targets, returns in metres summed
-over steps. Pushing: the mode of a model with codes sorts the candidates, and the best quarter is judged by the mean
-over the mode and {JUDGING} samples (`expected_predictor`, `cem(screened=)`). Rows of reaching are older: by the mode
-alone. Of an ensemble the first member sorts, and the mean over all members judges. A model without samples has its
-one rollout.
+over steps. The mode of a model with codes sorts the candidates, and the best quarter is judged by the mean over the
+mode and {JUDGING} samples (`expected_predictor`, `cem(screened=)`). Of an ensemble the first member sorts, and the
+mean over all members judges. A model without samples has its one rollout.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
