@@ -195,8 +195,9 @@ def drawings_of_rows() -> Iterator[Drawing]:
     words = [word for word in zoo.words("dynamics", "ablation") if word in set(imperfect["model"])]
     yield drawings.filtering(imperfect, asked.worlds["noise"], words)
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
-    subject = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
-    yield from drawings.advantage_map(imperfect, predict, subject, asked.rivals, asked.noises, asked.delays)
+    theirs = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
+    clean = predict if theirs == asked.subject else imperfect  # rivals that were trained as it was
+    yield from drawings.advantage_map(imperfect, clean, theirs, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
         yield from drawings.rounds(explored, env, titles)
     yield from drawings.ways(explored, WEAK_MOTORS.env)

@@ -2,7 +2,7 @@
 
 The paper gives no number: every threshold is ours and was set before results existed. Two choices came after
 results. The planner of claims about plans was Adam, the paper's, and is CEM since rows were there, because Adam has not
-planned through every model. And CEM judges candidates of pushing by an expectation since rows by the mode were there;
+planned through every model. And CEM judges candidates by an expectation since rows by the mode were there;
 that was chosen on validation targets. No margin moved. Adam is a reading wherever it was primary.
 """
 
