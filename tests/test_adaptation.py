@@ -208,6 +208,7 @@ def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> 
     (["rounds", "--envs", PUSH, "--models", "ensemble+mse"], "'ensemble+mse' does not explore tsm/ReacherPush-v1"),
     (["predict", "--envs", PENDULUM, "--models", "rtsm"], "predict takes no Pendulum-v1"),
     (["predict", "--envs", PUSH, "--models", "oracle"], "predict takes no oracle; --models are some of tsm, rtsm"),
+    (["control", "--envs", PUSH, "--models", "oracle", "--planners", "adam"], "--planners of oracle are cem and mppi"),
     (["adaptation", "--models", "rtsm", "--variants", "mass2"], "cannot be chosen: it has no object"),
     (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
     (["adaptation", "--models", "ensemble+mse", "--envs", PUSH], "no pretrained ensemble"),

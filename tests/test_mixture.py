@@ -104,6 +104,12 @@ def test_copies_draw_as_each_alone() -> None:
         assert torch.allclose(part, predict_segment(mixture, past, actions, generator=drawn(seed)))
 
 
+def test_copies_with_generators_of_their_own_within_shared_noise_are_refused() -> None:
+    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
+    with pytest.raises(TypeError, match="several generators in SharedNoise; a Mixture takes one"):
+        predict_segment(mixture, past, actions, generator=SharedNoise(SeparateNoise((drawn(1),)), B))
+
+
 def test_gradients_reach_the_actions() -> None:
     mixture, (past, actions) = tsm.Mixture([one_step(0), recurrent(1)]), given()
     actions.requires_grad_()

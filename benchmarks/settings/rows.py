@@ -7,8 +7,9 @@
 predict: open loop and on segments (03_predict); ablations: the same as rows of 03_ablation, where variants of TSM are
 compared on pushing with it and with the one-step model. control: plans by each planner in both search spaces, open
 loop, and by the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes,
-no torque and random torques beside them (05_control). policies: learned inside each model, of ours and the paper's in
-both search spaces, of the others direct alone, as in 05_control, by --copies and --iterations where the run has none;
+no torque and random torques beside them (05_control); the model oracle is the true simulator. policies: learned inside
+each model, of ours and the paper's in both search spaces, of the others direct alone, as in 05_control, by --copies and
+--iterations where the run has none;
 name all models in one call, since how soon a policy learns is told by the plateau of the best of them. Models, scores,
 plans and policies are those of the run, so what is missing is made first. torques: of plans by --planners in both
 search spaces, beside held-out torques and those of the prior, and the signal of gradients at the first 50 starts
@@ -56,6 +57,7 @@ NOTEBOOKS = {
 }  # fmt: skip
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
+SIMULATOR = planning.ORACLE.model
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -110,7 +112,7 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     trials, rows = study.trials(run, tasks, ways), list[Row]()
     for task in tasks:
         rows += action_prior.task_rows(study.task_torques(run, task), trials[task.env], run)
-        rows += study.signal_rows(run, task.take(50), [word for word in models if word != "oracle"], samples=32)
+        rows += study.signal_rows(run, task.take(50), [word for word in models if word != SIMULATOR], samples=32)
     return rows
 
 
@@ -171,9 +173,9 @@ def main() -> None:
     parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "peers"))
     parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
     parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, rounds.PENDULUM), metavar="ENV")
-    parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL",
+    parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
                         help="of control and torques also oracle, the true simulator")  # fmt: skip
-    parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), "oracle"), metavar="MODEL")
+    parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL")
     parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
     parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
     parser.add_argument("--data", nargs="+", default=exploration.DATA[:2], choices=exploration.DATA, help="of rounds")
@@ -194,8 +196,10 @@ def main() -> None:
         return
     if not given.models and given.part != "collect":
         parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
-    if "oracle" in given.models and given.part not in ("control", "torques"):
-        parser.error(f"{given.part} takes no oracle; --models are some of {', '.join(zoo.words())}")
+    if SIMULATOR in given.models and given.part not in ("control", "torques"):
+        parser.error(f"{given.part} takes no {SIMULATOR}; --models are some of {', '.join(zoo.words())}")
+    if SIMULATOR in given.models and not set(given.planners) <= {"cem", "mppi"}:
+        parser.error(f"the simulator has no gradient; --planners of {SIMULATOR} are cem and mppi")
     if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     if rounds.PENDULUM in given.envs and given.part != "rounds":

@@ -131,7 +131,7 @@ def _of_share(noise: Noise, chosen: Tensor) -> torch.Generator | SharedNoise:
         raise TypeError(f"a Mixture draws by a generator or SharedNoise, not by {type(noise).__name__}")
     source = noise.generator if isinstance(noise, SharedNoise) else noise
     if not isinstance(source, torch.Generator):
-        raise TypeError("a Mixture draws by one generator, not by one for each copy")
+        raise TypeError("found several generators in SharedNoise; a Mixture takes one: SharedNoise(generator, period)")
     seed = int(torch.randint(2**62, (), generator=source, device=source.device))
     own = torch.Generator(device=source.device).manual_seed(seed)
     return SharedNoise(own, int(chosen[: noise.period].sum())) if isinstance(noise, SharedNoise) else own

@@ -242,7 +242,8 @@ def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
 def evaluate(
     predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK
 ) -> Tensor:
-    """Expected return (C, B) of parameters (C, B, *shape), up to ``rows`` at a time: what models decode at once."""
+    """Expected return (C, B) of parameters (C, B, *shape), up to ``rows`` candidates at a time, times
+    their targets, each with its samples."""
     return _returns(predict, reward, _decoded(space, parameters, rows=rows), rows=rows)
 
 
@@ -252,12 +253,12 @@ def _decoded(space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK) -> Te
 
 
 def _returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
-    """Expected return (C, B) of actions (C, B, T, du), predicted up to ``rows`` at a time."""
+    """Expected return (C, B) of actions (C, B, T, du); rows: as of ``evaluate``."""
     return _sample_returns(predict, reward, actions, rows=rows).mean(0)
 
 
 def _sample_returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
-    """Return of each sample, (S, C, B)."""
+    """The return of each sample (S, C, B); rows: as of ``evaluate``."""
     chunks = actions.split(max(1, rows // actions.shape[1]))
     return torch.cat([rewarded(reward, predict(chunk), chunk).sum(-1) for chunk in chunks], dim=1)
 

@@ -195,9 +195,10 @@ def drawings_of_rows() -> Iterator[Drawing]:
     words = [word for word in zoo.words("dynamics", "ablation") if word in set(imperfect["model"])]
     yield drawings.filtering(imperfect, asked.worlds["noise"], words)
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
-    theirs = asked.subject if asked.subject in words else "tsm+energy+direct"  # whose rows there are
-    clean = predict if theirs == asked.subject else imperfect  # rivals that were trained as it was
-    yield from drawings.advantage_map(imperfect, clean, theirs, asked.rivals, asked.noises, asked.delays)
+    subject, clean = asked.subject, predict
+    if subject not in words:  # the forerunner, with rivals that were trained as it was
+        subject, clean = "tsm+energy+direct", imperfect
+    yield from drawings.advantage_map(imperfect, clean, subject, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
         yield from drawings.rounds(explored, env, titles)
     yield from drawings.ways(explored, WEAK_MOTORS.env)

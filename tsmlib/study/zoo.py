@@ -138,22 +138,26 @@ class ModelSpec:
 # Training stages and arguments ----------------------------------------------------------------------------------------
 
 
-def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75) -> Stage:
-    """TSM's, free-running over two chained segments. Its rate of Muon is lower: it diverges at a higher."""
-    return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False, muon=0.003)
+_SLOW = 0.003  # rate of Muon of TSM, which diverges at a higher
+
+
+def _free(loss: str, rate: float | tuple[float, float], share: float = 0.75, *, muon: float = _SLOW) -> Stage:
+    """Free-running over two chained segments."""
+    return Stage(loss, rate, share, lr=2e-3, batch=128, bf16=False, muon=muon)
 
 
 def _baseline(loss: str, rate: float, *, bf16: bool = True) -> Stage:
-    """With Muon at half the best rate of a quarter of the time (``benchmarks/settings``, sections 5, 7 and 8)."""
+    """With Muon at half the rate that was best for the one-step model and the LSTM in a quarter of the time
+    (``benchmarks/settings``, sections 5, 7 and 8)."""
     return Stage(loss, rate, lr=2e-3, bf16=bf16, muon=0.01)
 
 
-TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10, muon=0.003)
-LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10, muon=0.003)
+TEACHER = Stage("teacher_forced_loss", (30, 20), 0.25, future_len=10, muon=_SLOW)
+LONGER = Stage("teacher_forced_loss", 26, 0.4, future_len=10, muon=_SLOW)
 RECURRENT = (  # the mode first, since a sample costs less than two; at last over longer windows
-    replace(_free("point_loss", 17, 0.5), muon=0.01, bf16=True, span=(0.0, 0.5)),
-    replace(_free("loss", 11, 0.35), muon=0.01, bf16=True, span=(0.5, 0.85)),
-    replace(_free("loss", 7.5, 0.15), muon=0.01, bf16=True, span=(0.85, 1.0), future_len=30),
+    replace(_free("point_loss", 17, 0.5, muon=0.01), bf16=True, span=(0.0, 0.5)),
+    replace(_free("loss", 11, 0.35, muon=0.01), bf16=True, span=(0.5, 0.85)),
+    replace(_free("loss", 7.5, 0.15, muon=0.01), bf16=True, span=(0.85, 1.0), future_len=30),
 )
 PAPER = (TEACHER, _free("loss", (16, 10.5)))  # teacher forcing for a quarter of the time, then squared error and KL
 
@@ -171,14 +175,7 @@ def _skip(env: EnvSpec) -> dict[str, Json]:
 def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
     """One of the paper's choices, changed; as many updates as TSM."""
     look = Look(f"TSM, {name}", colour)
-    return ModelSpec(
-        word,
-        look,
-        "tsmlib.models.tsm:TSM",
-        PAPER,
-        lambda env: _wide(env) | arguments,
-        "choice",
-    )
+    return ModelSpec(word, look, "tsmlib.models.tsm:TSM", PAPER, lambda env: _wide(env) | arguments, "choice")
 
 
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any colour vision --------
@@ -191,9 +188,7 @@ _TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
     )
 )  # fmt: skip
 _MODELS = (
-    ModelSpec(
-        "tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True,
-    ),
+    ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True),
     ModelSpec(
         "rtsm", Look("recurrent TSM", "#003C8F", "*"), _RECURRENT, RECURRENT,
         planned=True, pushing=tuple(replace(stage, muon=0.005) for stage in RECURRENT),
@@ -213,9 +208,7 @@ _MODELS = (
     ModelSpec(  # the state skip with the paper's loss
         "tsm+direct", Look("TSM + skip", "#7BA7D9", "h"), _TSM, (LONGER, _free("loss", 11, 0.6)), _skip, "ablation",
     ),
-    ModelSpec(
-        "onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (_baseline("loss", 36),), planned=True,
-    ),
+    ModelSpec("onestep", Look("one-step", "#E69F00", "s"), _ONE_STEP, (_baseline("loss", 36),), planned=True),
     ModelSpec(  # free-running over 2 H steps
         "multistep", Look("multi-step", "#D55E00", "^"), _ONE_STEP, (_baseline("multi_step_loss", 21),),
         planned=True,

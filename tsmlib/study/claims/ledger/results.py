@@ -119,9 +119,7 @@ def c34(q: Query) -> Checks:
 
 @Claim("C35", "figure 6", FIGURE6, headline=True, readings=ADAM,
        statistic="executed return and size of the gap: TSM with prior against four other methods, both tasks",
-       why={FAILED: CLOSER.replace(" TSM,", " TSM (C02, "
-                                           "03_predict),") + "so that predicted returns of plans through them are "
-                    "nearer to the executed ones, and these higher."})
+       why={FAILED: CLOSER + "so that predicted returns of plans through them are nearer to the executed ones."})
 def c35(q: Query) -> Checks:
     """TSM with its prior has the highest executed return, and the one nearest to the predicted."""
     for task in TASKS:
