@@ -343,3 +343,18 @@ def test_a_film_takes_kilobytes_of_a_notebook_for_each_of_its_frames() -> None:
 def test_a_film_that_is_not_there_says_how_to_make_it(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match=r"figures\.save_video"):
         figures.embed(tmp_path / "none.mp4")
+
+
+@pytest.mark.parametrize("words", [1, 12])
+def test_a_legend_is_never_wider_than_its_figure(words: int) -> None:
+    with plt.style.context(style.STYLE):
+        figure = plt.figure(figsize=(5, 3), layout="constrained")
+        handles = [style.entry(" ".join(["label"] * (words if i == 7 else 1)), color="k") for i in range(8)]
+        rows = style.legend(figure, handles, columns=4)
+        figure.canvas.draw()
+    plt.close(figure)
+    (drawn,) = figure.legends
+    box = drawn.get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.width
+    assert (rows == 2) == (words == 1)

@@ -209,10 +209,8 @@ def foot(ax: Axes, label: str, notes: Sequence[str], inches: float) -> None:
 def finish(figure: Figure, grid: Iterable[Iterable[Axes]], handles: Sequence[Line2D] = (), columns: int = 1) -> Figure:
     """The figure with its legend, and as much higher as the legend and the words below its panels take."""
     lines = sum(max(ax.get_xlabel().count("\n") for ax in row) for row in grid)
-    rows = -(-len(handles) // columns)
+    rows = legend(figure, handles, columns=columns) if handles else 0
     figure.set_figheight(figure.get_figheight() + 0.115 * lines + (0.14 * rows + 0.1 if handles else 0))
-    if handles:
-        legend(figure, handles, columns=columns)
     return figure
 
 

@@ -82,10 +82,17 @@ def entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], **look, label=label)
 
 
-def legend(figure: Figure, handles: Sequence[Line2D], columns: int = 8) -> None:
-    """A legend above all panels, where it covers nothing; of no more columns than its rows need."""
-    rows = -(-len(handles) // columns)
-    figure.legend(handles=handles, loc="outside upper left", ncols=-(-len(handles) // max(rows, 1)) or 1)
+def legend(figure: Figure, handles: Sequence[Line2D], columns: int = 8) -> int:
+    """A legend above all panels, where it covers nothing, of no more columns than its rows need and fewer where these
+    are wider than the figure; the number of rows."""
+    rows = max(1, -(-len(handles) // columns))
+    while True:
+        columns = -(-len(handles) // rows) or 1
+        drawn = figure.legend(handles=handles, loc="outside upper left", ncols=columns)
+        if columns == 1 or drawn.get_window_extent().width <= figure.bbox.width:
+            return rows
+        drawn.remove()
+        rows += 1
 
 
 def stamp(figure: Figure, text: str) -> Figure:
