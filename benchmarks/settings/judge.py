@@ -46,6 +46,7 @@ from tsmlib.planning.base import Judge, Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
 from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import (
+    JUDGING,
     expected_predictor,
     fresh_predictor,
     model_predictor,
@@ -65,7 +66,7 @@ JUDGES = (
     "mean of 16", "median of 16", "screened mean of 4", "screened mean of 8", "screened mean of 16",
 )  # fmt: skip
 REFERENCES = ("zero", "oracle")
-STUDY = "screened mean of 8"  # the study's judge of models with codes
+STUDY = f"screened mean of {JUDGING}"  # the study's judge of models with codes
 KEY = ("env", "model", "model_seed", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
 COLUMNS = (
     *KEY, "cpu_seconds", "cost", "cost_sem", "more_than_mode", "more_than_mode_sem", "within_5cm", "final_mean",

@@ -9,11 +9,10 @@ compared on pushing with it and with the one-step model. control: plans by each 
 loop, and by the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes,
 no torque and random torques beside them (05_control); the model oracle is the true simulator. policies: learned inside
 each model, of ours and the paper's in both search spaces, of the others direct alone, as in 05_control, by --copies and
---iterations where the run has none;
-name all models in one call, since how soon a policy learns is told by the plateau of the best of them. Models, scores,
-plans and policies are those of the run, so what is missing is made first. torques: of plans by --planners in both
-search spaces, beside held-out torques and those of the prior, and the signal of gradients at the first 50 starts
-(07_action_prior).
+--iterations where the run has none; name all models in one call, since how soon a policy learns is told by the plateau
+of the best of them. Models, scores, plans and policies are those of the run, so what is missing is made first. torques:
+of plans by --planners in both search spaces, beside held-out torques and those of the prior, and the signal of
+gradients at the first 50 starts (07_action_prior).
 
 gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
 and --models, as far as these ask for them, and publish what their tables then say.

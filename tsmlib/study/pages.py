@@ -7,7 +7,7 @@ from typing import cast
 
 import pandas as pd
 
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import MUJOCO_IDS, EnvSpec
 from tsmlib.planning.predictors import JUDGING
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
@@ -239,6 +239,9 @@ def results_page() -> str:
     peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
         "pets" in set(predict["model"])
     )
+    over = {env: prediction_results.over_the_best(predict, OURS, "energy_score_noise", env=env, steps_ahead=(10, 80))
+            for env in MUJOCO_IDS}  # fmt: skip
+    beside = "\n\n".join(f"`{env}`:\n\n{table.markdown(lines)}" for env, lines in over.items() if len(lines))
     pages = robots_page(published("09_your_own")), exploration_page(published("10_explore"), published("10_model_free"))
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
@@ -256,9 +259,9 @@ of an environment got as many updates as fit into the same time on one idle core
 
 {scores}
 
-Pushing, seed by seed: the energy score of `{OURS}` over that of the best other model (in brackets):
+Seed by seed: the energy score of `{OURS}` over that of the best other model that has rows (in brackets).
 
-{table.markdown(prediction_results.over_the_best(predict, OURS, "energy_score_noise", env=PUSH, steps_ahead=(10, 80)))}
+{beside}
 
 ## Planning
 
