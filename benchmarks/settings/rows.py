@@ -14,8 +14,9 @@ of the best of them. Models, scores, plans and policies are those of the run, so
 of plans by --planners in both search spaces, beside held-out torques and those of the prior, and the signal of
 gradients at the first 50 starts (07_action_prior).
 
-gradients: their errors (02_train). collect and latent execute 01_collect and 04_latent in the run's folder for --envs
-and --models, as far as these ask for them, and publish what their tables then say.
+gradients: their errors (02_train). collect, latent and robustness execute 01_collect, 04_latent and 06_robustness in
+the run's folder for --envs and --models, as far as these ask for them, and publish what their tables then say:
+06_robustness of tsm/Reacher-v0 in its imperfect worlds and of the place of its map that tsm/ReacherObstacle-v0 is.
 
 rounds: of exploration on --envs, by default the pendulum, by each of --data: own plans, as many random episodes, or no
 new ones (the same training alone); of pushing also contacts in each round's episodes, and how soon a search through
@@ -52,7 +53,8 @@ from tsmlib.study.runs import RESULTS
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
-    "latent": "04_latent", "torques": "07_action_prior", "rounds": "10_explore", "adaptation": "10_explore",
+    "latent": "04_latent", "robustness": "06_robustness", "torques": "07_action_prior", "rounds": "10_explore",
+    "adaptation": "10_explore",
 }  # fmt: skip
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
