@@ -231,13 +231,15 @@ def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monke
     made = {
         "loop": row | dict(model="pets", planner="cem", execution="closed loop", iteration=5, env_steps=75_000),
         "free": row | dict(model="sac", planner="policy", execution="policy", env_steps=1_000_000),
+        "scores": row | dict(model="pets", planner="none", execution="open loop", metric="nrmse"),
     }
     for name, each in made.items():
         tables.save(tmp_path / f"{name}.csv", [each])
     for _ in range(2):  # once more changes nothing
         run_script(ROOT / "benchmarks" / "settings" / "rows.py", "peers", *(str(tmp_path / f"{n}.csv") for n in made))
-    found = {name: tables.load(tmp_path / "results" / f"{name}.csv") for name in ("10_explore", "10_model_free")}
-    assert [rows["model"].tolist() for rows in found.values()] == [["pets"], ["sac"]]
+    names = ("10_explore", "10_model_free", "peers_pets")
+    found = {name: tables.load(tmp_path / "results" / f"{name}.csv") for name in names}
+    assert [rows["model"].tolist() for rows in found.values()] == [["pets"], ["sac"], ["pets"]]
     assert "75,000" in results.rounds_table(found["10_explore"], PUSH)
     ((method, (at, _)),) = results.round_panels(found["10_explore"], ["executed return"], PUSH)[
         "executed return"

@@ -24,8 +24,8 @@ the true simulator returns as much in codes of the last prior as in those of the
 run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
 reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
-beside them, in the files that are named: mbrl-lib's loop (benchmarks/peers) in 10_explore, policies without a model
-(benchmarks/model_free) as 10_model_free.
+beside them, in the files that are named: mbrl-lib's loop in 10_explore and the scores of its models as peers_pets (both
+benchmarks/peers), policies without a model (benchmarks/model_free) as 10_model_free.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
@@ -152,8 +152,11 @@ def published_peers(files: list[Path]) -> None:
     """Rows of other libraries, from the tables that benchmarks/peers and benchmarks/model_free wrote."""
     rows = tables.frame(pd.concat([tables.load(path) for path in files]))
     loops, policies = rows[rows["execution"] == "closed loop"], rows[rows["execution"] == "policy"]
+    predicted = rows[rows["planner"] == "none"]
     if len(loops):
         publish("10_explore", loops)
+    if len(predicted):
+        publish("peers_pets", predicted)
     if len(policies):  # whole: a learner's steps may have been others before
         tables.ship(RESULTS / "10_model_free.csv", policies)
         manifest.write_manifest(Path(RESULTS).parent)
