@@ -2,7 +2,7 @@
 
 The trainings of every model of the three MuJoCo arms and of two imperfect ones, their scores, plans by CEM on 100
 targets of two tasks, and policies: what notebooks 02, 03, 05 and 06 need for every seed. Not counted are the ablations
-and imperfect policies of seed 0, other planners, closed loops and the oracle in 05, and what 04 and 07 look at. Of
+and the map of seed 0, other planners, closed loops and the oracle in 05, and what 04 and 07 look at. Of
 every part a little is done in each round, with one thread, and multiplied by how often the seed does it: updates of
 each stage of each training, episodes of each score, iterations of each plan, updates of each policy. Every update does
 the same work, and so on. The reference is the budget of two hours on two cores, so this row, unlike all others, depends
@@ -31,13 +31,15 @@ from tsmlib import study
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, MUJOCO_IDS, NOISE
 from tsmlib.evaluation import prediction
+from tsmlib.figures.method import Method
 from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
-from tsmlib.study import runs, zoo
+from tsmlib.study import needed, runs, zoo
+from tsmlib.study.policies import complete
 from tsmlib.study.results import planning as planning_results
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
@@ -120,9 +122,24 @@ def everything(arguments: argparse.Namespace) -> Iterator[Part]:
         for word in models:
             if word in planning_results.PAPER:
                 yield from plans(nets[env, word], nets[env, "prior"], task, arguments.little)
-        for word in (word for word in models if word in (zoo.OURS, "onestep", "multistep", "lstm", "ensemble+mse")):
-            prior = nets[env, "prior"] if word == zoo.OURS else None
-            yield from policies(nets[env, word], prior, task, arguments.updates)
+    for env, way, iterations in learned(envs, models):
+        prior = nets[REACH if env in IMPERFECT else env, "prior"] if way.search_space == "latent" else None
+        yield policies(nets[env, way.model], prior, study.load_task(env), arguments.updates, iterations)
+
+
+def learned(envs: list[str], models: list[str]) -> list[tuple[str, Method, int]]:
+    """The policies of 05 and 06 in environments and models that are asked for: environment, method, iterations."""
+    run = runs.resolve("05_control", scale="paper")
+    robust = needed.robustness(runs.resolve("06_robustness", scale="paper"))
+    asked = needed.control(run).policies
+    asked += [(robust.worlds[world], way, budget) for (world, way), budget in robust.policies.items()]
+    known = {*envs, *(IMPERFECT if REACH in envs else ())}
+    found = {
+        (env, way): complete(run, budget).iterations
+        for env, way, budget in asked
+        if env in known and way.model in models
+    }
+    return [(*key, iterations) for key, iterations in found.items()]
 
 
 def trainings(run: runs.Run, env: str, word: str, data: Trajectories, n: int) -> Iterator[Part]:
@@ -155,21 +172,22 @@ def plans(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
         yield Part("plan", partial(reevaluate, found, judge, few.reward), len(task) / len(few))
 
 
-def policies(net: Any, prior: Any, task: Task, n: int) -> Iterator[Part]:
-    """Three copies, 2,200 updates, direct, and latent where there is a prior."""
+def policies(net: Any, prior: Any, task: Task, n: int, iterations: int) -> Part:
+    """Three copies; acting through the prior where there is one."""
     draw = episodes_from(torch.from_numpy(task.start))
     dx, angles = task.start.shape[1], net.features.angles
-    learners: list[Any] = [OneStepPolicy(dx, 2, angles=angles, copies=3)]
-    learners += [SegmentPolicy(dx, prior, angles=angles, copies=3)] if prior is not None else []
-    for learner in learners:
-        learner.features.load_state_dict(net.features.state_dict())
+    learner: Any = (
+        OneStepPolicy(dx, 2, angles=angles, copies=3) if prior is None
+        else SegmentPolicy(dx, prior, angles=angles, copies=3)
+    )  # fmt: skip
+    learner.features.load_state_dict(net.features.state_dict())
 
-        def updates(learner: Any = learner) -> float:
-            return learn_policy(
-                learner, net, task.reward_for, draw, LearningOptions(iterations=n, record_every=n)
-            ).seconds[-1]
+    def updates() -> float:
+        return learn_policy(learner, net, task.reward_for, draw, LearningOptions(iterations=n, record_every=n)).seconds[
+            -1
+        ]
 
-        yield Part("policy", updates, 2200 / n)
+    return Part("policy", updates, iterations / n)
 
 
 if __name__ == "__main__":

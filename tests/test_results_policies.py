@@ -55,9 +55,10 @@ def test_rows_hold_every_record_of_every_copy_and_the_cost() -> None:
     }  # fmt: skip
 
 
-def test_rows_become_curves_again_with_copies_and_seeds_as_lines() -> None:
+def test_rows_become_curves_again_with_the_copies_of_one_seed_or_else_seeds_as_lines() -> None:
+    assert curves_of(rows())["reach"][TSM]["return_true"].tolist() == [[0, -1, -2], [-1, -2, -3]]
     curves = curves_of([*rows(), *rows(seed=1), {"execution": "open loop", "iteration": 1}])["reach"][TSM]
-    assert curves["return_true"].tolist() == [[0, -1, -2], [-1, -2, -3], [-1, -2, -3], [-2, -3, -4]]
+    assert curves["return_true"].tolist() == [[-0.5, -1.5, -2.5], [-1.5, -2.5, -3.5]]  # means over two copies each
     assert curves["iterations"].tolist() == [0, 220, 440]
     assert curves["steps"].tolist() == [0, 220_000, 440_000]  # 20 episodes of 50 steps each
     assert curves["seconds"].tolist() == [100, 150, 200]  # training of the model comes first
@@ -146,7 +147,7 @@ def test_what_belongs_to_no_point_of_a_curve_is_passed_over() -> None:
 def test_the_table_has_one_line_per_policy_with_its_last_record() -> None:
     _, _, line = policies_results.policies_table(curves_of([*rows(), *rows(seed=2)])).splitlines()
     cells = [cell.strip() for cell in line.split("|")[1:-1]]
-    assert cells[:3] == ["reach", "TSM, latent", "4"]
+    assert cells[:3] == ["reach", "TSM, latent", "2"]  # seeds, not the two copies of each
     assert cells[3].startswith("-3.500 ±")
     assert cells[-2:] == ["50,000", "200"]
 

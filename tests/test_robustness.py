@@ -454,11 +454,15 @@ def test_learning_curves_are_a_line_for_each_copy() -> None:
     figures.figure8(curves, {zoo.method("random"): -14.0})
 
 
-def test_two_seeds_of_a_copy_are_two_lines() -> None:
-    more = tables.frame([*ROWS, *({**row, "seed": 1} for row in learned({"delay": [[-12, -7, -6]]}))])
-    assert robustness_results.learning_curves(more, last=500)["delay"][OURS]["return_true"].tolist() == [
-        [-12, -6, -8], [-12, -6, -7], [-12, -7, -6],
-    ]  # fmt: skip
+def test_copies_that_learned_in_one_model_are_one_line_beside_those_of_another_seed() -> None:
+    more = tables.frame([*ROWS, *({**row, "seed": 1} for row in learned({"delay": [[-12, -7, -6], [-12, -7, -9]]}))])
+    curves = robustness_results.learning_curves(more, last=500)
+    assert curves["delay"][OURS]["return_true"].tolist() == [[-12, -6, -7.5], [-12, -7, -7.5]]
+    assert curves["noise"][OURS]["return_true"].tolist() == [[-12, -6, -5], [-12, -6, -5]]  # of seed 0 alone
+    head, _, ours, _ = (
+        line.split("|")[1:-1] for line in robustness_results.policies_table(more, last=500).splitlines()
+    )
+    assert ours[[cell.strip() for cell in head].index("delay: executed return")].strip() == "-7.5"  # both seeds alike
 
 
 def scored(model: str, seeds: list[float], env: str = REACHER, subset: str = "") -> list[dict[str, Any]]:

@@ -147,7 +147,7 @@ def floors(task: Task) -> dict[Method, float]:
 def figure8(found: pd.DataFrame, floor: Mapping[Method, float]) -> Iterator[Drawing]:
     """Learning curves of policies with noise and delay. floor: returns of random and zero torques."""
     curves, yours = table.pair(found, robustness.learning_curves)
-    if curves:  # policies are learned in the models of seed 0
+    if curves:
         rows = table.select(found, execution="policy", metric="return_true")
         yield Drawing(figures.figure8(curves, floor, yours), "figure8", rows)
 

@@ -103,18 +103,15 @@ def control(run: Run) -> Control:
 
 
 def _policies(run: Run) -> list[tuple[str, Method, Budget]]:
-    """Environment, method and budget; those of the paper's model, which take half an hour each, only of seed 0 or where
-    the run has them. On pushing all have the smaller budget. At scale laptop one begins to learn to reach."""
+    """Environment, method and budget, the smaller one where an iteration takes long: inside the paper's model, and on
+    pushing. At scale laptop one begins to learn to reach."""
     inside = [*methods((PAPERS, OURS), "policy"), *methods(BASELINES, "policy", ["direct"])]
     found: list[tuple[str, Method, Budget]] = []
     envs = run.pick(smoke=(REACH, PUSH), laptop=(REACH,), paper=(REACH, PUSH))
     for env, way in product(envs, run.pick(smoke=inside[:1], laptop=[method(OURS, "latent", "policy")], paper=inside)):
-        budget, kept = run.pick(smoke=Budget(), laptop=BEGUN, paper=WHOLE), stored_budget(run, env, way)
-        if run.scale == "paper" and (way.model == PAPERS or env == PUSH):
-            if way.model == PAPERS and kept is None and run.seed:
-                continue
-            budget = ON_IMPERFECT
-        found.append((env, way, kept or budget))
+        whole = ON_IMPERFECT if way.model == PAPERS or env == PUSH else WHOLE
+        budget = run.pick(smoke=Budget(), laptop=BEGUN, paper=whole)
+        found.append((env, way, stored_budget(run, env, way) or budget))
     return found
 
 
@@ -138,14 +135,14 @@ class Robustness(NamedTuple):
 
 
 def robustness(run: Run) -> Robustness:
-    """What 06_robustness asks for at a run's scale; policies, and the map of noise and delay, of seed 0 alone."""
+    """What 06_robustness asks for at a run's scale; the map of noise and delay of seed 0 alone."""
     words = choice(run).words
     words = run.pick(smoke=words[::2][:2], laptop=words, paper=words)
     ways = [method(*way, "policy") for way in (
         (PAPERS, "latent"), (PAPERS, "direct"), (OURS, "latent"),
         *((word, "direct") for word in ("onestep", "multistep", "lstm")),
     )]  # fmt: skip
-    ways = run.pick(smoke=ways[:1], laptop=ways[:1], paper=ways) if run.seed == 0 else []
+    ways = run.pick(smoke=ways[:1], laptop=ways[:1], paper=ways)
     worlds = {"clean": REACH, "noise": imperfect(REACH, noise=NOISE), "delay": imperfect(REACH, delay=DELAY)}
     few = run.pick(smoke=Budget(), laptop=Budget(), paper=ON_IMPERFECT)
     usual = run.pick(smoke=Budget(), laptop=Budget(), paper=WHOLE)  # on the clean arm those of 05_control

@@ -121,9 +121,9 @@ def _records(found: pd.DataFrame) -> pd.DataFrame:
 def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
     """The input of ``figures.figure7``: task -> method -> curves, from rows of policies, in the order of the zoo.
 
-    Copies and seeds of a method are its k lines. Seconds are the CPU's where a table has them, else the clock's, which
-    are more on a busy machine; training of the model is counted. ValueError where lines were not measured at the same
-    points, or where one task was learned in two environments.
+    A method's k lines are those that are ``independent``. Seconds are the CPU's where a table has them, else the
+    clock's, which are more on a busy machine; training of the model is counted. ValueError where lines were not
+    measured at the same points, or where one task was learned in two environments.
     """
     curves: dict[str, dict[Method, Curves]] = {}
     for (task, method), own in table.groups(_one_env(_records(found)), ["task", "method"]):
@@ -137,28 +137,37 @@ def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
 def _curves(own: pd.DataFrame) -> Curves:
     """The curves of one method."""
     clock = "cpu_seconds" if "cpu_seconds" in set(own["metric"]) else "seconds"
-    lines = own[own["metric"].isin([*UNITS, clock])]
+    records = own[own["metric"].isin([*UNITS, clock])]
     key = ["metric", "seed", "copy"]
-    if len(doubled := lines[lines.duplicated([*key, "at"])]):
+    if len(doubled := records[records.duplicated([*key, "at"])]):
         metric, seed, _, at = doubled[[*key, "at"]].iloc[0]
         raise ValueError(f"{metric} of seed {seed} stands twice at {at}")
-    wide = lines.pivot(index=key, columns="at", values="value")
+    wide = records.pivot(index=key, columns="at", values="value")
     if len(cut := wide[wide.isna().any(axis=1)]):
         (metric, seed, copy), points = cut.index[0], cut.iloc[0].dropna().index
         raise ValueError(
             f"{metric} of seed {seed}, copy {copy} was measured at {len(points)} points up to {points.max()}, expected "
             f"the {wide.shape[1]} up to {wide.columns.max()} of the others"
         )
-    at = wide.columns.to_numpy(dtype=int)
+    at, wide = wide.columns.to_numpy(dtype=int), independent(wide)
     curves = {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
     curves["seconds"] = curves.pop(clock).mean(0)
     if not own["search_space"].iloc[0]:
         return curves | {"steps": at, "samples": at}
     samples, before = (own[own["metric"] == metric]["value"].mean() for metric in ("samples", "train_seconds"))
-    task, scale = own[["task", "scale"]].iloc[0]
+    (task, scale), within = own[["task", "scale"]].iloc[0], own[own["metric"] == "within_data"]
+    within = independent(within.set_index(["seed", "copy"])[["value"]])
     curves |= {"iterations": at, "steps": at * model_steps(task, scale)}
     return curves | {"samples": np.full(len(at), samples), "seconds": curves["seconds"] + before,
-                     "within_data": own[own["metric"] == "within_data"]["value"].to_numpy()[:, None]}  # fmt: skip
+                     "within_data": within.to_numpy()}  # fmt: skip
+
+
+def independent(values: pd.DataFrame) -> pd.DataFrame:
+    """Of values by seed and copy, levels of the index: each copy's, or, where there are several training seeds, the
+    mean over the copies of each, since copies that learn in one model are no samples of training it."""
+    if values.index.unique("seed").size < 2:
+        return values
+    return values.groupby(level=[name for name in values.index.names if name != "copy"], sort=False).mean()
 
 
 def model_steps(task: str, scale: str) -> int:
@@ -203,7 +212,7 @@ def plateaus_table(found: pd.DataFrame) -> pd.DataFrame:
 
 
 def policies_table(curves: Mapping[str, Mapping[Method, Curves]]) -> str:
-    """The end of every learning curve in Markdown: means over copies and seeds, with half 95 % intervals."""
+    """The end of every learning curve in Markdown: means over its lines, with half 95 % intervals."""
     return table.markdown(_ends(curves))
 
 
@@ -240,7 +249,7 @@ def _ends(curves: Mapping[str, Mapping[Method, Curves]]) -> pd.DataFrame:
              "final_distance": "final distance (m)", "success": ARRIVED,
              "within_data": "steps within the data"}  # fmt: skip
     counts = {"iterations": "iterations", "samples": "environment steps", "seconds": "seconds"}
-    lines = [
+    ends = [
         {"task": task, "method": method, "k": len(own["return_true"])}
         | {title: table.spell(own[metric][:, -1], "{:.3f} ± {:.3f}") if len(own.get(metric, ())) else ""
            for metric, title in shown.items()}
@@ -248,4 +257,4 @@ def _ends(curves: Mapping[str, Mapping[Method, Curves]]) -> pd.DataFrame:
         for task, methods in curves.items()
         for method, own in methods.items()
     ]  # fmt: skip
-    return pd.DataFrame(lines)
+    return pd.DataFrame(ends)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -18,7 +19,7 @@ from tsmlib.evaluation.filtering import PARTS, rmse
 from tsmlib.figures.method import Method
 from tsmlib.study import zoo
 from tsmlib.study.results import table
-from tsmlib.study.results.policies import model_steps
+from tsmlib.study.results.policies import independent, model_steps
 from tsmlib.study.results.prediction import paired, select, values
 from tsmlib.study.results.table import PolicyHeader, Row
 
@@ -153,16 +154,19 @@ def _ends(found: pd.DataFrame, last: int, *metrics: str) -> pd.DataFrame:
 
 @table.sourced
 def policies_table(found: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
-    """What policies come to in each world, in Markdown: means over copies with half their 95 % t interval, at the
-    last record of at most ``last`` iterations."""
+    """What policies come to in each world, in Markdown: means over seeds, or over the copies of the only one, with half
+    their 95 % t interval, at the last record of at most ``last`` iterations."""
     shown = {"return_true": "executed return", "final_distance": "final distance (m)", "success50": "within 0.05 m"}
     ends = _ends(found, last, *shown)
-    wide = ends.pivot_table(
-        index="method", columns=["world", "metric"], values="value", aggfunc=table.spell, sort=False
-    )
-    titles = {f"{arm}: {title}": (arm, metric) for arm in ends["world"].unique() for metric, title in shown.items()}
-    columns = {title: wide[column] for title, column in titles.items() if column in wide}
-    return pd.DataFrame(columns, index=wide.index).reset_index()
+    said = {
+        key: table.spell(independent(own.set_index(["seed", "copy"])[["value"]])["value"])
+        for key, own in table.groups(ends, ["world", "metric", "method"])
+    }
+    columns: dict[str, list[object]] = {"method": list(ends["method"].unique())}
+    for arm, (metric, title) in product(ends["world"].unique(), shown.items()):
+        if any(key[:2] == (arm, metric) for key in said):
+            columns[f"{arm}: {title}"] = [said.get((arm, metric, method), "") for method in columns["method"]]
+    return pd.DataFrame(columns)
 
 
 def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float) -> float:
@@ -174,11 +178,11 @@ def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float
 
 
 def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Method, dict[str, np.ndarray]]]:
-    """The input of ``figures.figure8``: world -> method -> curves against steps in the model, a line per copy, of up to
-    ``last`` iterations."""
+    """The input of ``figures.figure8``: world -> method -> curves against steps in the model, those that are
+    ``policies.independent``, of up to ``last`` iterations."""
     curves: dict[str, dict[Method, dict[str, np.ndarray]]] = {}
     for (arm, method), own in table.groups(_policies(found, last, "return_true"), ["world", "method"]):
-        wide = own.pivot(index=["seed", "copy"], columns="iteration", values="value")
+        wide = independent(own.pivot(index=["seed", "copy"], columns="iteration", values="value"))
         steps = wide.columns.to_numpy(dtype=float) * model_steps(*own[["task", "scale"]].iloc[0])
         curves.setdefault(arm, {})[method] = {"steps": steps, "return_true": wide.to_numpy()}
     return curves
