@@ -237,7 +237,7 @@ def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monke
         tables.save(tmp_path / f"{name}.csv", [each])
     for _ in range(2):  # once more changes nothing
         run_script(ROOT / "benchmarks" / "settings" / "rows.py", "peers", *(str(tmp_path / f"{n}.csv") for n in made))
-    names = ("10_explore", "10_model_free", "peers_pets")
+    names = ("10_explore", "model_free", "peers_pets")
     found = {name: tables.load(tmp_path / "results" / f"{name}.csv") for name in names}
     assert [rows["model"].tolist() for rows in found.values()] == [["pets"], ["sac"], ["pets"]]
     assert "75,000" in results.rounds_table(found["10_explore"], PUSH)
@@ -321,7 +321,7 @@ def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
     assert pages.exploration_page(tables.frame([])) == ""
     rows = published("10_explore")
     if len(rows):
-        page = pages.exploration_page(rows, published("10_model_free"))
+        page = pages.exploration_page(rows, published("model_free"))
         assert page in (ROOT / "docs" / "results.md").read_text()
 
 

@@ -70,7 +70,7 @@ SETTINGS: dict[str, list[dict[str, float]]] = {
     ],
 }  # episodes: per update, of SAC side by side; std: of the actions, at first; updates: per step of the environment
 MINIBATCH = 250  # steps; of PPO, and of TRPO's value function
-STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 600_000}  # of the environment, by each seed
+STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 1_000_000}  # of the environment, by each seed
 SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v1": 200_000}  # by each configuration
 SEARCH_SEED = 100
 RECORDS = 25  # along the way, and one before

@@ -25,7 +25,8 @@ run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
 reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
 beside them, in the files that are named: mbrl-lib's loop in 10_explore and the scores of its models as peers_pets (both
-benchmarks/peers), policies without a model (benchmarks/model_free) as 10_model_free.
+benchmarks/peers), policies without a model as model_free
+(benchmarks/model_free), in place of those of the same algorithm and environment.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
 """
@@ -157,8 +158,11 @@ def published_peers(files: list[Path]) -> None:
         publish("10_explore", loops)
     if len(predicted):
         publish("peers_pets", predicted)
-    if len(policies):  # whole: a learner's steps may have been others before
-        tables.ship(RESULTS / "10_model_free.csv", policies)
+    if len(policies):  # a learner's steps may have been others before
+        path, about = RESULTS / "model_free.csv", ["env", "model"]
+        kept = tables.load(path) if tables.stored(path) else policies[:0]
+        there = policies.set_index(about).index
+        tables.ship(path, tables.frame(pd.concat([kept[~kept.set_index(about).index.isin(there)], policies])))
         manifest.write_manifest(Path(RESULTS).parent)
 
 

@@ -242,7 +242,7 @@ def results_page() -> str:
     over = {env: prediction_results.over_the_best(predict, OURS, "energy_score_noise", env=env, steps_ahead=(10, 80))
             for env in MUJOCO_IDS}  # fmt: skip
     beside = "\n\n".join(f"`{env}`:\n\n{table.markdown(lines)}" for env, lines in over.items() if len(lines))
-    pages = robots_page(published("09_your_own")), exploration_page(published("10_explore"), published("10_model_free"))
+    pages = robots_page(published("09_your_own")), exploration_page(published("10_explore"), free)
     later = "\n\n".join(filter(None, pages))
     n = predict[(predict["execution"] == "open loop") & (predict["subset"] == "")]["n"].max()
     there = [word for word in zoo.ZOO if word in set(predict["model"])]

@@ -25,8 +25,8 @@ from tsmlib.storage.files import Json
 from tsmlib.study.comparison import table
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
-from tsmlib.study.results.policies import EPISODES, finished, learning_curves, learning_rows, plateau_rows
-from tsmlib.study.results.table import PolicyHeader, Row, of_task
+from tsmlib.study.results.policies import EPISODES, GRADIENTS, finished, learning_curves, learning_rows, plateau_rows
+from tsmlib.study.results.table import PolicyHeader, Row, of_task, select
 from tsmlib.study.runs import Run
 from tsmlib.trajectory import Trajectories
 
@@ -155,7 +155,7 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
         )  # fmt: skip
     if run.scale == "laptop":
         return rows
-    free = finished(table(run, "model_free").drop(columns="source"))
+    free = finished(select(table(run, "model_free"), model=GRADIENTS).drop(columns="source"))
     curves = learning_curves(tables.frame(pd.concat([tables.frame(rows), free[free["seed"] == run.seed]])))
     for task in {task.env: task for task, *_ in wanted}.values():
         compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}

@@ -17,6 +17,7 @@ from tsmlib.study.results import table
 from tsmlib.study.results.planning import ARRIVED, ordered
 from tsmlib.study.results.table import PolicyHeader, Row
 
+GRADIENTS = ("ppo", "trpo")  # the policy gradients of figure 7
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration of learning (A.3)
 UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
          "success": "share"}  # fmt: skip
