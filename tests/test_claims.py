@@ -170,6 +170,32 @@ def test_a_claim_that_turns_with_the_reading_depends_on_it(paper: int, fair: int
     assert ("A1b one shared variance" in verdict.why) == (word == DEPENDENT)
 
 
+def test_an_inconclusive_claim_names_the_readings_under_which_it_fails() -> None:
+    rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0]), readings=LIKELIHOODS)
+    rows = [score("tsm", k, value) for k, value in enumerate((-1.0, 0.1, 1.0))]
+    rows += [score("tsm", k, value, metric="ll_shared") for k, value in enumerate((-1.2, -1.1, -1.0))]
+    verdict = evaluate.judge(rule, frames(of_03_predict=rows))
+    assert (verdict.word, verdict.against) == (INCONCLUSIVE, ["A1b one shared variance"])
+    assert "It fails with: A1b one shared variance." in verdict.why
+    assert "INCONCLUSIVE**; not replicated by A1b one shared variance" in report.table([verdict], [verdict])
+
+
+@pytest.mark.parametrize(("lstm", "word"), [(2.0, REPLICATED), (0.0, UNTESTABLE)])
+def test_a_share_of_a_lead_that_is_not_there_is_no_margin(lstm: float, word: str) -> None:
+    def rule(q: Query) -> Checks:
+        lead = q.ll(LSTM, REACHER) - q.ll(ONE_STEP, REACHER)
+        yield (lead > 0).assumed()
+        yield from between(-0.25 * lead, q.ll(TSM, REACHER) - q.ll(LSTM, REACHER), 0.25 * lead)
+
+    rows = study(tsm=[lstm, lstm + 0.01, lstm - 0.01], lstm=[lstm] * 3, onestep=[1.0, 1.01, 0.99])
+    verdict = evaluate.judge(claim(rule), rows)
+    assert verdict.word == word
+    assert len(verdict.effects[""]) == (2 if word == REPLICATED else 3)  # a premise that holds is not a check
+    assert ("A margin is a share of" in verdict.why) == (word == UNTESTABLE)
+    assert report.change(verdict).startswith("a lead" if word == UNTESTABLE else "rows that bring")
+    assert ("not testable" in report.in_full(verdict, verdict)) == (word == UNTESTABLE)
+
+
 def test_what_holds_by_definition_is_not_counted() -> None:
     rule = claim(lambda _: iter([constant(2.0) > 1]), definition="It is arithmetic.")
     verdict = evaluate.judge(rule, study(tsm=[1]))
@@ -418,7 +444,7 @@ def test_swapping_the_labels_of_two_models_turns_every_check_that_compares_them(
             (other,) = rival
             swapped = evaluate.judge(c, rows.relabelled({"tsm": other, other: "tsm"}))
             effect = next(effect for effect in swapped.effects[""] if effect.check is check)
-            assert effect.state in ("fails", "missing"), check.text
+            assert effect.state in (("void",) if check.premise else ("fails", "missing")), check.text
             turned.add((c.id, effect.state))
     assert len({name for name, state in turned if state == "fails"}) >= 12
     assert {"C23", "C26", "C27", "C30", "C31", "C32", "C34"} <= {name for name, state in turned if state == "fails"}

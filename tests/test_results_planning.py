@@ -139,10 +139,10 @@ def test_the_size_of_a_gap_is_that_of_each_seed_before_seeds_are_averaged() -> N
     rows = [dict(given, metric="return_true", target=i, seed=seed, value=1.0) for seed in predicted for i in range(3)]
     rows += [dict(given, metric="return_predicted", target=i, seed=seed, value=value)
              for seed, value in predicted.items() for i in range(3)]  # fmt: skip
-    np.testing.assert_array_equal(planning_results.gap_sizes(tables.frame(rows))[TSM], [2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(planning_results.gap_sizes(tables.frame(rows))[TSM], [[2.0, 2.0, 2.0]] * 2)
 
 
-def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_as_well() -> None:
+def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_and_over_seeds_as_well() -> None:
     given = dict(
         env="tsm/Reacher-v0", search_space="latent", planner="cem", execution="open loop", metric="return_true"
     )
@@ -155,7 +155,10 @@ def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_as_well() -> None
     rows = [dict(given, model=model, target=i, seed=seed, value=-cost)
             for (model, seed), each in costs.items() for i, cost in enumerate(each)]  # fmt: skip
     _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict("records")
-    assert (line["cost of tsm minus this"], line["in each seed"]) == ("-2.00", "-1.00, -3.00")
+    assert (line["cost of tsm minus this"], line["in each seed"]) == ("-2.00 (12.71)", "-1.00, -3.00")  # t of 2 seeds
+    rows = [row for row in rows if row["seed"] == 0]
+    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict("records")
+    assert line["cost of tsm minus this"] == "-1.00"
 
 
 def test_distances_that_are_drawn_are_those_of_every_seed() -> None:

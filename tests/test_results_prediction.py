@@ -24,7 +24,9 @@ TSM, LSTM = zoo.method("tsm"), zoo.method("lstm")
 def scores(n: int, steps: int, level: float = 0.0) -> prediction.Scores:
     """Scores that grow by one per step, from ``level`` on; the truth lies at the median."""
     ramp = level + torch.arange(1.0, steps + 1).expand(n, -1)
-    values = {metric: ramp.clone() for metric in ("ll_paper", "energy_score_noise")} | {"squared_error": ramp.square()}
+    values = {metric: ramp.clone() for metric in ("ll_paper", "ll_own", "energy_score_noise")} | {
+        "squared_error": ramp.square()
+    }
     fitted = prediction.Fitted(0.1, 0.1, torch.ones(steps, D), torch.ones(steps, D), 0.1)
     outside = torch.zeros(n)
     outside[0] = 0.5
@@ -51,6 +53,23 @@ def test_a_row_without_steps_ahead_is_the_mean_over_all_steps(found: pd.DataFram
     assert prediction_results.values(found, "ll_paper", env=ENV, execution="segments")["tsm"] == pytest.approx(
         [5.5] * 3
     )
+
+
+def test_a_log_score_stands_with_and_without_the_episodes_in_which_it_is_worst() -> None:
+    test, n = study.random_data(ENV, 40, seed=0), 40
+    missed = scores(n, T)
+    missed.values["ll_own"][:2] = -1000.0  # two of forty
+    pair = missed, scores(n * len(prediction_results.SEGMENTS), 10)
+    rows = tables.frame(prediction_results.rows(ENV, "tsm", *pair, test, seed=0, scale="smoke"))
+    whole = prediction_results.values(rows, "ll_own", env=ENV)["tsm"]
+    assert whole == pytest.approx([(38 * 45.5 - 2 * 1000) / 40])
+    trimmed = prediction_results.select(rows, "ll_own", env=ENV, subset=prediction_results.TRIMMED)
+    assert trimmed[["value", "n"]].to_numpy().tolist() == [[45.5, 38]]
+    titles, _, line = prediction_results.own_density_table(rows, [ENV]).splitlines()
+    assert [cell.strip() for cell in titles.split("|")[2:4]] == [
+        "ReacherPush: all episodes", "ReacherPush: without the worst 5 %",
+    ]  # fmt: skip
+    assert [cell.strip() for cell in line.split("|")[1:4]] == ["tsm", "-6.78", "45.5"]
 
 
 def test_a_row_with_steps_ahead_is_the_score_at_that_step(found: pd.DataFrame) -> None:
@@ -164,4 +183,6 @@ def test_an_arm_alone_has_no_rows_of_contact() -> None:
     rows = prediction_results.rows(
         env, "tsm", scores(2, T), scores(2 * len(prediction_results.SEGMENTS), 10), test, seed=0, scale="smoke"
     )
-    assert {(row["execution"], row.get("subset", "")) for row in rows} == {("open loop", ""), ("segments", "")}
+    assert {(row["execution"], row.get("subset", "")) for row in rows} == {
+        ("open loop", ""), ("segments", ""), ("open loop", prediction_results.TRIMMED),
+    }  # fmt: skip

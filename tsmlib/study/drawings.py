@@ -21,8 +21,9 @@ from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.study import zoo
 from tsmlib.study.results import exploration, latent, planning, policies, prediction, robustness, table
 
-SCORES = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance", "energy_score_noise": "energy score"}
-FEW = (zoo.PAPERS, zoo.OURS, "onestep", "lstm", "ensemble+mse")  # models whose scores are drawn step by step
+PROTOCOLS = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance"}  # of figure 5
+SCORES = {**PROTOCOLS, "ll_own": "own density", "energy_score_noise": "energy score"}
+FEW = (zoo.PAPERS, zoo.OURS, "onestep", "multistep", "lstm", "ensemble+mse")  # drawn step by step
 
 
 class Drawing(NamedTuple):
@@ -42,8 +43,7 @@ def _whole(found: pd.DataFrame, envs: Sequence[str]) -> pd.DataFrame:
 
 def figure5(found: pd.DataFrame, envs: Sequence[str]) -> Drawing:
     """Log-likelihoods of all models, by environment."""
-    titles = {metric: title for metric, title in SCORES.items() if metric.startswith("ll_")}
-    published, yours = table.pair(found, partial(prediction.score_panels, titles=titles, envs=envs))
+    published, yours = table.pair(found, partial(prediction.score_panels, titles=PROTOCOLS, envs=envs))
     return Drawing(figures.figure5(published, yours=yours), "figure5", _whole(found, envs))
 
 

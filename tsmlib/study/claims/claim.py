@@ -4,8 +4,8 @@
     READING-DEPENDENT   the checks hold under some reading, not under all
     NOT REPLICATED      the interval of some check lies beyond its margin, on the wrong side, by Holm's procedure over
                         the claim's checks
-    INCONCLUSIVE        the interval of some check holds its margin, or there is none
-    NOT TESTABLE        rows are missing, or were refused
+    INCONCLUSIVE        the interval of some check holds its margin, or there is none; readings that fail are named
+    NOT TESTABLE        rows are missing, or were refused; or a margin is a share of a lead that is not there
     DEFINITIONAL        nothing that could be measured would contradict it; not counted
 
 The SHA-256 of all that decides a verdict is stored with it; under another rule a stored verdict is void.
@@ -25,7 +25,7 @@ from tsmlib.study.claims.query import Check, Checks, Query
 from tsmlib.study.claims.shown import Shown
 from tsmlib.study.zoo import PAPERS
 
-VERSION = 3  # raise it when verdicts are reached in another way: those that are stored are void then
+VERSION = 4  # raise it when verdicts are reached in another way: those that are stored are void then
 REPLICATED, DEPENDENT, INCONCLUSIVE, FAILED, UNTESTABLE, DEFINITIONAL = VERDICTS = (
     "REPLICATED", "READING-DEPENDENT", "INCONCLUSIVE", "NOT REPLICATED", "NOT TESTABLE", "DEFINITIONAL",
 )  # fmt: skip
@@ -74,7 +74,7 @@ class Claim:
         lines = inspect.getsource(self.rule).splitlines()
         body = list(itertools.dropwhile(lambda line: not line.lstrip().startswith("def "), lines))
         checks = {
-            reading: [[c.text, c.op, c.margin, c.level, c.number.terms] for c in checks]
+            reading: [[c.text, c.op, c.margin, c.level, c.premise, c.number.terms] for c in checks]
             for reading, checks in self.checks.items()
         }
         decides = json.dumps([VERSION, self.id, self.definition, body, checks], sort_keys=True)

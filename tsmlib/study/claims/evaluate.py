@@ -52,7 +52,7 @@ class Effect:
     """
 
     check: Check
-    state: str  # holds, fails, open or missing
+    state: str  # one of STATES
     value: float | None = None
     low: float | None = None
     high: float | None = None
@@ -114,7 +114,7 @@ class Effect:
         return self.estimate if self.value is None else f"{self.estimate}, {counted}"
 
 
-STATES = ("fails", "missing", "open", "holds")  # of a whole rule: one check that fails decides, whatever is missing
+STATES = ("void", "fails", "missing", "open", "holds")  # of a whole rule the first that one of its checks has
 
 
 @dataclass(frozen=True)
@@ -130,6 +130,15 @@ class Verdict:
     def key(self) -> Effect:
         """The check of the primary reading that decides: the one that is furthest from holding."""
         return min(self.effects[""], key=lambda effect: effect.ease)
+
+    @property
+    def against(self) -> list[str]:
+        """The other readings of the paper under which it fails, where it is not decided as the paper words it."""
+        named = self.effects.items() if self.word == INCONCLUSIVE else ()
+        return [
+            reading + ", by one training seed" * all(effect.seeds == 1 for effect in found if effect.state == "fails")
+            for reading, found in named if reading and state_of(found) == "fails"
+        ]  # fmt: skip
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -207,13 +216,16 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
 def judge(claim: Claim, rows: Tables) -> Verdict:
     """What rows say of a claim."""
     effects = {
-        reading: _of_one_family([_effect(claim, check, rows) for check in checks])
+        reading: _void(claim, checks, rows) + _of_one_family([_effect(claim, c, rows) for c in checks if not c.premise])
         for reading, checks in claim.checks.items()
     }
-    states = {reading: min((e.state for e in found), key=STATES.index) for reading, found in effects.items()}
+    states = {reading: state_of(found) for reading, found in effects.items()}
     first, key = states.pop(""), min(effects[""], key=lambda effect: effect.ease)
-    holds = [reading for reading, found in states.items() if found == "holds"]
-    turned = [reading for reading in states if not all(effect.right_side for effect in effects[reading])]
+    holds, fails = ([reading for reading, found in states.items() if found == state] for state in ("holds", "fails"))
+    turned = [
+        reading for reading, found in states.items()
+        if found != "void" and not all(effect.right_side for effect in effects[reading])
+    ]  # fmt: skip
     measured = f"{key.check.text}: it is {key.text}."
     failing = sum(effect.state == "fails" for effect in effects[""])
     word, why = {
@@ -221,9 +233,10 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
         "fails": (FAILED, f"{measured} {failing} of {len(effects[''])} checks fail."),
         "open": (
             INCONCLUSIVE,
-            f"{measured} {_undecided(key, len(effects['']))}",
+            f"{measured} {_undecided(key, len(effects['']))}" + f" It fails with: {'; '.join(fails)}." * bool(fails),
         ),
         "missing": (UNTESTABLE, key.why),
+        "void": (UNTESTABLE, key.why),
     }[first]
     if claim.definition:
         word, why = DEFINITIONAL, claim.definition
@@ -232,6 +245,20 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     elif first in ("fails", "open") and holds:
         word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. As the paper words it, {why}"
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
+
+
+def state_of(effects: Sequence[Effect]) -> str:
+    """Of a rule: void where a premise does not hold; else one check that fails decides, whatever is missing."""
+    return min((effect.state for effect in effects), key=STATES.index)
+
+
+def _void(claim: Claim, checks: Sequence[Check], rows: Tables) -> list[Effect]:
+    """The premises that do not hold by their estimates."""
+    found = [_effect(claim, check, rows) for check in checks if check.premise]
+    return [
+        replace(effect, state="void", why=f"A margin is a share of {effect.check.number.text}: it is {effect.text}.")
+        for effect in found if not effect.right_side
+    ]  # fmt: skip
 
 
 def _undecided(key: Effect, checks: int) -> str:

@@ -144,12 +144,17 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """One inequality: a number, an operator and a margin. level: of the interval that has to lie beyond the margin."""
+    """One inequality: a number, an operator and a margin. level: of the interval that has to lie beyond the margin.
+
+    premise: the estimate has to be on the accepted side, or the claim cannot be asked: of a lead of which another
+    check's margin is a share, since a share of no lead is no margin.
+    """
 
     number: Number
     op: str
     margin: float
     level: float = 0.95
+    premise: bool = False
 
     @property
     def asked(self) -> str:
@@ -168,6 +173,10 @@ class Check:
             ">": low > self.margin, ">=": low >= self.margin, "<": high < self.margin, "<=": high <= self.margin,
             "==": (low <= self.margin) & (self.margin <= high),
         }[self.op]  # fmt: skip
+
+    def assumed(self) -> Check:
+        """The same as a premise."""
+        return replace(self, premise=True)
 
     def share(self) -> Number:
         """The share of a seed's trials for which it is true."""
@@ -246,7 +255,7 @@ class Query:
 
     def ablation(self, model: Model) -> Number:
         """The log-likelihood on pushing of a model with one thing changed."""
-        return self.score("ll_paper", model, PUSH._replace(table="03_ablation"))
+        return self.ll(model, PUSH._replace(table="03_ablation"))
 
     def latent(self, metric: str, place: Place, *, subset: str = "") -> Number:
         """What was measured of the codes, in segments from the true past; of contacts (a subset), open loop."""

@@ -7,7 +7,7 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, REPLICATED, UNTESTABLE, VERDICTS, Claim
-from tsmlib.study.claims.evaluate import STATES, Effect, Verdict
+from tsmlib.study.claims.evaluate import Effect, Verdict, state_of
 from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
 
@@ -33,12 +33,18 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
         claim, key, checks = verdict.claim, verdict.key, len(verdict.effects[""])
         found = "no rows yet" if key.value is None else key.estimate
         lines.append({
-            "": claim.id, "the paper says": f"{claim.statement} ({claim.place})", "verdict": f"**{verdict.word}**",
+            "": claim.id, "the paper says": f"{claim.statement} ({claim.place})",
+            "verdict": f"**{verdict.word}**" + against(verdict),
             "with our model": other.word.lower(), "measured": claim.statistic,
             "deciding check": f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}",
             "n": key.n, "shown in": _links(claim, root),
         })  # fmt: skip
     return markdown(pd.DataFrame(lines))
+
+
+def against(verdict: Verdict) -> str:
+    """Readings under which an inconclusive claim fails, in words; else empty."""
+    return f"; not replicated by {'; '.join(verdict.against)}" if verdict.against else ""
 
 
 def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
@@ -85,7 +91,8 @@ def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
     """One claim as a section in Markdown: what the paper says, verdict, every check with all its seeds, the verdict
     under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
     claim, effects = verdict.claim, verdict.effects[""]
-    several = f"All of {len(effects)} checks have to hold" if len(effects) > 1 else "One check has to hold"
+    checks = sum(effect.state != "void" for effect in effects)
+    several = f"All of {checks} checks have to hold" if checks > 1 else "One check has to hold"
     known = verdict.why if verdict.word in (DEFINITIONAL, UNTESTABLE) else claim.why.get(verdict.word, "")
     known = f" {known}" if known else ""
     pictures = "\n".join([f"{'against':<{HALF}}|{'for it':>{HALF}}", *map(_strip, effects)])
@@ -132,8 +139,9 @@ def _strip(effect: Effect) -> str:
 
 def _under(effects: Sequence[Effect]) -> str:
     """What would be the verdict if this reading were the only one."""
-    state = min((effect.state for effect in effects), key=STATES.index)
-    return {"holds": "replicated", "fails": "not replicated", "open": "inconclusive", "missing": "no rows"}[state]
+    words = {"holds": "replicated", "fails": "not replicated", "open": "inconclusive", "missing": "no rows",
+             "void": "not testable"}  # fmt: skip
+    return words[state_of(effects)]
 
 
 def _deciding(effects: Sequence[Effect]) -> str:
@@ -147,17 +155,18 @@ def change(verdict: Verdict) -> str:
     if verdict.word == DEFINITIONAL:
         return "nothing that could be measured."
     if verdict.word == UNTESTABLE:
-        return "rows, which are missing."
+        return "a lead to take a share of." if key.state == "void" else "rows, which are missing."
     if verdict.word == DEPENDENT:
         return "to know what the paper means: the readings above differ."
     if key.low is None:
         return "another training seed, since one has no interval."
     away, low, high = key.beyond
     if verdict.word in (REPLICATED, FAILED):
-        side, half = "right" if away > 0 else "wrong", max(abs(high - low) / 2, 1e-300)
+        side, half = "right" if verdict.word == REPLICATED else "wrong", abs(high - low) / 2
+        times = f": {abs(away) / half:.1f} times half its interval" if half > 0 else ""
         return (
             f"rows that bring the mean of the deciding check to the other side of its margin, {abs(away):.3g} from "
-            f"where it lies on the {side} one: {abs(away) / half:.1f} times half its interval."
+            f"where it lies on the {side} one{times}."
         )
     side = "right" if away > 0 else "wrong"
     if low * high > 0:

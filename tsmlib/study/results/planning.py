@@ -26,6 +26,7 @@ from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.planners import iterations_to
 from tsmlib.planning.tasks import TOLERANCE, Task
+from tsmlib.statistics import random_effects
 from tsmlib.study import zoo
 from tsmlib.study.results import table
 from tsmlib.study.results.table import Columns, Row
@@ -315,37 +316,51 @@ def spaces_table(found: pd.DataFrame) -> pd.DataFrame:
 
 def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str = OPEN) -> pd.DataFrame:
     """Plans by CEM over codes beside those of ``subject``, target by target, the cheapest first: mean cost, and the
-    subject's cost and size of the gap minus theirs with half the 95 % t interval over targets; the cost also in each
-    seed alone. Closed loop, the gap is that of the first plan. found: rows with a ``target``."""
+    subject's cost and size of the gap minus theirs (``spell_effect``), the cost also in each seed alone. Closed loop,
+    the gap is that of the first plan. found: rows with a ``target``."""
     planned = plans_of(found, env=env, execution=execution, planners=["cem"])
-    seeds = [by_target(part, "return_true") for _, part in table.groups(planned, "seed")]
-    costs = {way: -true for way, true in by_target(planned, "return_true").items() if way.search_space != "direct"}
+    costs = {way: cost for way, cost in costs_of(planned).items() if way.search_space != "direct"}
     gaps, ours = gap_sizes(planned), next((way for way in costs if way.model == subject), None)
     lines = []
-    for method, cost in sorted(costs.items(), key=lambda each: each[1].mean()):
-        line = {"method": method, "cost (m)": f"{cost.mean():.2f}"}
+    for method, cost in sorted(costs.items(), key=lambda each: each[1].to_numpy().mean()):
+        line = {"method": method, "cost (m)": f"{cost.to_numpy().mean():.2f}"}
         if ours is not None and method is not ours:
-            line[f"cost of {subject} minus this"] = table.spell(costs[ours] - cost, "{:+.2f} ± {:.2f}")
-            apart = [table.spell(seed[method] - seed[ours], "{:+.2f} ± {:.2f}") for seed in seeds
-                     if method in seed and ours in seed]  # fmt: skip
-            if len(seeds) > 1:
-                line["in each seed"] = ", ".join(apart)
+            apart = (costs[ours] - cost).dropna()
+            line[f"cost of {subject} minus this"] = spell_effect(apart)
+            if len(apart) > 1:
+                line["in each seed"] = ", ".join(table.spell(row, "{:+.2f} ± {:.2f}") for row in apart.to_numpy())
             if method in gaps:
-                spelt = table.spell(gaps[ours] - gaps[method], "{:+.2f} ± {:.2f}")
-                line[f"size of the gap of {subject} minus this"] = spelt
-        lines.append(line | {"n": len(cost)})
+                line[f"size of the gap of {subject} minus this"] = spell_effect((gaps[ours] - gaps[method]).dropna())
+        lines.append(line | {"n": cost.shape[1]})
     return pd.DataFrame(lines)
 
 
-def gap_sizes(found: pd.DataFrame) -> dict[Method, np.ndarray]:
-    """Size of predicted minus executed return: method -> (targets,), means over seeds of each seed's own size. found:
-    rows with a ``target``."""
+def spell_effect(values: pd.DataFrame) -> str:
+    """Mean of paired differences (seeds, targets), half its 95 % interval over targets, and in brackets, where there
+    are several seeds, that over seeds and targets (two-way random effects)."""
+    whole = f" ({random_effects(values.to_numpy()).half():.2f})" * (len(values) > 1)
+    return table.spell(values.mean(), "{:+.2f} ± {:.2f}") + whole
+
+
+def costs_of(found: pd.DataFrame) -> dict[Method, pd.DataFrame]:
+    """Costs of plans: method -> (seeds, targets). found: rows with a ``target``."""
+    own = table.with_method(table.select(found, metric="return_true"))
+    return {method: -part.pivot(index="seed", columns="target", values="value")
+            for method, part in table.groups(own, "method")}  # fmt: skip
+
+
+def gap_sizes(found: pd.DataFrame) -> dict[Method, pd.DataFrame]:
+    """Size of predicted minus executed return: method -> (seeds, targets). found: rows with a ``target``."""
     own = table.with_method(table.select(found, metric=["return_true", "return_predicted"]))
-    wide = table.means(own, ["method", "seed", "target"])
-    if "return_predicted" not in wide:
-        return {}
-    sizes = (wide["return_predicted"] - wide["return_true"]).abs().rename("value").reset_index().dropna()
-    return table.arrays(table.means(sizes, "target", "method").sort_index())
+    sizes: dict[Method, pd.DataFrame] = {}
+    for method, part in table.groups(own, "method"):
+        predicted, executed = (
+            own.pivot(index="seed", columns="target", values="value")
+            for own in (part[part["metric"] == metric] for metric in ("return_predicted", "return_true"))
+        )
+        if len(predicted):
+            sizes[method] = (predicted - executed).abs()
+    return sizes
 
 
 @table.sourced

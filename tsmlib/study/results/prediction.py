@@ -28,6 +28,8 @@ from tsmlib.trajectory import Trajectories
 
 SEGMENTS = range(10, 100, 30)  # steps at which the segments that are scored from the true past begin
 HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
+WORST = 0.05  # share of episodes that the subset TRIMMED leaves out
+TRIMMED = "without the worst 5 %"  # of the episodes, by the model's own mean log-likelihood
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
 NAMES = {  # of metrics, as readers meet them
     "ll_paper": "log-likelihood, paper's protocol", "ll_shared": "log-likelihood, one shared variance",
@@ -63,8 +65,15 @@ def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajec
             found += [dict(here, metric=metric, value=value) for metric, value in means(scores, chosen).items()]
             if scores is open_loop:
                 found += _by_step(scores, chosen, where.sum(0), here) + _calibrated(scores, chosen, here)
+    found.append(dict(common, execution="open loop", **_trimmed(open_loop)))
     diverged = dict(metric="diverged", unit="share", value=float(open_loop.outside.mean()), n=len(open_loop.outside))
     return [*found, dict(common, execution="open loop", **diverged)]
+
+
+def _trimmed(scores: Scores) -> Row:
+    """``ll_own`` without the episodes in which it is lowest: a mean of log scores is decided by few that all miss."""
+    by_episode = scores.values["ll_own"].mean(1).sort().values[int(WORST * len(scores.outside)) :]
+    return dict(metric="ll_own", subset=TRIMMED, value=float(by_episode.mean()), n=len(by_episode))
 
 
 def _by_step(scores: Scores, where: Tensor | None, n: Tensor, here: Row) -> list[Row]:
@@ -265,6 +274,17 @@ def scores_table(
         wide.insert(0, "n", own.groupby("model")["n"].max())
     wide.index = [name + few for name, few in zip(names, fewer, strict=True)]
     return wide.rename_axis("model").reset_index()
+
+
+@table.sourced
+def own_density_table(found: pd.DataFrame, envs: Sequence[str]) -> pd.DataFrame:
+    """``ll_own`` over 90 steps in Markdown, of all episodes and without the worst of each model: a line per model."""
+    columns: dict[str, dict[str, str]] = {}
+    for env in envs:
+        for subset, words in (("", "all episodes"), (TRIMMED, TRIMMED)):
+            numbers = values(found, "ll_own", env=env, subset=subset)
+            columns[f"{EnvSpec.parse(env).name}: {words}"] = {model: table.spell(own) for model, own in numbers.items()}
+    return pd.DataFrame(columns).fillna("").rename_axis("model").reset_index()
 
 
 def over_the_best(

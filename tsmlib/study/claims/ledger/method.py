@@ -2,29 +2,36 @@
 # fmt: off
 # isort: off
 
-from tsmlib.study.claims.claim import FAILED, Claim
+from tsmlib.study.claims.claim import FAILED, REPLICATED, Claim
 from tsmlib.study.claims.query import (
-    ADAM, ARMS, DELAY, LAP, LSTM, MULTI_STEP, ONE_STEP, PUSH, REACHER, TASKS, TSM, VARIANCE, Check, Checks, Model,
-    Query, between, constant, log,
+    ADAM, ARMS, DELAY, LAP, LIKELIHOODS, LSTM, MULTI_STEP, ONE_STEP, PUSH, REACHER, TASKS, TSM, VARIANCE, Check,
+    Checks, Model, Number, Query, between, constant, log,
 )
 from tsmlib.study.claims.shown import (
     ACTION_PRIOR, CAUSES, CHANGES, DATA, FIGURE6, FIGURE7, HORIZON, ITERATIONS, PROBLEM, ROBUSTNESS, WORKSPACE,
 )
 
-@Claim("C09", "section 3", CHANGES,
+SPREAD = ("It is the protocol, by which a model with samples states a variance for every step and the one-step model "
+          "one for everything; by one shared variance they are much closer.")
+
+
+@Claim("C09", "section 3", CHANGES, readings=LIKELIHOODS,
        statistic="log-likelihood, full encoder minus ours, against a tenth of the lead over the one-step model")
 def c09(q: Query) -> Checks:
     """An encoder that sees the future states alone is as good as one that sees everything."""
-    tsm, tenth = q.ablation(TSM), 0.1 * (q.ablation(TSM) - q.ablation(ONE_STEP))
-    yield from between(-tenth, q.ablation(Model("tsm+full")) - tsm, tenth)
+    lead, change = _lead(q), q.ablation(Model("tsm+full")) - q.ablation(TSM)
+    yield (lead > 0).assumed()
+    yield from between(-0.1 * lead, change, 0.1 * lead)
 
-@Claim("C10", "section 3.1", CHANGES,
-       statistic="log-likelihood with them minus without, against a quarter of the lead over the one-step model")
+@Claim("C10", "section 3.1", CHANGES, readings=LIKELIHOODS,
+       statistic="log-likelihood with them minus without, against a quarter of the lead over the one-step model",
+       why={FAILED: "At the learning rate that was chosen for it with them, and after 580 s."})
 def c10(q: Query) -> Checks:
     """Residual and skip connections help a little and are not essential."""
-    tsm, plain = q.ablation(TSM), q.ablation(Model("tsm+plain"))
-    yield tsm - plain > 0
-    yield tsm - plain <= 0.25 * (tsm - q.ablation(ONE_STEP))
+    lead, change = _lead(q), q.ablation(TSM) - q.ablation(Model("tsm+plain"))
+    yield (lead > 0).assumed()
+    yield change > 0
+    yield change <= 0.25 * lead
 
 @Claim("C11", "section 3", ROBUSTNESS,
        statistic="log-likelihood with delay: TSM minus the same with zeros for past actions")
@@ -81,25 +88,30 @@ def c16(q: Query) -> Checks:
 
 @Claim("C17", "sections 5.1 and 6", WORKSPACE, picture=True,
        statistic="share of the cells of a 20 x 20 grid over the workspace that data visit; share of episodes with "
-                 "contact")
+                 "contact",
+       why={REPLICATED: "How strong and how smooth the torques are was chosen here so that they do (A15)."})
 def c17(q: Query) -> Checks:
     """Smooth random torques explore enough."""
     yield q.data("cells_visited", REACHER) >= 0.9
     yield q.data("contact_share", PUSH) >= 0.1
 
-@Claim("C18", "section 5.1", CHANGES,
-       statistic="log-likelihood, H = 1 minus the one-step model, against a tenth of the lead of H = 10")
+@Claim("C18", "section 5.1", CHANGES, readings=LIKELIHOODS,
+       statistic="log-likelihood, H = 1 minus the one-step model, against a tenth of the lead of H = 10",
+       why={FAILED: SPREAD})
 def c18(q: Query) -> Checks:
     """With segments of one step it is a one-step model."""
-    one, tenth = q.ablation(ONE_STEP), 0.1 * (q.ablation(TSM) - q.ablation(ONE_STEP))
-    yield from between(-tenth, q.ablation(Model("tsm+h1")) - one, tenth)
+    lead, apart = _lead(q), q.ablation(Model("tsm+h1")) - q.ablation(ONE_STEP)
+    yield (lead > 0).assumed()
+    yield from between(-0.1 * lead, apart, 0.1 * lead)
 
-@Claim("C19", "section 5.1", CHANGES,
+@Claim("C19", "section 5.1", CHANGES, readings=LIKELIHOODS,
        statistic="log-likelihood, H = 20 minus H = 10, against a tenth of what H = 10 has over H = 1")
 def c19(q: Query) -> Checks:
     """Segments longer than ten steps bring little."""
     tsm = q.ablation(TSM)
-    yield q.ablation(Model("tsm+h20")) - tsm < 0.1 * (tsm - q.ablation(Model("tsm+h1")))
+    lead = tsm - q.ablation(Model("tsm+h1"))
+    yield (lead > 0).assumed()
+    yield q.ablation(Model("tsm+h20")) - tsm < 0.1 * lead
 
 @Claim("C20", "section 5.1", DATA, statistic="autocorrelation of the joint velocities at 20 steps",
        why={FAILED: "Torques are smooth and joints have little friction, so that speeds last longer than a segment."})
@@ -108,7 +120,8 @@ def c20(q: Query) -> Checks:
     for task in TASKS:
         yield from between(-0.2, q.data("velocity_autocorrelation", task, lag=20), 0.2)
 
-@Claim("C21", "section 5.1", CHANGES, statistic="log-likelihood, 8 dimensions minus 4, and 16 minus 8")
+@Claim("C21", "section 5.1", CHANGES, readings=LIKELIHOODS,
+       statistic="log-likelihood, 8 dimensions minus 4, and 16 minus 8")
 def c21(q: Query) -> Checks:
     """Eight latent dimensions are a good trade-off."""
     yield q.ablation(TSM) - q.ablation(Model("tsm+z4")) >= 0
@@ -132,3 +145,8 @@ def c23(q: Query) -> Checks:
     for task in TASKS:
         yield q.ll(LSTM, task) - q.ll(ONE_STEP, task) > 0
         yield q.executed(TSM, task) - q.executed(LSTM, task) > 0
+
+
+def _lead(q: Query) -> Number:
+    """What TSM of the ablations is ahead of the one-step model by."""
+    return q.ablation(TSM) - q.ablation(ONE_STEP)
