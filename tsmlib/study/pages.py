@@ -72,10 +72,10 @@ def readme_results() -> str:
     narrow = re.sub(r":-+", "---", re.sub(" +", " ", table.markdown(pd.DataFrame(lines))))  # README is to be short
     return f"""{narrow}
 
-*Published rows of `{env}`; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
+*`{env}`, published; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
 {episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
-truths in 80 % intervals. {targets} targets, CEM over codes: share, 1 by the simulator, 0 for doing nothing; gap, mean
-size of predicted minus executed return.*
+truths in 80 % intervals of samples, or, without samples, of a fitted Gaussian. {targets} targets, CEM over codes: share,
+1 by the simulator, 0 for doing nothing; gap, mean size of predicted minus executed return.*
 {readme_loops(env)}"""
 
 
@@ -154,10 +154,15 @@ Of the {len(carrying)} that carry the paper, with its own model: {given}. So {sa
 
 
 def _leaning(verdict: evaluate.Verdict) -> str:
-    """Of an inconclusive verdict: how many of its checks have their whole interval on the wrong side of the margin."""
+    """Of an inconclusive verdict: how many of its checks have their whole interval on the wrong side of the margin, and
+    the readings by which it fails."""
+    if verdict.word != INCONCLUSIVE:
+        return ""
     against = sum(effect.against for effect in verdict.effects[""])
-    told = f", the intervals of {against} of its {len(verdict.effects[''])} checks lying against it"
-    return told * (verdict.word == INCONCLUSIVE and against > 0)
+    told = f"the intervals of {against} of its {len(verdict.effects[''])} checks lie against it" * (against > 0)
+    fails = ", ".join(dict.fromkeys(reading.split()[0] for reading in verdict.against))
+    said = "; ".join(filter(None, [told, f"by reading {fails} it fails" * bool(fails)]))
+    return f" ({said})" * bool(said)
 
 
 # Pages of docs/ ------------------------------------------------------------------------------------------------------
