@@ -261,7 +261,7 @@ def stamp(lines: pd.DataFrame) -> str:
     models = ", ".join(zoo.look(model).name for model in dict.fromkeys(several_of["model"]))
     return (
         f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed 0"
-        + f" (after {more} seeds {seeds} of {models}: small marks, the line joins means)" * bool(more)
+        + f"; small marks: the others of seeds {seeds} after {more}, of {models}" * bool(more)
         + f"; one network each; predictions: n = {EPISODES} fresh episodes, plans and "
         f"violations: n = {targets} validation targets"
     )
@@ -307,7 +307,7 @@ def main() -> None:
         curves = {
             title: {
                 zoo.method(str(model)): (group["seconds"].to_numpy(), group[name].to_numpy())
-                for model, group in lines.sort_values("seconds").groupby("model", sort=False)
+                for model, group in lines.sort_values(["seconds", "seed"]).groupby("model", sort=False)
             }
             for name, title in MEASURES.items()
         }

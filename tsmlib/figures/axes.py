@@ -121,15 +121,16 @@ def band(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def curve(
     ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, look: Props, shift: float = 0,
-    marks: Sequence[int] = (),
+    marks: Sequence[int] = (), factor: bool = False,
 ) -> None:  # fmt: skip
     """A line, or a single point above all lines, and its band; shift: a share of the way from one marker to the next,
-    so that those of lines part; marks: the places in ``at`` that markers stand at instead."""
-    every, low = max(1, len(at) // 5), ax.get_ylim()[0]
+    so that those of lines part; marks: the places in ``at`` that markers stand at instead; factor: ``half`` is one, by
+    which the band reaches up and down."""
+    every = max(1, len(at) // 5)
     ax.plot(at, mean, **look, zorder=3 if len(at) > 1 else 4, markevery=list(marks) or (int(shift * every), every))
-    if half.any():
-        lower = np.maximum(mean - half, low / 10) if ax.get_yscale() == "log" else mean - half
-        ax.fill_between(at, lower, mean + half, color=look["color"], alpha=0.11, lw=0, zorder=2)
+    if (half != factor).any():
+        ends = (mean / half, mean * half) if factor else (mean - half, mean + half)
+        ax.fill_between(at, *ends, color=look["color"], alpha=0.11, lw=0, zorder=2)
 
 
 def bars(ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, main: str) -> None:

@@ -77,8 +77,9 @@ def training_time(
     """Measures against the time that training took, one panel each, both axes logarithmic.
 
     curves: title -> method -> seconds (k,) and values (k,), positive; where a time was trained for more than once, the
-    line is that of the means, and each training a small mark. seconds: nominal, of one network, of which a model may
-    have several. ships: the budget in seconds by which a network that ships is trained, a dashed line.
+    line joins the first of them, such as one seed's, and each other is a small mark. seconds: nominal, of one network,
+    of which a model may have several. ships: the budget in seconds by which a network that ships is trained, a dashed
+    line.
     """
     figure, grid = panels(len(curves), 4, 1.6)
     look_of = axes.looks(curves)
@@ -87,10 +88,11 @@ def training_time(
         for method, (seconds, values) in lines.items():
             seconds = finite(f"seconds of {title}, {method.label}", seconds, "k")
             values = finite(f"values of {title}, {method.label}", values, f"{len(seconds)}")
-            times, which = np.unique(seconds, return_inverse=True)
-            means = np.bincount(which, values) / np.bincount(which)
-            ax.plot(seconds, values, **look_of[method] | {"ms": 2, "mew": 0, "ls": "", "alpha": 0.6}, zorder=3)
-            ax.plot(times, means, **look_of[method] | {"ms": 4}, zorder=4)
+            times, first = np.unique(seconds, return_index=True)
+            others = np.setdiff1d(np.arange(len(seconds)), first)
+            small = look_of[method] | {"ms": 2.6, "mew": 0, "ls": "", "alpha": 0.7}
+            ax.plot(seconds[others], values[others], **small, zorder=3)
+            ax.plot(times, values[first], **look_of[method] | {"ms": 4}, zorder=4)
             every, drawn = [*every, *seconds.tolist()], [*drawn, *values.tolist()]
         axes.log_axis(ax, min(drawn) / 1.15, max(drawn) * 1.15)
         ax.set(title=title, xscale="log", xlim=(min(every) / 1.3, max(every) * 1.3))
@@ -114,7 +116,8 @@ def against_horizon(
 ) -> Figure:  # fmt: skip
     """Scores at every step ahead, one panel each: mean over seeds, and a band for its 95 % t interval.
 
-    curves: title -> method -> (k, T); ylabel: one for all, or title -> text; log: the titles with a logarithmic axis;
+    curves: title -> method -> (k, T); ylabel: one for all, or title -> text; log: the titles with a logarithmic axis,
+    mean and interval being those of the logarithm;
     reference: title -> a value to draw a dashed line at, such as the nominal coverage; yours: as curves, drawn over
     them as hollow diamonds; measured: the steps ahead of which scores are known, for markers to stand only there, each
     line's at every third, so that they part. The axis is that of the medians over seeds: one seed that goes astray does
@@ -130,23 +133,26 @@ def against_horizon(
     figure, grid = panels(len(titles), columns, 1.55, width=width, head=0.1)
     banded = False
     for i, (title, ax) in enumerate(zip(titles, grid, strict=True)):
-        lines, mine = {method: axes.band(rows) for method, rows in checked[title].items()}, own.get(title, {})
+        mine, factor = own.get(title, {}), title in log
         every = {**mine, **checked[title]}.values()
         medians, means = (np.concatenate([of(rows, 0) for rows in every]) for of in (np.median, np.mean))
         _scale(ax, title, medians, means, reference.get(title), title in log)
+        lines = {
+            method: np.exp(axes.band(np.log(rows))) if factor else axes.band(rows)
+            for method, rows in checked[title].items()
+        }
         notes = []
         for j, (method, (mean, half)) in enumerate(lines.items()):
             steps = np.arange(1, len(mean) + 1)
             marks = [step - 1 for step in list(measured)[j % 3 :: 3] if step <= len(mean)]
-            axes.curve(ax, steps, mean, half, look_of[method], j / len(lines), marks)
+            axes.curve(ax, steps, mean, half, look_of[method], j / len(lines), marks, factor)
             notes += axes.outside(ax, steps, mean, method)
-            banded |= bool(half.any())
+            banded |= bool((half != factor).any())
         for method, rows in mine.items():
             some = np.linspace(0, rows.shape[1] - 1, 5).astype(int)
             notes += axes.diamonds(ax, "y", some + 1, rows.mean(0)[some], method)
         ax.set_xlim(0, max(rows.shape[1] for part in (checked[title], mine) for rows in part.values()) + 1)
-        alike = i % columns and ylabels[title] == ylabels[titles[i - 1]]
-        ax.set(title=axes.wrapped(title, width / columns - 0.2), ylabel="" if alike else ylabels[title])
+        ax.set(title=axes.wrapped(title, width / columns - 0.2), ylabel=ylabels[title])
         axes.foot(ax, "steps ahead" if i + columns >= len(titles) else "", notes, width / columns - 0.4)
     handles = [*axes.entries(look_of), *([entry("95 % interval over seeds", **BAND)] if banded else [])]
     handles += axes.yours_entry(*own.values())
@@ -227,7 +233,7 @@ def differences(
         mine = own.get(title, {})
         every = [*rows.values()] or [seeds.mean(keepdims=True) for seeds in mine.values()]
         ax.set_xlim(axes.limits(np.concatenate(every), axes.ends(every), also=[0.0]))
-        ax.locator_params(axis="x", nbins=5)
+        ax.locator_params(axis="x", nbins=5 if count < 4 else 4)
         notes = []
         for method, seeds in rows.items():
             (mean, half), look, y = interval(seeds), look_of[method], heights[method]

@@ -74,8 +74,8 @@ def readme_results() -> str:
 
 *`{env}`, published; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
 {episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
-truths in 80 % intervals of samples, or, without samples, of a fitted Gaussian. {targets} targets, CEM over codes: share,
-1 by the simulator, 0 for doing nothing; gap, mean size of predicted minus executed return.*
+truths in 80 % intervals of samples, or, without samples, of a fitted Gaussian. {targets} targets, CEM over codes:
+share, 1 by the simulator, 0 for doing nothing; gap, mean size of predicted minus executed return.*
 {readme_loops(env)}"""
 
 
@@ -242,8 +242,8 @@ of an environment got as many updates as fit into the same time on one idle core
 
 {scores}
 
-The mean of a log score is decided by the episodes that all samples of a model miss. `ll_own`, mean over 90 steps, of all
-episodes, and without the twentieth of them in which each model's own is lowest:
+The mean of a log score is decided by the episodes that all samples of a model miss. `ll_own`, mean over 90 steps, of
+all episodes, and without the twentieth of them in which each model's own is lowest:
 
 {prediction_results.own_density_table(predict, MUJOCO_IDS)}
 

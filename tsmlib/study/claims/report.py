@@ -6,12 +6,22 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
-from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, REPLICATED, UNTESTABLE, VERDICTS, Claim
+from tsmlib.study.claims.claim import (
+    DEFINITIONAL,
+    DEPENDENT,
+    FAILED,
+    INCONCLUSIVE,
+    REPLICATED,
+    UNTESTABLE,
+    VERDICTS,
+    Claim,
+)  # fmt: skip
 from tsmlib.study.claims.evaluate import Effect, Verdict, state_of
 from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
 
 DECIDED = (REPLICATED, DEPENDENT, FAILED)
+ANSWERS = {REPLICATED: "yes", FAILED: "no", INCONCLUSIVE: "open", UNTESTABLE: "not measured"}  # to our own questions
 
 
 def counts(verdicts: Sequence[Verdict]) -> str:
@@ -52,7 +62,7 @@ def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
     lines = [
         {
             "": verdict.claim.id, "question": f"{verdict.claim.statement} ({verdict.claim.place})",
-            "measured": f"`{effect.check.number.text}`", "verdict": f"**{verdict.word}**",
+            "measured": f"`{effect.check.number.text}`", "answer": f"**{ANSWERS[verdict.word]}**",
             "found": f"{effect.text}, asked {effect.check.asked}", "shown in": _links(verdict.claim, root),
         }
         for verdict in verdicts for effect in verdict.effects[""]
