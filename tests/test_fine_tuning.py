@@ -44,8 +44,8 @@ def model(word: str) -> Any:
 
 
 def tuned(net: Any, part: Any, **given: Any) -> tsm.Trajectories:
-    weak = data(WEAK)
-    tsm.fine_tune(net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), OPTIONS, part=part, **given)
+    weak, options = data(WEAK), replace(OPTIONS, past_len=net.past_len)
+    tsm.fine_tune(net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), options, part=part, **given)
     return weak
 
 
@@ -129,7 +129,7 @@ def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself(
 def test_a_model_that_only_gets_worse_is_left_as_it_was() -> None:
     net = model("onestep")
     before = digest(net.state_dict())
-    wild = replace(OPTIONS, lr=1.0, steps=4, validate_every=4)
+    wild = replace(OPTIONS, past_len=1, lr=1.0, steps=4, validate_every=4)
     tsm.fine_tune(net, net.loss, data(WEAK), data(WEAK), wild)
     assert digest(net.state_dict()) == before
 

@@ -528,6 +528,14 @@ def test_a_future_of_no_whole_number_of_segments_is_refused(new: Any, future_len
         train(new(), future_len=future_len)
 
 
+@pytest.mark.parametrize("past_len", [H - 1, H + 1])
+def test_windows_of_another_past_than_the_model_has_in_a_rollout_are_refused(past_len: int) -> None:
+    with pytest.raises(ValueError, match=rf"past_len is {past_len}, but TSM is given 4 .*past_len=model.past_len"):
+        train(new_tsm(), past_len=past_len)
+    with pytest.raises(ValueError, match=f"past_len is {past_len}, but ActionPrior is given 4"):
+        train(new_prior(), past_len=past_len)
+
+
 def test_episodes_shorter_than_the_windows_are_refused() -> None:
     with pytest.raises(TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"):
         train(new_tsm(), future_len=36)
