@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -115,6 +116,13 @@ def test_a_killed_loop_goes_on_with_the_same_bits(
     finished = learners()
     assert explored(*finished, folder=tmp_path).records == expected.records  # without any work
     assert bits(*finished) == bits(*whole)
+
+
+def test_what_is_no_number_comes_back_from_the_folder(tmp_path: Path) -> None:
+    endless = options(rounds=1, model=replace(options().model, clip=math.inf))
+    for _ in range(2):
+        found = explored(*learners(), options=endless, folder=tmp_path, measure=lambda *_: {"unknown": math.nan})
+        assert math.isnan(found.records[0]["unknown"])
 
 
 def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:

@@ -381,6 +381,16 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
             learn(other, **given, **settings)
 
 
+def test_what_is_measured_may_be_no_number_and_comes_back_from_a_checkpoint(tmp_path: Path) -> None:
+    def measure(_: Any) -> dict[str, Tensor]:
+        return {"distance": torch.tensor([math.nan]), "bound": torch.tensor([-math.inf])}
+
+    curves = [learn(policy("onestep"), measure=measure, checkpoint=tmp_path / "policy") for _ in range(2)]
+    for curve in curves:
+        assert np.isnan(curve.measured["distance"]).all()
+        assert curve.measured["bound"] == [[-math.inf]] * 3
+
+
 def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> None:
     def attempt(starts: Tensor, radius: float) -> None:
         options = LearningOptions(horizon=5, episodes=4, iterations=2, record_every=1)

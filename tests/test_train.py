@@ -389,6 +389,17 @@ def test_without_tensorboard_its_callback_names_what_to_install(monkeypatch: pyt
         TensorBoardCallback("board")
 
 
+def test_a_run_that_never_clips_goes_on_from_its_checkpoint_and_is_not_one_that_clips(tmp_path: Path) -> None:
+    whole, stopped, again = new_tsm(), new_tsm(), new_tsm()
+    train(whole, clip=math.inf)
+    with pytest.raises(Interrupted):
+        train(stopped, Faulty(stopped, 13, interrupt), clip=math.inf, checkpoint=tmp_path / "run")
+    train(again, clip=math.inf, checkpoint=tmp_path / "run")
+    assert same(weights(again), weights(whole))
+    with pytest.raises(files.StoreError, match="another run: clip is 'inf' in the file, expected 1.0"):
+        train(new_tsm(), checkpoint=tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [

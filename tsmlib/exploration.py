@@ -34,7 +34,7 @@ from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json, StoreError, writer_lock
+from tsmlib.storage.files import Json, StoreError, spelled, unspelled, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.fit import Loss, TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
@@ -157,7 +157,7 @@ def explore(
         if folder is not None:
             stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
-            place = None if folder is None else _Round(folder / f"round-{k:03d}", identity)
+            place = None if folder is None else _Round(folder / f"round-{k:03d}", spelled(identity))
             new, record = (
                 _collected(k, model, prior, train, tasks, options, seed, place)
                 if episodes is None else (episodes(k), dict[str, float]())
@@ -318,7 +318,7 @@ class _Round:
             shutil.rmtree(checkpoint)
 
     def _header(self, record: Mapping[str, float]) -> dict[str, Json]:
-        return {"identity": dict(self.identity), "record": dict(record)}
+        return {"identity": dict(self.identity), "record": spelled(dict(record))}
 
     def _record(self, path: Path) -> dict[str, float]:
         header = artifacts.read_header(path)
@@ -330,4 +330,4 @@ class _Round:
                 f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "
                 "or go back to those settings"
             )
-        return dict(cast(dict[str, float], header["record"]))
+        return dict(unspelled(header["record"]))
