@@ -52,6 +52,7 @@ class Trainable(DynamicsModel, Protocol):
 Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
 Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
 Episodes = Callable[[int], Trajectories | None]  # round -> episodes that no plan made, or none
+DISCARDED = "discarded"
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,9 @@ class Exploration:
 
     records: ``round``; ``env_steps`` executed up to and with it; ``executed_return`` and, by the task's measures,
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
-    of the ``gap``; ``lost``, episodes in which the simulation became unstable; after training the losses on held-out
-    data, ``validation`` and ``prior_validation``, and what ``measure`` gave.
+    of the ``gap``; ``lost``, episodes in which the simulation became unstable, whereupon the others begin anew
+    (``env_steps`` counts what all had executed until then); after training the losses on held-out data, ``validation``
+    and ``prior_validation``, and what ``measure`` gave.
     """
 
     train: Trajectories
@@ -163,7 +165,7 @@ def explore(
                 if episodes is None else (episodes(k), dict[str, float]())
             )  # fmt: skip
             found.episodes.append(new)
-            before = found.records[-1]["env_steps"] if found.records else 0
+            before = (found.records[-1]["env_steps"] if found.records else 0) + record.pop(DISCARDED, 0)
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))
                 found.held_out = found.held_out.joined(new.take(slice(n)))
@@ -181,7 +183,10 @@ def _collected(
     k: int, model: Trainable, prior: ActionPrior | None, like: Trajectories, tasks: Tasks,
     options: ExplorationOptions, seed: int, place: _Round | None,
 ) -> tuple[Trajectories, dict[str, float]]:  # fmt: skip
-    """The episodes of round k and what is said of them, from the folder if they are there."""
+    """The episodes of round k and what is said of them, from the folder if they are there.
+
+    DISCARDED, said beside what a record has: steps of attempts that became unstable.
+    """
     if place is not None and (stored := place.episodes()) is not None:
         return stored
     task = tasks(k)
@@ -200,7 +205,7 @@ def _collected(
     if options.noise:
         planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(-1 - draw))  # of no search
     judge: Judge = partial(model_predictor, samples=options.samples) if options.bonus else model_predictor
-    lost = 0
+    lost, discarded = 0, 0
     while True:
         try:
             trial = mpc(aim, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
@@ -208,8 +213,9 @@ def _collected(
         except SimulationUnstable as fault:
             if len(aim) <= 2:
                 raise
+            discarded += (fault.step + 1) * len(aim)
             aim, lost = aim.take([i for i in range(len(aim)) if i != fault.episode]), lost + 1
-    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost}
+    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost, DISCARDED: discarded}
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
     episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
     if place is not None:
