@@ -203,6 +203,24 @@ def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> 
     assert results.steps_table(tables.frame([]), free) == results.steps_table(rows, tables.frame([])) == ""
 
 
+def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round() -> None:
+    loop = dict(env=PUSH, model="rtsm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=4)
+    ends = {0: (500, 600, 700), 1: (500, 580, 680)}  # of each round; seed 1 lost an episode in the first
+    rows = tables.frame([
+        loop | dict(seed=seed, iteration=k, env_steps=steps, metric="return_true", value=-20 + 5 * k - 10 * seed)
+        for seed, of_round in ends.items() for k, steps in enumerate(of_round)
+    ])  # fmt: skip
+    ((at, values),) = results.round_panels(rows, ["executed return"], PUSH)["executed return"].values()
+    assert at.tolist() == [500, 590, 690]
+    assert values.tolist() == [[-20, -15, -10], [-30, -25, -20]]
+    lines = [line for line in str(results.rounds_table(rows, PUSH)).splitlines() if "`rtsm`" in line]
+    assert [line.count(steps) for line, steps in zip(lines, ("500", "590", "690"), strict=True)] == [1, 1, 1]
+    sac = dict(env=PUSH, metric="return_true", model="sac", planner="policy", execution="policy", seed=0)
+    free = tables.frame([sac | dict(env_steps=9000, value=-20)])
+    cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
+    assert cells[4:8] == ["590", "6.6%", "in round 1", "-15.00"]
+
+
 @pytest.mark.parametrize(("options", "said"), [
     (["rounds", "--envs", "tsm/Reacher-v0", "--models", "rtsm"], "no rounds are measured on 'tsm/Reacher-v0'"),
     (["rounds", "--envs", PUSH, "--models", "ensemble+mse"], "'ensemble+mse' does not explore tsm/ReacherPush-v1"),

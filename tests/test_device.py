@@ -19,6 +19,7 @@ from torch import Tensor
 from tsmlib import study
 from tsmlib.__main__ import main
 from tsmlib.evaluation import prediction
+from tsmlib.evaluation.actions import rebuilt, reconstruct, sample_actions
 from tsmlib.models.base import rollout
 from tsmlib.planning.base import Planner, SearchSpace
 from tsmlib.planning.planners import adam, cem
@@ -28,7 +29,7 @@ from tsmlib.policies.learning import LearningOptions, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
 from tsmlib.study import runs, zoo
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.training.fit import TrainingOptions, fit, fixed_windows
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
 T = TypeVar("T")
@@ -198,9 +199,9 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
 
     def learned(place: str) -> tuple[Any, Tensor]:
         if through == "codes":
-            policy: Any = SegmentPolicy(6, new_prior().float(), channels=8, copies=2)
+            policy: Any = SegmentPolicy(6, new_prior().float(), angles=(0, 1), channels=8, copies=2)
         else:
-            policy = OneStepPolicy(6, DU, copies=2)
+            policy = OneStepPolicy(6, DU, angles=(0, 1), copies=2)
 
         def draw(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
             return starts[torch.randint(8, (n,), generator=generator)], torch.randn(n, 2, generator=generator)
@@ -214,6 +215,23 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
     assert agree(act, expected, device)
     for a, b in zip(there.cpu().parameters(), here.parameters(), strict=True):
         assert agree(a, b, device)
+
+
+def test_a_model_and_a_prior_there_are_scored_as_they_are_here(device: str) -> None:
+    case = MODELS["tsm"]
+    test, validation = episodes(case, 4, seed=1), episodes(case, 4, seed=2)
+    actions, window = torch.from_numpy(test.actions[:, :20]), fixed_windows(test, 10, 10)
+
+    def scored(place: str) -> dict[str, Tensor]:
+        model, prior, generator = new_model().to(place), new_prior().float().to(place), torch.Generator().manual_seed(0)
+        return prediction.score(model, model.features, test, validation, samples=2, horizon=10).values | {
+            "sampled": sample_actions(prior, 2, 20, generator), "reconstructed": reconstruct(prior, actions),
+            "rebuilt": torch.tensor(rebuilt(prior, window)),
+        }  # fmt: skip
+
+    there, here = on(device, scored), on(PROCESSOR, scored)
+    for name, expected in here.items():
+        assert agree(there[name], expected, device), name
 
 
 def test_what_study_makes_there_is_what_it_makes_here(

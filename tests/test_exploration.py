@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -117,6 +118,13 @@ def test_a_killed_loop_goes_on_with_the_same_bits(
     assert bits(*finished) == bits(*whole)
 
 
+def test_what_is_no_number_comes_back_from_the_folder(tmp_path: Path) -> None:
+    endless = options(rounds=1, model=replace(options().model, clip=math.inf))
+    for _ in range(2):
+        found = explored(*learners(), options=endless, folder=tmp_path, measure=lambda *_: {"unknown": math.nan})
+        assert math.isnan(found.records[0]["unknown"])
+
+
 def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
     explored(*learners(), options=options(rounds=1), folder=tmp_path)
     with pytest.raises(StoreError, match=r"is of another exploration: .*seed.*Delete .* to start anew"):
@@ -176,8 +184,11 @@ def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores(
     def swings(k: int) -> tsm.Task:
         return tsm.Task.from_env("Pendulum-v1", n=3, horizon=HORIZON, reward=upright, seed=10 * k)
 
+    once = replace(options().model, past_len=model.past_len)
     small, found = (
-        tsm.explore(copy.deepcopy(model), None, train, train, swings, options(prior=None, rounds=1, rms=rms))
+        tsm.explore(
+            copy.deepcopy(model), None, train, train, swings, options(model=once, prior=None, rounds=1, rms=rms)
+        )
         for rms in (0.01, 0.6)
     )
     sizes = [float(np.abs(each.episodes[0].actions).mean()) for each in (small, found) if each.episodes[0]]
@@ -206,7 +217,9 @@ def test_noise_and_bonus_lead_elsewhere(changes: Mapping[str, float]) -> None:
     assert executed(**changes) != executed()
 
 
-def test_an_unstable_episode_is_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_until_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole, asked = exploration.mpc, []
 
     def unstable(task: tsm.Task, *given: Any, **named: Any) -> tsm.Trial:
@@ -216,9 +229,13 @@ def test_an_unstable_episode_is_left_out_and_counted(monkeypatch: pytest.MonkeyP
         return whole(task, *given, **named)
 
     monkeypatch.setattr(exploration, "mpc", unstable)
-    found = explored(*learners(), options=options(rounds=1))
+    found = explored(*learners(), options=options(rounds=1), folder=tmp_path)
     assert found.records[0]["lost"] == 1
+    assert found.records[0]["env_steps"] == EPISODES * 8 + (EPISODES - 1) * HORIZON  # step 7 is the eighth
     np.testing.assert_array_equal(asked[1], asked[0][[0, 2]])
+    (tmp_path / "round-001" / "model.safetensors").unlink()  # as if killed before
+    assert explored(*learners(), options=options(rounds=1), folder=tmp_path).records == found.records
+    assert len(asked) == 2
 
 
 def test_what_disturbs_a_plan_is_no_candidate_of_its_search(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -17,6 +18,7 @@ from tsmlib.models.codes import learned_codes
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import StoreError
+from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment, initial_past
 
 ARM, WEAK = "tsm/Reacher-v0", "tsm/Reacher-gain0.7-v0"
@@ -44,8 +46,8 @@ def model(word: str) -> Any:
 
 
 def tuned(net: Any, part: Any, **given: Any) -> tsm.Trajectories:
-    weak = data(WEAK)
-    tsm.fine_tune(net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), OPTIONS, part=part, **given)
+    weak, options = data(WEAK), replace(OPTIONS, past_len=net.past_len)
+    tsm.fine_tune(net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), options, part=part, **given)
     return weak
 
 
@@ -129,9 +131,25 @@ def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself(
 def test_a_model_that_only_gets_worse_is_left_as_it_was() -> None:
     net = model("onestep")
     before = digest(net.state_dict())
-    wild = replace(OPTIONS, lr=1.0, steps=4, validate_every=4)
+    wild = replace(OPTIONS, past_len=1, lr=1.0, steps=4, validate_every=4)
     tsm.fine_tune(net, net.loss, data(WEAK), data(WEAK), wild)
     assert digest(net.state_dict()) == before
+
+
+def test_a_fine_tuning_that_breaks_off_leaves_no_weights_worse_than_the_first() -> None:
+    net, updates = model("rtsm"), 0
+    before = digest(net.state_dict())
+
+    def breaks_off(window: tsm.Window, generator: torch.Generator) -> torch.Tensor:
+        nonlocal updates
+        updates += (learning := torch.is_grad_enabled())
+        return net.loss(window, generator) * (math.nan if learning and updates == 6 else 1)
+
+    wild = replace(OPTIONS, lr=1.0)
+    with pytest.raises(TrainingStopped, match="weights of step [24] are kept") as stopped:
+        tsm.fine_tune(net, breaks_off, data(WEAK), data(WEAK), wild)
+    assert digest(net.state_dict()) == before
+    assert "the weights that it began with" in stopped.value.__notes__[0]
 
 
 def test_a_stopped_fine_tuning_goes_on_with_the_same_bits_and_not_as_another(tmp_path: Path) -> None:

@@ -338,6 +338,21 @@ def test_what_is_learned_is_the_policy_alone_and_not_the_model_or_the_prior() ->
 
 
 @KINDS
+def test_a_policy_sees_states_as_its_model_does_unless_it_was_fitted_before(kind: str) -> None:
+    world, once = model("onestep"), LearningOptions(horizon=2, episodes=2, iterations=1)
+    world.features.mean.fill_(0.3)
+    starts = episodes_from(torch.zeros(1, DX, dtype=torch.float64))
+    actor, fitted, before = policy(kind, DX), policy(kind, DX), normal(5, 8, DX)
+    statistics = weights(fitted.features.fit(before))
+    for each in (actor, fitted):
+        learn_policy(each, world, arrive, starts, once)
+    assert same(weights(actor.features), weights(world.features))
+    assert same(weights(fitted.features), statistics)
+    with pytest.warns(UserWarning, match=r"angles \[0\], the model \[\], .* raw units. Make it with angles=\(\)"):
+        learn_policy(policy(kind, DX, angles=(0,)), world, arrive, starts, once)
+
+
+@KINDS
 def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_path: Path) -> None:
     def stop_late(actor: Any) -> dict[str, Tensor]:
         asked.append(weights(actor))
@@ -364,6 +379,16 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
     for other, given, said in others:
         with pytest.raises(files.StoreError, match=f"another run: {said}. Delete"):
             learn(other, **given, **settings)
+
+
+def test_what_is_measured_may_be_no_number_and_comes_back_from_a_checkpoint(tmp_path: Path) -> None:
+    def measure(_: Any) -> dict[str, Tensor]:
+        return {"distance": torch.tensor([math.nan]), "bound": torch.tensor([-math.inf])}
+
+    curves = [learn(policy("onestep"), measure=measure, checkpoint=tmp_path / "policy") for _ in range(2)]
+    for curve in curves:
+        assert np.isnan(curve.measured["distance"]).all()
+        assert curve.measured["bound"] == [[-math.inf]] * 3
 
 
 def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> None:

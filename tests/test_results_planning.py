@@ -161,6 +161,30 @@ def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_and_over_seeds_as
     assert line["cost of tsm minus this"] == "-1.00"
 
 
+def test_targets_that_a_method_lacks_take_no_seed_away() -> None:
+    given = dict(env=PUSH, search_space="latent", planner="cem", execution="open loop", metric="return_true")
+    rows = [dict(given, model=model, target=i, seed=seed, value=-cost - i)
+            for model, cost, n in (("tsm", 1.0, 4), ("lstm", 2.0, 3)) for seed in (0, 1) for i in range(n)]  # fmt: skip
+    _, line = planning_results.paired_table(tables.frame(rows), PUSH, "tsm").to_dict("records")
+    assert (line["in each seed"], line["n"]) == ("-1.00, -1.00", 3)
+    apart = [row for row in rows if (row["model"], row["seed"]) not in {("tsm", 0), ("lstm", 1)}]  # no seed of both
+    _, line = planning_results.paired_table(tables.frame(apart), PUSH, "tsm").to_dict("records")
+    assert line["cost of tsm minus this"] == ""
+
+
+def test_open_and_closed_loop_are_compared_in_the_seeds_that_were_executed_both_ways() -> None:
+    given = dict(env=PUSH, search_space="latent", planner="cem", metric="final_distance", n=1, target=0)
+    seeds = {("tsm", "open loop"): (0, 1), ("tsm", "closed loop"): (1, 2), ("lstm", "closed loop"): (0, 1)}
+    rows = tables.frame([dict(given, model=model, execution=way, seed=seed, value=seed + (way == "open loop"))
+                         for (model, way), own in seeds.items() for seed in own])  # fmt: skip
+    drawn = planning_results.final_distances(rows, PUSH)
+    assert {way: values.tolist() for way, values in drawn[TSM].items()} == {"open": [2], "closed": [1]}
+    assert {way: values.tolist() for way, values in drawn[LSTM].items()} == {"closed": [0, 1]}  # of no open loop
+    _, ours, theirs = cells(planning_results.loops_table(rows))
+    assert ours[-3:] == ["1", "2.000", "1.000"]
+    assert theirs[-3:] == ["2", "", "0.500"]
+
+
 def test_distances_that_are_drawn_are_those_of_every_seed() -> None:
     given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", metric="final_distance")
     rows = [dict(given, execution=way, target=i, seed=seed, value=i + seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gzip
 import json
+import math
 import os
 import pickle
 import random
@@ -320,6 +321,19 @@ def test_a_model_of_another_class_or_shape_is_refused(tmp_path: Path) -> None:
     artifacts.save(path, tensors, kind="model", header={**header, "config": {"colour": 4}})
     with pytest.raises(StoreError, match="does not fit the present Line"):
         artifacts.load_model(path, Line)
+
+
+def test_numbers_that_json_does_not_have_are_spelled_and_read_again() -> None:
+    given: Any = {
+        "clip": math.inf,
+        "curve": [[1.5, -math.inf], [np.float32(np.nan)]],
+        "name": "info",
+        "n": 3,
+        "none": None,
+    }
+    again = files.unspelled(files.loads(json.dumps(files.spelled(given), allow_nan=False)))
+    assert again.keys() == given.keys()
+    assert str(again) == str({**given, "curve": [[1.5, -math.inf], [math.nan]]})
 
 
 def test_a_header_that_is_not_json_is_refused(saved: Path) -> None:

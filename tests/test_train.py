@@ -389,6 +389,17 @@ def test_without_tensorboard_its_callback_names_what_to_install(monkeypatch: pyt
         TensorBoardCallback("board")
 
 
+def test_a_run_that_never_clips_goes_on_from_its_checkpoint_and_is_not_one_that_clips(tmp_path: Path) -> None:
+    whole, stopped, again = new_tsm(), new_tsm(), new_tsm()
+    train(whole, clip=math.inf)
+    with pytest.raises(Interrupted):
+        train(stopped, Faulty(stopped, 13, interrupt), clip=math.inf, checkpoint=tmp_path / "run")
+    train(again, clip=math.inf, checkpoint=tmp_path / "run")
+    assert same(weights(again), weights(whole))
+    with pytest.raises(files.StoreError, match="another run: clip is 'inf' in the file, expected 1.0"):
+        train(new_tsm(), checkpoint=tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [
@@ -526,6 +537,14 @@ def test_a_future_of_no_whole_number_of_segments_is_refused(new: Any, future_len
         ValueError, match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or"
     ):
         train(new(), future_len=future_len)
+
+
+@pytest.mark.parametrize("past_len", [H - 1, H + 1])
+def test_windows_of_another_past_than_the_model_has_in_a_rollout_are_refused(past_len: int) -> None:
+    with pytest.raises(ValueError, match=rf"past_len is {past_len}, but TSM is given 4 .*past_len=model.past_len"):
+        train(new_tsm(), past_len=past_len)
+    with pytest.raises(ValueError, match=f"past_len is {past_len}, but ActionPrior is given 4"):
+        train(new_prior(), past_len=past_len)
 
 
 def test_episodes_shorter_than_the_windows_are_refused() -> None:

@@ -18,6 +18,7 @@ from torch import nn
 from tsmlib.models.codes import CodeLayers, learned_codes
 from tsmlib.models.features import Features
 from tsmlib.training.callbacks import Callback
+from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import Loss, TrainingHistory, TrainingOptions, fit, fixed_windows, validate
 from tsmlib.trajectory import Trajectories
 
@@ -49,12 +50,33 @@ def fine_tune(
     """Train ``part`` of a trained ``model`` on episodes of a changed robot; everything else as in ``fit``.
 
     It begins with the model's weights and keeps the statistics of its features, for which they were made. The weights
-    with the best validation loss are left in ``model``, those it began with among them; no part stays frozen.
-    ValueError for a model that was never trained, has other states or angles than the data, or lacks the part.
+    with the best validation loss are left in ``model``, those it began with among them, also where TrainingStopped is
+    raised; no part stays frozen. ValueError for a model that was never trained, has other states or angles than the
+    data, or lacks the part.
     """
     _require_trained(model, train)
     first = {name: weight.detach().clone() for name, weight in model.state_dict().items()}
-    before = validate(loss, fixed_windows(validation, options.past_len, options.future_len), seed)
+    held_out = fixed_windows(validation, options.past_len, options.future_len)
+    before = validate(loss, held_out, seed)
+    try:
+        with _only(model, part):
+            history = fit(
+                model, loss, train, validation, options,
+                seed=seed, device=device, checkpoint=checkpoint, progress=progress, callback=callback,
+            )  # fmt: skip
+    except TrainingStopped as stopped:
+        if not validate(loss, held_out, seed) < before:
+            model.load_state_dict(first)
+            stopped.add_note("These were no better than the weights that it began with, which the model has again.")
+        raise
+    if min(history.validation) >= before:
+        model.load_state_dict(first)
+    return history
+
+
+@contextmanager
+def _only(model: nn.Module, part: Part) -> Iterator[None]:
+    """The model with gradients for ``part`` alone."""
     with ExitStack() as stack:
         if part == "all":
             pass
@@ -68,13 +90,7 @@ def fine_tune(
             raise ValueError(
                 f"part is {part!r:.80}; of {type(model).__name__} one can train {', '.join(map(repr, ['all', *has]))}"
             )
-        history = fit(
-            model, loss, train, validation, options,
-            seed=seed, device=device, checkpoint=checkpoint, progress=progress, callback=callback,
-        )  # fmt: skip
-    if min(history.validation) >= before:
-        model.load_state_dict(first)
-    return history
+        yield
 
 
 @contextmanager

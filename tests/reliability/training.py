@@ -497,7 +497,9 @@ def memory(trials: int) -> Outcome:
 
     with folder() as place:
         open_before = len(os.listdir("/proc/self/fd"))
-        options = TrainingOptions(**{**SIZES, "steps": trials, "validate_every": max(1, trials // 20)})
+        options = TrainingOptions(
+            **{**SIZES, "past_len": model.past_len, "steps": trials, "validate_every": max(1, trials // 20)}
+        )
         fit(model, loss, data, HELD_OUT, options, checkpoint=place / "run")
         steps, megabytes = np.array(samples).T
         slope = 1000 * np.polyfit(steps, megabytes, 1)[0]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tsmlib.envs.geometry import DT
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.layers import on_device_of
 from tsmlib.trajectory import Window
 
 TRAITS = ("change", "centroid", "autocorrelation")  # of claim C51
@@ -40,17 +41,18 @@ def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def sample_actions(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
-    """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0)."""
-    z = torch.randn(n, -(-horizon // prior.segment_len), prior.latent_dim, generator=generator)
-    return prior.plan(_rest(prior, n), z)[:, :horizon]
+    """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0); on the generator's device."""
+    z = torch.randn(n, -(-horizon // prior.segment_len), prior.latent_dim, generator=generator, device=generator.device)
+    return prior.plan(_rest(prior, n), *on_device_of(prior, z))[:, :horizon].to(z.device)
 
 
 @torch.no_grad()
 def reconstruct(prior: ActionPrior, actions: Tensor) -> Tensor:
     """Torques (B, T, du) encoded segment by segment and decoded from the mean codes, T a multiple of H."""
+    home, (actions,) = actions.device, on_device_of(prior, actions)
     segments = actions.unflatten(1, (-1, prior.segment_len))  # (B, K, H, du)
     codes, _ = prior.encode(segments.flatten(0, 1))
-    return prior.plan(_rest(prior, len(actions)), codes.unflatten(0, segments.shape[:2]))
+    return prior.plan(_rest(prior, len(actions)), codes.unflatten(0, segments.shape[:2])).to(home)
 
 
 @torch.no_grad()
@@ -59,7 +61,7 @@ def rebuilt(prior: ActionPrior, window: Window) -> tuple[float, float]:
 
     Root mean squares, over the deviation of the training torques. window: its future is one segment of H steps.
     """
-    past, true = window.past.actions, window.future.actions
+    past, true = on_device_of(prior, window.past.actions, window.future.actions)
     z, _ = prior.encode(true)
     off = (((prior.decode(past, codes) - true) / prior.std).square().mean().sqrt() for codes in (z, z.roll(7, 0)))
     return float(next(off)), float(next(off))

@@ -145,8 +145,12 @@ def sample_states(
 
 
 def scored(features: Features, states: Tensor) -> Tensor:
-    """(..., dx) -> (..., D), the space of the scores. What is not finite becomes the worst that can be counted."""
-    return features(states)[..., features.scored].nan_to_num(nan=WORST).clamp(-WORST, WORST)
+    """(..., dx) -> (..., D), the space of the scores. What is not finite becomes the worst that can be counted.
+
+    ``features`` may be on another device; what is returned is where ``states`` are.
+    """
+    found = features(states.to(features.mean.device))[..., features.scored].to(states.device)
+    return found.nan_to_num(nan=WORST).clamp(-WORST, WORST)
 
 
 def cut(steps: Tensor, starts: Sequence[int], horizon: int) -> Tensor:

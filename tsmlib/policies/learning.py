@@ -13,6 +13,7 @@ Letters in shapes: as in ``networks``; n episodes, T horizon.
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -23,6 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.models.base import Model, as_dynamics, stepper
+from tsmlib.models.features import Features
 from tsmlib.models.layers import on_device_of
 from tsmlib.policies.networks import Policy
 from tsmlib.rewards import Reward, rewarded
@@ -126,13 +128,15 @@ def learn_policy(
     reward: target (R, dg) -> reward of states (R, T, dx) and actions, such as ``rewards.reach``. draw: starts and
     targets of episodes. Episodes and noise are functions of (seed, iteration), so a run resumed from ``checkpoint``
     continues as if it had not stopped; a checkpoint of other starts or targets, by ``summary``, is refused. The model
-    is left as it was.
+    is left as it was. A policy whose features have no statistics yet takes those of the model's features first, if it
+    has any, and keeps them.
 
-    Raises, with the policy unchanged, ValueError for a reward of the wrong shape or without a gradient and
+    Raises, with the policy's weights unchanged, ValueError for a reward of the wrong shape or without a gradient and
     FloatingPointError for one that is not finite where states are; TrainingStopped, with the weights of the last record
     in ``policy``, where states or gradients are not finite; StoreError for a checkpoint of another run or in use.
     """
     o = options or LearningOptions()
+    _take_statistics(policy, model)
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(trained, lr=o.lr)
     identity = asdict(o) | dict(
@@ -263,6 +267,21 @@ def _clip(parameters: Sequence[Tensor], norm: float) -> Tensor:
         for g in gradients:
             g *= (norm / found.clamp(min=norm)).reshape(-1, *[1] * (g.ndim - 1))
     return found
+
+
+def _take_statistics(policy: Policy, model: Model) -> None:
+    """Those of the model's features, where the policy's have none."""
+    own, known = policy.features, getattr(model, "features", None)
+    if own.fitted or not isinstance(known, Features) or own.step_std.shape != known.step_std.shape:
+        return
+    if own.angles == known.angles:
+        own.load_state_dict(known.state_dict())
+    else:
+        warnings.warn(
+            f"the policy has the angles {own.angles}, the model {known.angles}, so that it learns on states in raw "
+            f"units. Make it with angles={tuple(known.angles)}, or call policy.features.fit(torch.from_numpy(states))",
+            stacklevel=4,
+        )
 
 
 def _digest(model: Model) -> str:

@@ -30,6 +30,7 @@ class Policy(Configured):
 
     state_dim, target_dim: dx, dg. angles: state dimensions in radians. target_std: metres, what a target counts in.
     past_len: steps of past that it reads. output_dim: size of what is noisy, the action or the code of a segment.
+    ``features`` standardise its states once they have statistics, by ``fit`` or from the model that it learns in.
     """
 
     past_len: int

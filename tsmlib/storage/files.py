@@ -5,6 +5,7 @@ import glob
 import gzip
 import io
 import json
+import math
 import os
 import socket
 import sys
@@ -13,7 +14,7 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import psutil
@@ -179,6 +180,24 @@ def loads(text: str | bytes) -> Json:
         raise ValueError(f"{word} is not a JSON value")
 
     return json.loads(text, parse_constant=refuse)
+
+
+def spelled(value: Json) -> Any:
+    """JSON with the numbers that it does not have as texts: "nan", "inf", "-inf"."""
+    if isinstance(value, float | np.floating):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {name: spelled(item) for name, item in value.items()}
+    return [spelled(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def unspelled(value: Json) -> Any:
+    """What ``spelled`` was given; tuples have become lists."""
+    if isinstance(value, Mapping):
+        return {name: unspelled(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [unspelled(item) for item in value]
+    return float(value) if isinstance(value, str) and value in ("nan", "inf", "-inf") else value
 
 
 def dumps(path: Path, value: Json, indent: int | None = None) -> str:

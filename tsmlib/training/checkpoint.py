@@ -2,7 +2,7 @@
 
 A generation is one artefact, ``<step>.safetensors``: arrays, what they are and the checksum over all of it appear with
 one rename. The last two are kept. One that is cut, damaged or not what its name says is refused, and the one before it
-is used.
+is used. Numbers that JSON does not have, such as a clip that is infinite, are texts in it.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json, StoreError, writer_lock
+from tsmlib.storage.files import Json, StoreError, spelled, unspelled, writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.training.precision import native_bf16
 
@@ -72,7 +72,8 @@ class TrainingState(Generic[C]):
         self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
         configuration = model.config() if isinstance(model, Configured) else {}
         began = artifacts.digest(model.state_dict())[:16]
-        self.identity, self.folder = {**identity, "configuration": configuration, "began with": began}, folder
+        self.identity: dict[str, Json] = spelled({**identity, "configuration": configuration, "began with": began})
+        self.folder = folder
         self.step, self.seconds = 0, 0.0
         self.keep(math.inf)
 
@@ -107,7 +108,7 @@ class TrainingState(Generic[C]):
             identity=self.identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
             made_by=self._made_by(), best_step=self.best_step, best_loss=self.best_loss,
         )  # fmt: skip
-        save_generation(self.folder, self.step, tensors, header=header)
+        save_generation(self.folder, self.step, tensors, header=spelled(header))
 
     def load(self) -> None:
         """Go on from the newest whole generation, if there is one.
@@ -135,7 +136,7 @@ class TrainingState(Generic[C]):
                 for name, tensor in groups[group].items():
                     index, _, moment = name.partition(".")
                     held.setdefault(int(index), {})[moment] = tensor
-            curve, made_by = type(self.curve)(**header["curve"]), {"device": "cpu", **header["made_by"]}
+            curve, made_by = type(self.curve)(**unspelled(header["curve"])), {"device": "cpu", **header["made_by"]}
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:

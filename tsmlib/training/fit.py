@@ -37,10 +37,11 @@ class Statistics(Protocol):
 class TrainingOptions:
     """Windows and schedule of a training.
 
-    past_len, future_len: steps of a window. muon: peak learning rate of Muon for the weight matrices (``matrices``),
-    beside Adam for all else; 0: Adam for everything. weight_decay: of the matrices, decoupled, per unit of their
-    learning rate. span: the part of one cosine schedule, from 0 to 1, that this training covers, where several follow
-    each other; warm-up where it begins at 0. patience: validations without improvement before stopping early; 0: never.
+    past_len, future_len: steps of a window; past_len is the model's. muon: peak learning rate of Muon for the weight
+    matrices (``matrices``), beside Adam for all else; 0: Adam for everything. weight_decay: of the matrices, decoupled,
+    per unit of their learning rate. span: the part of one cosine schedule, from 0 to 1, that this training covers,
+    where several follow each other; warm-up where it begins at 0. patience: validations without improvement before
+    stopping early; 0: never.
     """
 
     past_len: int
@@ -106,8 +107,13 @@ def fit(
     as if it had not stopped. Raises TrainingStopped at the first loss or gradient that is not finite, with the best
     weights so far in ``model``, and StoreError for a checkpoint of another run, or one that another process writes.
     A model of states whose features have no statistics yet takes those of ``train`` first. Parameters with
-    ``requires_grad`` False stay as they are.
+    ``requires_grad`` False stay as they are. ValueError where the windows have another past than ``model.past_len``.
     """
+    if (needed := getattr(model, "past_len", options.past_len)) != options.past_len:
+        raise ValueError(
+            f"past_len is {options.past_len}, but {type(model).__name__} is given {needed} steps of past in a rollout; "
+            "take TrainingOptions(past_len=model.past_len, ...)"
+        )
     features = getattr(model, "features", None)
     if isinstance(features, Statistics) and not features.fitted:
         features.fit(torch.from_numpy(train.states), train.lengths)

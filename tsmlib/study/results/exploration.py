@@ -141,16 +141,18 @@ def round_panels(
 ) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
     """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
-    Without those that take no steps.
+    Seeds are compared round by round: lost episodes leave one with fewer steps, and steps are means over seeds. Without
+    those that take no steps.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM])
     for metric, title in ROUNDS[env].items():
         for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
             if title in titles:
-                wide = own.pivot(index="seed", columns="env_steps", values="value").dropna()
-                steps, values = wide.columns.to_numpy(float), wide.to_numpy(float)
-                found.setdefault(title, {})[zoo.method(word, variant=data)] = steps, values
+                wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
+                steps = own[own["seed"].isin(wide.index)].groupby("iteration")["env_steps"].mean()
+                at, values = steps[wide.columns].to_numpy(float), wide.to_numpy(float)
+                found.setdefault(title, {})[zoo.method(word, variant=data)] = at, values
     return found
 
 
@@ -182,7 +184,8 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
         {key for key, _ in table.groups(closed, keys)}, key=lambda of: (words.index(of[0]), DATA.index(of[1]), of[2])
     ):
         own = table.select(closed, model=word, configuration=data, iteration=k)
-        line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{int(own['env_steps'].max()):,}"}
+        steps = own.groupby("seed")["env_steps"].max().mean()
+        line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{steps:,.0f}"}
         for metric, title in ROUNDS[env].items():
             values = table.select(own, metric=metric)["value"]
             line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
@@ -229,22 +232,22 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
     for policy, theirs in table.groups(table.select(learned, model=MODEL_FREE), "model"):
         curve = theirs.groupby("env_steps")["value"].mean()
         for word, ours in table.groups(rounds, "model"):
-            own = ours.groupby("env_steps")["value"].mean()
-            taken, end = _steps_to(own, curve.iloc[-1]), float(curve.index[-1])
-            k = 0 if taken is None else int(ours[ours["env_steps"] == taken]["iteration"].min())
+            own = ours.groupby("iteration")[["env_steps", "value"]].mean()
+            k, end = _first(own["value"], curve.iloc[-1]), float(curve.index[-1])
+            taken = None if k is None else float(own["env_steps"][k])
             lines.append({
                 "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{curve.iloc[-1]:.2f}",
                 "rounds of": f"`{word}`", "steps to that return": "-" if taken is None else f"{taken:,.0f}",
                 "share": "-" if taken is None else f"{taken / end:.1%}",
-                "when": "never" if taken is None else f"in round {k}" if k else "before the first round",
-                "return after the last": f"{own.iloc[-1]:.2f}",
+                "when": "never" if k is None else f"in round {k:.0f}" if k else "before the first round",
+                "return after the last": f"{own['value'].iloc[-1]:.2f}",
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
     return table.markdown(pd.DataFrame(lines))
 
 
-def _steps_to(curve: pd.Series, level: float) -> float | None:
-    """The first steps at which a curve has come to a level, None if it never does."""
+def _first(curve: pd.Series, level: float) -> float | None:
+    """The first round at which a curve has come to a level, None if it never does."""
     there = curve.index[curve >= level]
     return float(there[0]) if len(there) else None
 

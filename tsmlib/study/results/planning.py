@@ -153,6 +153,18 @@ def plans_of(
     return own[(own["model"] == "none") | own["planner"].isin(list(planners))] if planners else own
 
 
+def both_ways(found: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Finished plans open and closed loop, of methods with closed loops and the seeds that were executed both ways; of
+    a method without any such seed, its closed loops alone."""
+    opened, closed = (table.with_method(plans_of(found, execution=way)) for way in (OPEN, CLOSED))
+    keys = [list(zip(part["env"], part["method"], part["seed"], strict=True)) for part in (opened, closed)]
+    both = set(keys[0]) & set(keys[1])
+    paired = {(env, method) for env, method, _ in both}
+    of_both = np.array([key in both for key in keys[0]], dtype=bool)
+    of_both_or_alone = np.array([key in both or key[:2] not in paired for key in keys[1]], dtype=bool)
+    return opened[of_both], closed[of_both_or_alone]
+
+
 def by_target(found: pd.DataFrame, metric: str, *, apart: bool = False) -> dict[Method, np.ndarray]:
     """Rows with a ``target`` as arrays: method -> (targets,), means over the seeds there are; apart: targets of each
     seed, (seeds * targets,)."""
@@ -177,14 +189,15 @@ def returns(
 
 def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.ndarray]]:
     """What ``figures.final_distances`` draws of one task, from rows with a ``target``: open beside closed loop, the
-    targets of every seed."""
+    targets of every seed (``both_ways``)."""
     opened, closed = (
-        {method: part["value"].to_numpy() for method, part in table.groups(table.with_method(own), "method")}
-        for own in (
-            table.select(plans_of(found, env=env, execution=way), metric="final_distance") for way in (OPEN, CLOSED)
-        )
+        {method: part["value"].to_numpy() for method, part in table.groups(own, "method")}
+        for own in both_ways(table.select(found, env=env, metric="final_distance"))
     )
-    return {method: {"open": opened[method], "closed": distances} for method, distances in closed.items()}
+    return {
+        method: ({"open": opened[method]} if method in opened else {}) | {"closed": distances}
+        for method, distances in closed.items()
+    }
 
 
 def return_panels(
@@ -263,13 +276,14 @@ def _violations(found: pd.DataFrame, env: str, planner: str) -> pd.DataFrame:
 
 
 def loops_table(found: pd.DataFrame) -> str:
-    """Open loop beside closed loop, of the methods that were executed both ways, in Markdown."""
+    """Open loop beside closed loop, of the methods and seeds that were executed both ways (``both_ways``), in
+    Markdown."""
     return _loops(found) or NOT_YET
 
 
 @table.sourced
 def _loops(found: pd.DataFrame) -> pd.DataFrame:
-    opened, closed = (_printed(plans_of(found, execution=execution), LOOP) for execution in (OPEN, CLOSED))
+    opened, closed = (_printed(own, LOOP) for own in both_ways(found))
     return opened.merge(closed, "right", ["env", "method", "n", "seeds"], suffixes=(f", {OPEN}", f", {CLOSED}"))
 
 
@@ -325,19 +339,26 @@ def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str 
     for method, cost in sorted(costs.items(), key=lambda each: each[1].to_numpy().mean()):
         line = {"method": method, "cost (m)": f"{cost.to_numpy().mean():.2f}"}
         if ours is not None and method is not ours:
-            apart = (costs[ours] - cost).dropna()
+            apart = _paired(costs[ours], cost)
             line[f"cost of {subject} minus this"] = spell_effect(apart)
-            if len(apart) > 1:
+            if apart.size and len(apart) > 1:
                 line["in each seed"] = ", ".join(table.spell(row, "{:+.2f} ± {:.2f}") for row in apart.to_numpy())
             if method in gaps:
-                line[f"size of the gap of {subject} minus this"] = spell_effect((gaps[ours] - gaps[method]).dropna())
+                line[f"size of the gap of {subject} minus this"] = spell_effect(_paired(gaps[ours], gaps[method]))
         lines.append(line | {"n": cost.shape[1]})
     return pd.DataFrame(lines)
 
 
+def _paired(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
+    """Differences (seeds, targets), without targets that either lacks, and then without such seeds."""
+    return (ours - theirs).dropna(axis="columns", how="all").dropna()
+
+
 def spell_effect(values: pd.DataFrame) -> str:
     """Mean of paired differences (seeds, targets), half its 95 % interval over targets, and in brackets, where there
-    are several seeds, that over seeds and targets (two-way random effects)."""
+    are several seeds, that over seeds and targets (two-way random effects). '' where there are none."""
+    if values.empty:
+        return ""
     whole = f" ({random_effects(values.to_numpy()).half():.2f})" * (len(values) > 1)
     return table.spell(values.mean(), "{:+.2f} ± {:.2f}") + whole
 
