@@ -353,6 +353,24 @@ def test_nothing_counts_after_an_episode_ended() -> None:
     assert [steps == int(fallen(trial.states[i]).int().argmax()) for i, steps in enumerate(trial.lengths)] == [True] * 3
 
 
+def test_a_reward_sees_the_whole_episode_also_where_all_robots_fell_before() -> None:
+    weight = torch.linspace(1, 2, 60)  # fails on any other horizon
+    task = Task.from_env(HOPPER, n=2, horizon=60, reward=lambda x, u: x[..., 5] * weight, seed=0)
+    space, planner = tsmlib.DirectActions(60, 3), partial(tsmlib.mppi, candidates=2, iterations=1)
+    model = tsmlib.OneStep.for_data(tsmlib.collect_random(HOPPER, episodes=2, horizon=10), hidden=8)
+    closed = tsmlib.mpc(task, model, space, planner, every=20)
+    for trial in (closed, tsmlib.execute(task, lambda past: torch.ones(len(past.states), 1, 3))):
+        assert max(trial.steps) < 60
+        assert (trial.actions.shape, trial.states.shape) == ((2, 60, 3), (2, 61, 11))
+        for i, steps in enumerate(trial.steps):
+            assert not trial.actions[i, steps:].any()
+            assert (trial.states[i, steps:] == trial.states[i, steps]).all()
+        played = tsmlib.execute(task, trial.actions)
+        torch.testing.assert_close(trial.executed_return, played.executed_return, rtol=1e-4, atol=1e-4)
+    assert closed.plan is not None
+    assert closed.plan.states.shape == (1, 2, 60, 11)
+
+
 def test_success_is_a_yes_or_a_distance_within_the_tolerance() -> None:
     pose = partial(Task.from_env, PENDULUM, n=3, horizon=4, reward=still)
     nothing = torch.zeros(3, 4, 1)

@@ -207,6 +207,13 @@ def test_the_gap_is_predicted_minus_true() -> None:
         _ = plain.gap
 
 
+def test_a_trial_is_of_the_actions_that_were_executed() -> None:
+    task, strong = some_task(), torch.full((4, 20, 2), 3.0)
+    trial, clipped = execute(task, strong), execute(task, strong.clamp(-1, 1))
+    assert torch.equal(trial.actions, torch.ones(4, 20, 2))
+    assert torch.equal(trial.executed_return, clipped.executed_return)
+
+
 # Executing behind noisy sensors and with late actions -----------------------------------------------------------------
 
 
