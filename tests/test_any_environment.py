@@ -387,6 +387,13 @@ def test_success_is_a_yes_or_a_distance_within_the_tolerance() -> None:
         tsmlib.execute(pose(success=lambda x: x[..., 0] > 0), nothing)
 
 
+def test_a_distance_without_a_tolerance_is_no_measure_of_success() -> None:
+    pose = partial(Task.from_env, PENDULUM, n=3, horizon=4, reward=still, success=lambda x: x[:, -1, 0].abs())
+    with pytest.raises(ValueError, match=r"is a distance, .* and no tolerance is given; give the distance"):
+        pose()
+    assert pose(tolerance=0.0).tolerance == 0
+
+
 def test_a_task_of_any_robot_is_cut_and_repeated_with_its_seeds() -> None:
     task = Task.from_env(PENDULUM, n=3, horizon=4, reward=still, seed=7)
     assert (task.seeds, task.take(2).seeds, task.take(2).times(2).seeds) == ((7, 8, 9), (7, 8), (7, 8, 7, 8))

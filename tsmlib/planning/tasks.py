@@ -57,7 +57,7 @@ class Task:
     @classmethod
     def from_env(
         cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 1000, success: Success | None = None,
-        tolerance: float = 0.0, name: str = "",
+        tolerance: float | None = None, name: str = "",
     ) -> Task:  # fmt: skip
         """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
         states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
@@ -67,15 +67,26 @@ class Task:
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
+
+        ValueError where ``success`` gives distances, and no ``tolerance``, the distance within which they are one.
         """
         seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
-        return cls(
-            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance, seeds, success,
-            begun.action_dim,
+        task = cls(
+            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance or 0.0, seeds,
+            success, begun.action_dim,
         )  # fmt: skip
+        if success is not None and tolerance is None:
+            away, _ = task.judged(torch.from_numpy(start)[:, None].expand(-1, horizon + 1, -1))  # standing still
+            if not away.isnan().all():
+                raise ValueError(
+                    f"success of task {task.name!r} is a distance, {float(away[0]):.3g} at the first start, and no "
+                    "tolerance is given; give the distance within which a trial is a success, tolerance=0.05 for "
+                    "example, or a success that is true or false"
+                )
+        return task
 
     @classmethod
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
