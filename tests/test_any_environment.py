@@ -387,6 +387,17 @@ def test_success_is_a_yes_or_a_distance_within_the_tolerance() -> None:
         tsmlib.execute(pose(success=lambda x: x[..., 0] > 0), nothing)
 
 
+def test_a_task_is_no_longer_than_the_environments_limit_of_time() -> None:
+    swing = partial(Task.from_env, PENDULUM, n=1, reward=still)
+    with pytest.raises(
+        ValueError, match="horizon is 250, but Pendulum-v1 ends episodes after 200 steps; give horizon="
+    ):
+        swing(horizon=250)
+    with pytest.raises(ValueError, match="horizon is 201, but"):
+        swing(horizon=200).with_reward("longer", still, horizon=201)
+    Task.from_env("tsm/Reacher-v0", n=1, horizon=150, reward=still)  # an arm goes on
+
+
 def test_a_distance_without_a_tolerance_is_no_measure_of_success() -> None:
     pose = partial(Task.from_env, PENDULUM, n=3, horizon=4, reward=still, success=lambda x: x[:, -1, 0].abs())
     with pytest.raises(ValueError, match=r"is a distance, .* and no tolerance is given; give the distance"):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
+import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -35,8 +36,8 @@ class Task:
     the arm's tasks, in metres, and what has to arrive there, fingertip or object; (B, 0) and None of others.
 
     ``from_env`` makes one of any environment; ``standard`` gives the paper's, ``with_reward`` another reward from the
-    same starts. ValueError where a target is out of the arm's reach, or the reward is not one number per step;
-    FloatingPointError where it is NaN.
+    same starts. ValueError where a target is out of the arm's reach, the horizon beyond the environment's limit of
+    time, or the reward not one number per step; FloatingPointError where it is NaN.
     """
 
     name: str
@@ -98,6 +99,12 @@ class Task:
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
+        spec = gymnasium.registry.get(self.env) if self.seeds else None  # an arm goes on
+        if spec and (limit := spec.max_episode_steps) and self.horizon > limit:
+            raise ValueError(
+                f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; give horizon={limit} or "
+                f"less, or register a longer one: gymnasium.register(id, ..., max_episode_steps={self.horizon})"
+            )
         if self.seeds and len(self.seeds) != len(self):
             raise ValueError(f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each")
         if self.position is not None:
