@@ -16,7 +16,8 @@ import torch
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.envs.registration import register, registry
 from gymnasium.spaces import Box, Dict, Discrete
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
 import tsmlib
@@ -149,6 +150,42 @@ def test_an_environment_in_other_processes_is_collected_from() -> None:
     np.testing.assert_array_equal(
         data.states, collect(make_simulation(PENDULUM, 2), open_loop(actions), horizon=5, seed=0).states
     )
+
+
+class Drifts(VectorEnv):
+    """Copies that are one: reset takes one seed, as Gymnasium's base class has it, and all of them end at once."""
+
+    metadata = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
+    num_envs, dt = 2, 0.1
+    single_observation_space = single_action_space = Box(-1, 1, (1,))
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        assert not options
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.normal(size=(2, 1)).astype(np.float32), 0
+        return self.x, {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+        self.x, self.t = self.x + actions, self.t + 1
+        return self.x, np.zeros(2), np.zeros(2, bool), np.full(2, self.t >= 3), {}
+
+
+def test_a_vector_environment_that_takes_one_seed_is_given_one() -> None:
+    still = open_loop(torch.zeros(2, 5, 1))
+    first, again, other = (collect(Drifts(), still, horizon=5, seed=seed) for seed in (1, 1, None))
+    np.testing.assert_array_equal(first.states, again.states)
+    assert first.states[0, 0] != first.states[1, 0] != other.states[1, 0]
+    assert first.actions.shape == (2, 3, 1)
+    with pytest.raises(UnsupportedEnvironment, match="Drifts takes no seed for each .* give one for all of them"):
+        collect(Drifts(), still, horizon=5, seed=[1, 2])
+
+
+def test_a_wrapped_arm_is_collected_from_until_its_limit_of_time() -> None:
+    wrapped = RecordEpisodeStatistics(gymnasium.make_vec("tsm/Reacher-v0", num_envs=2))
+    actions = torch.zeros(2, 120, 2)
+    data = collect(wrapped, open_loop(actions), horizon=120, seed=3)
+    arms = collect(gymnasium.make_vec("tsm/Reacher-v0", num_envs=2), open_loop(actions), horizon=100, seed=3)
+    np.testing.assert_allclose(data.states, arms.states, atol=1e-6)
 
 
 def test_an_environment_without_an_id_is_collected_from() -> None:

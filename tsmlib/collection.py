@@ -31,8 +31,8 @@ def collect(
 
     env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations and actions. Actions
     in [-1, 1] are scaled to the bounds of its action space. Episodes start from the environment's own distribution,
-    drawn from ``seed`` (a function of it and of i in episode i; elsewhere than in an arm also a seed for each), or, in
-    an arm's, from ``states`` (N, dx).
+    drawn from ``seed`` (a function of it and of i in episode i; where copies are reset one by one also a seed for
+    each), or, in an arm's, from ``states`` (N, dx).
     UnsupportedEnvironment, naming what is supported, for anything else.
     """
     if horizon < 1:
