@@ -230,6 +230,18 @@ def test_a_model_that_diverges_on_everything_stops_the_planner(planner: str) -> 
         plan_by(planner, diverging, reward, 2)
 
 
+@pytest.mark.parametrize("planner", ["cem", "mppi"])
+def test_a_start_on_which_the_model_diverges_is_left_for_candidates(planner: str) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        """Without any force the world ends."""
+        return predictor()(actions) / (actions.abs().amax((2, 3)) > 0)[None, ..., None, None]
+
+    plan = plan_by(planner, fragile, reward, 3)
+    assert torch.isinf(plan.curve[0]).all()
+    assert torch.isfinite(plan.curve[1:]).all()
+    assert torch.isfinite(plan.predicted_return).all()
+
+
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str) -> None:
     def fragile(actions: Tensor) -> Tensor:
