@@ -27,7 +27,7 @@ from tsmlib.envs import stepping
 from tsmlib.envs.snapshots import abilities
 from tsmlib.envs.stepping import Stepping, UnsupportedEnvironment, Vectorised, make_simulation, simulation
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.networks import controller
+from tsmlib.policies.networks import Policy, controller
 from tsmlib.training.fit import TrainingOptions
 from tsmlib.trajectory import Trajectories
 
@@ -493,18 +493,22 @@ def test_a_search_space_of_another_robot_is_refused() -> None:
         tsmlib.cem(through, still, tsmlib.DirectActions(4, 6), 2, candidates=4, elites=2, iterations=1)
 
 
-def test_a_policy_is_learned_and_executed_on_another_robot() -> None:
+@pytest.mark.parametrize("kind", ["one step", "segment"])
+def test_a_policy_is_learned_and_executed_on_another_robot(kind: str) -> None:
     data = tsmlib.collect_random(PENDULUM, episodes=4, horizon=20)
     model = tsmlib.OneStep.for_data(data, hidden=8)
     task = Task.from_env(PENDULUM, n=2, horizon=6, reward=still)
-    policy = tsmlib.OneStepPolicy(3, 1, 0, hidden=8)
+    if kind == "one step":
+        policy: Policy = tsmlib.OneStepPolicy(3, 1, 0, hidden=8)
+    else:
+        policy = tsmlib.SegmentPolicy(3, tsmlib.ActionPrior.for_data(data, channels=8), 0, channels=8)
     policy.features.fit(torch.from_numpy(data.states), data.lengths)
     begin = torch.from_numpy(data.states[:, 0])
     tsmlib.learn_policy(
         policy, model, task.reward_for, lambda n, generator: (begin[torch.arange(n) % 4], torch.zeros(n, 0)),
         tsmlib.LearningOptions(horizon=6, episodes=4, iterations=2, record_every=1),
     )  # fmt: skip
-    trial = tsmlib.execute(task, controller(policy, task.target))
+    trial = tsmlib.execute(task, controller(policy, task.target), past_len=policy.past_len)
     assert trial.states.shape == (2, 7, 3)
 
 
