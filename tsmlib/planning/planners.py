@@ -52,16 +52,14 @@ def adam(
         if not iteration:
             _check_gradient(states, returns)
         search.update(parameters.detach(), returns.detach())
-        optimizer.zero_grad()
-        (-returns.sum()).backward()
-        assert parameters.grad is not None
-        sound = torch.isfinite(parameters.grad)
+        (gradient,) = torch.autograd.grad(-returns.sum(), parameters)  # of what is searched alone, not of weights
+        sound = torch.isfinite(gradient)
         if not iteration and not sound.all():
             raise FloatingPointError(
                 "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
                 "reward, and add a tiny constant under it"
             )
-        parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
+        parameters.grad = gradient.where(sound, 0)  # where the model diverges later on, a restart stays
         optimizer.step()
     search.update(parameters.detach(), search.returns_of(parameters))
     return search.plan()
