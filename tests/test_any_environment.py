@@ -455,6 +455,13 @@ def test_by_default_a_task_begins_where_no_data_of_the_default_seed_did() -> Non
     assert not (data.states[:, None, 0] == task.start[None]).all(-1).any()
 
 
+def test_starts_beyond_the_seeds_of_the_data_are_none_of_theirs() -> None:
+    data = tsmlib.collect_random(PENDULUM, 1004, horizon=1)
+    shared, apart = (Task.from_env(PENDULUM, n=4, horizon=4, reward=still, seed=seed) for seed in (1000, len(data)))
+    np.testing.assert_array_equal(data.states[1000:, 0], shared.start)  # as the default's docstring says
+    assert not (data.states[:, None, 0] == apart.start[None]).all(-1).any()
+
+
 def test_a_task_of_ones_own_is_made_of_an_arm_too() -> None:
     task = Task.from_env("tsm/Reacher-v0", n=2, horizon=4, reward=still, seed=1)
     trial = tsmlib.execute(task, torch.zeros(2, 4, 2))

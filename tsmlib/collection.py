@@ -82,8 +82,8 @@ def collect_random(
 ) -> Trajectories:
     """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone.
 
-    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts;
-    ``Task.from_env`` therefore begins at 1000 by default.
+    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts:
+    give ``Task.from_env``, which begins at 1000 by default, a seed beyond these where there are more.
     """
     seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:

@@ -63,8 +63,9 @@ class Task:
         """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
         states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
 
-        Neighbouring seeds share starts, so the default lies far from the 0 of ``collect_random``: what is measured does
-        not begin where training data began.
+        Neighbouring seeds share starts: ``collect_random`` begins its episode i by the reset of its ``seed + i``. The
+        default is held out from up to 1,000 episodes of its seed 0; of more, or of another seed, give the first beyond
+        theirs, which is that seed plus the number of episodes.
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
