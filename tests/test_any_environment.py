@@ -16,7 +16,8 @@ import torch
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.envs.registration import register, registry
 from gymnasium.spaces import Box, Dict, Discrete
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
 import tsmlib
@@ -26,7 +27,7 @@ from tsmlib.envs import stepping
 from tsmlib.envs.snapshots import abilities
 from tsmlib.envs.stepping import Stepping, UnsupportedEnvironment, Vectorised, make_simulation, simulation
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.networks import controller
+from tsmlib.policies.networks import Policy, controller
 from tsmlib.training.fit import TrainingOptions
 from tsmlib.trajectory import Trajectories
 
@@ -149,6 +150,42 @@ def test_an_environment_in_other_processes_is_collected_from() -> None:
     np.testing.assert_array_equal(
         data.states, collect(make_simulation(PENDULUM, 2), open_loop(actions), horizon=5, seed=0).states
     )
+
+
+class Drifts(VectorEnv):
+    """Copies that are one: reset takes one seed, as Gymnasium's base class has it, and all of them end at once."""
+
+    metadata = {"autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
+    num_envs, dt = 2, 0.1
+    single_observation_space = single_action_space = Box(-1, 1, (1,))
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        assert not options
+        super().reset(seed=seed)
+        self.x, self.t = self.np_random.normal(size=(2, 1)).astype(np.float32), 0
+        return self.x, {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+        self.x, self.t = self.x + actions, self.t + 1
+        return self.x, np.zeros(2), np.zeros(2, bool), np.full(2, self.t >= 3), {}
+
+
+def test_a_vector_environment_that_takes_one_seed_is_given_one() -> None:
+    still = open_loop(torch.zeros(2, 5, 1))
+    first, again, other = (collect(Drifts(), still, horizon=5, seed=seed) for seed in (1, 1, None))
+    np.testing.assert_array_equal(first.states, again.states)
+    assert first.states[0, 0] != first.states[1, 0] != other.states[1, 0]
+    assert first.actions.shape == (2, 3, 1)
+    with pytest.raises(UnsupportedEnvironment, match="Drifts takes no seed for each .* give one for all of them"):
+        collect(Drifts(), still, horizon=5, seed=[1, 2])
+
+
+def test_a_wrapped_arm_is_collected_from_until_its_limit_of_time() -> None:
+    wrapped = RecordEpisodeStatistics(gymnasium.make_vec("tsm/Reacher-v0", num_envs=2))
+    actions = torch.zeros(2, 120, 2)
+    data = collect(wrapped, open_loop(actions), horizon=120, seed=3)
+    arms = collect(gymnasium.make_vec("tsm/Reacher-v0", num_envs=2), open_loop(actions), horizon=100, seed=3)
+    np.testing.assert_allclose(data.states, arms.states, atol=1e-6)
 
 
 def test_an_environment_without_an_id_is_collected_from() -> None:
@@ -353,6 +390,24 @@ def test_nothing_counts_after_an_episode_ended() -> None:
     assert [steps == int(fallen(trial.states[i]).int().argmax()) for i, steps in enumerate(trial.lengths)] == [True] * 3
 
 
+def test_a_reward_sees_the_whole_episode_also_where_all_robots_fell_before() -> None:
+    weight = torch.linspace(1, 2, 60)  # fails on any other horizon
+    task = Task.from_env(HOPPER, n=2, horizon=60, reward=lambda x, u: x[..., 5] * weight, seed=0)
+    space, planner = tsmlib.DirectActions(60, 3), partial(tsmlib.mppi, candidates=2, iterations=1)
+    model = tsmlib.OneStep.for_data(tsmlib.collect_random(HOPPER, episodes=2, horizon=10), hidden=8)
+    closed = tsmlib.mpc(task, model, space, planner, every=20)
+    for trial in (closed, tsmlib.execute(task, lambda past: torch.ones(len(past.states), 1, 3))):
+        assert max(trial.steps) < 60
+        assert (trial.actions.shape, trial.states.shape) == ((2, 60, 3), (2, 61, 11))
+        for i, steps in enumerate(trial.steps):
+            assert not trial.actions[i, steps:].any()
+            assert (trial.states[i, steps:] == trial.states[i, steps]).all()
+        played = tsmlib.execute(task, trial.actions)
+        torch.testing.assert_close(trial.executed_return, played.executed_return, rtol=1e-4, atol=1e-4)
+    assert closed.plan is not None
+    assert closed.plan.states.shape == (1, 2, 60, 11)
+
+
 def test_success_is_a_yes_or_a_distance_within_the_tolerance() -> None:
     pose = partial(Task.from_env, PENDULUM, n=3, horizon=4, reward=still)
     nothing = torch.zeros(3, 4, 1)
@@ -369,6 +424,24 @@ def test_success_is_a_yes_or_a_distance_within_the_tolerance() -> None:
         tsmlib.execute(pose(success=lambda x: x[..., 0] > 0), nothing)
 
 
+def test_a_task_is_no_longer_than_the_environments_limit_of_time() -> None:
+    swing = partial(Task.from_env, PENDULUM, n=1, reward=still)
+    with pytest.raises(
+        ValueError, match="horizon is 250, but Pendulum-v1 ends episodes after 200 steps; give horizon="
+    ):
+        swing(horizon=250)
+    with pytest.raises(ValueError, match="horizon is 201, but"):
+        swing(horizon=200).with_reward("longer", still, horizon=201)
+    Task.from_env("tsm/Reacher-v0", n=1, horizon=150, reward=still)  # an arm goes on
+
+
+def test_a_distance_without_a_tolerance_is_no_measure_of_success() -> None:
+    pose = partial(Task.from_env, PENDULUM, n=3, horizon=4, reward=still, success=lambda x: x[:, -1, 0].abs())
+    with pytest.raises(ValueError, match=r"is a distance, .* and no tolerance is given; give the distance"):
+        pose()
+    assert pose(tolerance=0.0).tolerance == 0
+
+
 def test_a_task_of_any_robot_is_cut_and_repeated_with_its_seeds() -> None:
     task = Task.from_env(PENDULUM, n=3, horizon=4, reward=still, seed=7)
     assert (task.seeds, task.take(2).seeds, task.take(2).times(2).seeds) == ((7, 8, 9), (7, 8), (7, 8, 7, 8))
@@ -380,6 +453,13 @@ def test_a_task_of_any_robot_is_cut_and_repeated_with_its_seeds() -> None:
 def test_by_default_a_task_begins_where_no_data_of_the_default_seed_did() -> None:
     data, task = tsmlib.collect_random(PENDULUM, 60, horizon=1), Task.from_env(PENDULUM, n=8, horizon=4, reward=still)
     assert not (data.states[:, None, 0] == task.start[None]).all(-1).any()
+
+
+def test_starts_beyond_the_seeds_of_the_data_are_none_of_theirs() -> None:
+    data = tsmlib.collect_random(PENDULUM, 1004, horizon=1)
+    shared, apart = (Task.from_env(PENDULUM, n=4, horizon=4, reward=still, seed=seed) for seed in (1000, len(data)))
+    np.testing.assert_array_equal(data.states[1000:, 0], shared.start)  # as the default's docstring says
+    assert not (data.states[:, None, 0] == apart.start[None]).all(-1).any()
 
 
 def test_a_task_of_ones_own_is_made_of_an_arm_too() -> None:
@@ -420,18 +500,22 @@ def test_a_search_space_of_another_robot_is_refused() -> None:
         tsmlib.cem(through, still, tsmlib.DirectActions(4, 6), 2, candidates=4, elites=2, iterations=1)
 
 
-def test_a_policy_is_learned_and_executed_on_another_robot() -> None:
+@pytest.mark.parametrize("kind", ["one step", "segment"])
+def test_a_policy_is_learned_and_executed_on_another_robot(kind: str) -> None:
     data = tsmlib.collect_random(PENDULUM, episodes=4, horizon=20)
     model = tsmlib.OneStep.for_data(data, hidden=8)
     task = Task.from_env(PENDULUM, n=2, horizon=6, reward=still)
-    policy = tsmlib.OneStepPolicy(3, 1, 0, hidden=8)
+    if kind == "one step":
+        policy: Policy = tsmlib.OneStepPolicy(3, 1, 0, hidden=8)
+    else:
+        policy = tsmlib.SegmentPolicy(3, tsmlib.ActionPrior.for_data(data, channels=8), 0, channels=8)
     policy.features.fit(torch.from_numpy(data.states), data.lengths)
     begin = torch.from_numpy(data.states[:, 0])
     tsmlib.learn_policy(
         policy, model, task.reward_for, lambda n, generator: (begin[torch.arange(n) % 4], torch.zeros(n, 0)),
         tsmlib.LearningOptions(horizon=6, episodes=4, iterations=2, record_every=1),
     )  # fmt: skip
-    trial = tsmlib.execute(task, controller(policy, task.target))
+    trial = tsmlib.execute(task, controller(policy, task.target), past_len=policy.past_len)
     assert trial.states.shape == (2, 7, 3)
 
 

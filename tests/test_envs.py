@@ -148,6 +148,22 @@ def test_a_restored_state_replays_bit_for_bit(env_id: str) -> None:
     np.testing.assert_array_equal(other.rollout(actions[::-1]), future)
 
 
+def test_rewards_and_the_limit_of_time_go_on_from_a_snapshot_too(env_id: str) -> None:
+    if env_id in PYMUNK_IDS:  # has none
+        return
+    env, other, nothing = arms(env_id, 2), arms(env_id, 2), np.zeros((2, 2))
+    env.reset(seed=4)
+    env.rollout(np.zeros((2, env.max_episode_steps - 2, 2)))
+    other.reset(seed=99)
+    other.set_state(env.get_state())
+    for over in (False, True):
+        (_, reward, _, truncated, info), (_, again, _, ended, found) = env.step(nothing), other.step(nothing)
+        np.testing.assert_array_equal(again, reward)
+        np.testing.assert_array_equal(found["target"], info["target"])
+        assert (truncated == over).all()
+        assert (ended == over).all()
+
+
 def test_actions_beyond_the_bounds_are_clipped(env_id: str) -> None:
     env = arms(env_id)
     env.reset(seed=5)

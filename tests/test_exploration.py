@@ -261,7 +261,7 @@ def test_a_limit_of_time_ends_an_episode_without_terminating_it(monkeypatch: pyt
         def reward(x: Tensor, u: Tensor) -> Tensor:
             return x[..., 0]
 
-        return tsm.Task.from_env("tests/Limited-v0", n=3, horizon=HORIZON, reward=reward, seed=k)
+        return tsm.Task.from_env("tests/Limited-v0", n=3, horizon=12, reward=reward, seed=k)
 
     model, once = tsm.OneStep.for_data(train, hidden=8), replace(options().model, past_len=1)
     found = tsm.explore(model, None, train, train, swings, options(model=once, prior=None, rounds=1))

@@ -228,7 +228,7 @@ def test_a_blow_up_is_raised_with_episode_and_step(
     snapshot[277, 1 + env.model.nq] = value  # the shoulder's velocity
     with pytest.raises(SimulationUnstable, match="episode 277"):
         env.set_state(snapshot)
-    env._physics = snapshot[:, :-2]  # as if it had come about by itself
+    env._physics = snapshot[:, :-4]  # as if it had come about by itself
     with pytest.raises(SimulationUnstable) as caught:
         env.rollout(np.zeros((300, 4, 2)))
     assert (caught.value.env, caught.value.episode, caught.value.step) == (env_id, 277, 3)  # steps since reset

@@ -12,6 +12,7 @@ from torch import Tensor
 
 import tsmlib as tsm
 from tsmlib.models.features import Features
+from tsmlib.sampling import SeparateNoise, SharedNoise, by_generator, standard_normal
 from tsmlib.trajectory import Segment
 
 
@@ -37,6 +38,59 @@ def test_a_model_of_two_names_plans_scores_and_is_controlled() -> None:
     features = Features(6, data.angles).fit(torch.from_numpy(data.states))
     scores = tsm.score(Still(), features, data.take(slice(0, 4)), data.take(slice(4, 8)), samples=1, horizon=10)
     assert float(scores.against_horizon()["nrmse"].mean()) < 0.1  # without torque the arm hardly moves
+
+
+class Gusts:
+    """A model that draws as torch draws, and nothing else."""
+
+    segment_len, past_len = 10, 1
+
+    def predict_segment(self, past: Segment, actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        x, states = past.states[:, -1], []
+        for u in actions.unbind(1):
+            x = x + 0.1 * u.sum(1, keepdim=True)
+            if generator is not None:
+                x = x + 0.1 * torch.randn(x.shape, generator=generator)
+            states.append(x)
+        return torch.stack(states, dim=1)
+
+
+JUDGES = {
+    "samples": partial(tsm.model_predictor, samples=3),
+    "expected": partial(tsm.expected_predictor, samples=3),
+    "fresh": partial(tsm.fresh_predictor, samples=3),
+}
+
+
+@pytest.mark.parametrize("judge", JUDGES.values(), ids=JUDGES)
+def test_a_model_that_draws_from_a_torch_generator_is_planned_through_in_futures_that_candidates_share(
+    judge: Any,
+) -> None:
+    task = tsm.load_task("tsm/Reacher-v0").take(2)
+    predict, space = judge(Gusts(), task.past(1), seed=4), tsm.DirectActions(task.horizon)
+    same = predict(torch.zeros(3, 2, task.horizon, 2))  # (S, C, B, T, dx)
+    assert torch.equal(same, same[:, :1].expand_as(same))
+    assert torch.equal(same, predict(torch.zeros(3, 2, task.horizon, 2)))
+    futures = same[:, 0].flatten(0, 1)[:, -1, 0]  # of samples and targets, each its own
+    assert len(futures.unique()) == len(futures)
+    for planner in (
+        partial(tsm.adam, iterations=2),
+        partial(tsm.cem, candidates=4, elites=2, iterations=1, screened=0.5),
+        partial(tsm.mppi, candidates=4, iterations=1),
+    ):
+        assert torch.isfinite(planner(predict, task.reward, space, 2).predicted_return).all()
+    trial = tsm.mpc(task, Gusts(), space, partial(tsm.mppi, candidates=2, iterations=1), every=25, judge=judge)
+    assert torch.isfinite(trial.executed_return).all()
+
+
+def test_common_random_numbers_of_a_torch_generator_are_those_of_standard_normal() -> None:
+    def noise() -> SharedNoise:
+        return SharedNoise(SeparateNoise(tuple(torch.Generator().manual_seed(k) for k in (1, 2))), 6)
+
+    drawn, again, like = noise(), noise(), torch.zeros(12, 2)
+    for _ in range(2):  # the second draw goes on where the first ended
+        parts = [torch.randn(len(like[rows]), 2, generator=own) for rows, own in by_generator(12, drawn)]
+        assert torch.equal(torch.cat(parts), standard_normal((12, 2), again, like))
 
 
 @pytest.mark.parametrize(

@@ -230,6 +230,26 @@ def test_a_model_that_diverges_on_everything_stops_the_planner(planner: str) -> 
         plan_by(planner, diverging, reward, 2)
 
 
+def test_planning_by_gradients_leaves_none_in_the_weights() -> None:
+    model, prior = OneStep(2, 1, hidden=8), ActionPrior(1, channels=8)
+    model.features.fit(torch.randn(4, 9, 2))
+    predict = model_predictor(model, initial_past(START, model.past_len, 1))
+    assert adam(predict, reward, LatentActions(prior, T), B, iterations=2).actions.shape == (B, T, 1)
+    assert all(weight.grad is None for weight in (*model.parameters(), *prior.parameters()))
+
+
+@pytest.mark.parametrize("planner", ["cem", "mppi"])
+def test_a_start_on_which_the_model_diverges_is_left_for_candidates(planner: str) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        """Without any force the world ends."""
+        return predictor()(actions) / (actions.abs().amax((2, 3)) > 0)[None, ..., None, None]
+
+    plan = plan_by(planner, fragile, reward, 3)
+    assert torch.isinf(plan.curve[0]).all()
+    assert torch.isfinite(plan.curve[1:]).all()
+    assert torch.isfinite(plan.predicted_return).all()
+
+
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str) -> None:
     def fragile(actions: Tensor) -> Tensor:

@@ -31,8 +31,8 @@ def collect(
 
     env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations and actions. Actions
     in [-1, 1] are scaled to the bounds of its action space. Episodes start from the environment's own distribution,
-    drawn from ``seed`` (a function of it and of i in episode i; elsewhere than in an arm also a seed for each), or, in
-    an arm's, from ``states`` (N, dx).
+    drawn from ``seed`` (a function of it and of i in episode i; where copies are reset one by one also a seed for
+    each), or, in an arm's, from ``states`` (N, dx).
     UnsupportedEnvironment, naming what is supported, for anything else.
     """
     if horizon < 1:
@@ -82,8 +82,8 @@ def collect_random(
 ) -> Trajectories:
     """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone.
 
-    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts;
-    ``Task.from_env`` therefore begins at 1000 by default.
+    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts:
+    give ``Task.from_env``, which begins at 1000 by default, a seed beyond these where there are more.
     """
     seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:

@@ -1,6 +1,6 @@
 """Sources of standard normal noise: one generator, common random numbers, separate generators, none."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +57,27 @@ def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
     return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(like.device)
+
+
+def by_generator(
+    rows: int, noise: torch.Generator | SharedNoise | SeparateNoise
+) -> Iterator[tuple[slice, torch.Generator]]:
+    """The rows that draw from one generator, part by part: what ``standard_normal`` does, for draws of any kind.
+
+    Each part is drawn before the next is asked for. Rows that share noise find their generator as the first ones did.
+    """
+    if isinstance(noise, torch.Generator):
+        yield slice(0, rows), noise
+    elif isinstance(noise, SeparateNoise):
+        share = rows // len(noise.generators)
+        for k, generator in enumerate(noise.generators):
+            yield slice(k * share, (k + 1) * share), generator
+    else:
+        begun = [generator.get_state() for _, generator in by_generator(noise.period, noise.generator)]
+        for first in range(0, rows, noise.period):
+            for (part, generator), state in zip(by_generator(noise.period, noise.generator), begun, strict=True):
+                generator.set_state(state)
+                yield slice(first + part.start, first + part.stop), generator
 
 
 def draw_members(n_members: int, rows: int, noise: Noise, like: Tensor) -> Tensor:

@@ -253,18 +253,21 @@ class MujocoArm(ArmVectorEnv):
             raise SimulationUnstable(self.env_id, first + int(episode), int(step), reason)
 
     def get_state(self) -> np.ndarray:
-        return np.concatenate([self._physics, self._obstacle], axis=1)
+        return np.concatenate([self._physics, self._obstacle, self.target], axis=1)
 
     def set_state(self, snapshot: np.ndarray) -> None:
-        """Continue from `get_state`, of this or another environment of the same id and N; bit for bit."""
+        """Continue from `get_state`, of this or another environment of the same id and N; bit for bit.
+
+        Targets and the limit of time are those of the snapshot too.
+        """
         snapshot = np.asarray(snapshot, np.float64)
-        expected = (self.num_envs, self._physics.shape[1] + 2)
+        expected = (self.num_envs, self._physics.shape[1] + 4)
         if snapshot.shape != expected:
             raise ValueError(f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}")
-        self._physics, self._obstacle = snapshot[:, :-2].copy(), snapshot[:, -2:].copy()
+        self._physics, self._obstacle, self.target = (part.copy() for part in np.split(snapshot, [-4, -2], axis=1))
         self._check(self._physics[:, None], self._physics[:, 0] - DT, 0)
         self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
-        self._elapsed = self._elapsed or 0
+        self._elapsed = round(self._physics[:, 0].max() / DT)
 
     def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Seen from above by MuJoCo's renderer, or drawn by matplotlib where there is no OpenGL."""

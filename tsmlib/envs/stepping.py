@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Space
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from tsmlib.envs.mujoco_bulk import CHUNK, Mismatch, without_log
@@ -339,8 +339,20 @@ class Vectorised(_Described):
         self.mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
-        seeds: Any = self._seeds(seed, states)  # as VectorEnv.reset takes them, whatever its signature says
-        first, _ = self.env.reset(seed=seeds)
+        seeds = self._seeds(seed, states)
+        given: Any = seeds  # as copies take them, whatever the signature of VectorEnv.reset says
+        if not isinstance(self.env.unwrapped, SyncVectorEnv | AsyncVectorEnv) and (
+            seed is None or isinstance(seed, int)
+        ):
+            given = seeds[0]
+        try:
+            first, _ = self.env.reset(seed=given)
+        except (TypeError, gymnasium.error.Error) as error:
+            if given is not seeds:
+                raise
+            raise UnsupportedEnvironment(
+                f"{self.id} takes no seed for each of its episodes ({error!s:.100}); give one for all of them, seed=0"
+            ) from error
         self._begin(np.stack([self._checked(x) for x in first]).astype(np.float64))
         return self.last
 
@@ -360,7 +372,7 @@ class Vectorised(_Described):
                 self.returns[i] += rewards[i]
                 self.steps[i] += 1
                 self.terminated[i], self.ended[i] = terminated[i], over[i]
-            if over.any() and self.mode == AutoresetMode.DISABLED:
+            if over.any() and not self.ended.all() and self.mode == AutoresetMode.DISABLED:
                 self.env.reset(options={"reset_mask": over})
         self.last = states[:, -1].copy() if actions.shape[1] else self.last
         return states

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tsmlib.models.features import Features
 from tsmlib.models.layers import on_device_of
-from tsmlib.sampling import Noise
+from tsmlib.sampling import Noise, NoNoise, by_generator
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Window
 
@@ -52,7 +52,8 @@ class DynamicsModel(Protocol):
 class SegmentModel(Protocol):
     """The least that a model of one's own needs: (past, actions (B, K <= H, du)) -> states (B, K, dx).
 
-    ``predict_segment`` may take a ``generator`` to draw samples from; without an attribute ``past_len`` the past has H
+    ``predict_segment`` may take a ``generator``, a torch.Generator to draw a sample from or None for the mode; planners
+    ask once per candidate, each time with the same random numbers. Without an attribute ``past_len`` the past has H
     steps. A DynamicsModel has it too where whole segments are faster than steps.
     """
 
@@ -72,6 +73,8 @@ _LEAST = (
 class Adapted:
     """A SegmentModel as a DynamicsModel, to roll out: its steps are segments of one action with noise of their own.
 
+    The model draws from torch generators alone: rows that share noise, or have several generators, go in parts.
+
     TypeError naming what the model lacks, or what is not as it has to be.
     """
 
@@ -87,7 +90,16 @@ class Adapted:
         self.stochastic: bool = getattr(model, "stochastic", self.samples)
 
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-        noise = {"generator": generator} if self.samples else {}
+        if not self.samples:
+            return self._checked(past, actions)
+        if generator is None or isinstance(generator, torch.Generator | NoNoise):
+            return self._checked(past, actions, generator=generator)
+        parts = by_generator(len(actions), generator)
+        each = (self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own) for rows, own in parts)
+        return torch.cat(list(each))
+
+    def _checked(self, past: Segment, actions: Tensor, **noise: Noise | None) -> Tensor:
+        """The model's own prediction; TypeError where it is of another shape."""
         states = self.model.predict_segment(past, actions, **noise)
         expected = (*actions.shape[:2], past.states.shape[2])
         if not isinstance(states, Tensor) or states.shape != expected:

@@ -47,7 +47,7 @@ class BatchedLinear(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__()
-        bound = inputs**-0.5
+        bound = inputs**-0.5 if inputs else 0.0  # of no input, a target of a task without targets, as torch has it
 
         def drawn(*shape: int) -> nn.Parameter:
             return nn.Parameter(torch.stack([torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]))

@@ -49,7 +49,8 @@ class Plan:
 
     actions (B, T, du); parameters (B, *shape) they decode from; states (S, B, T, dx) predicted for them;
     predicted_return (B,): expected and undiscounted; curve (iterations + 1, B): predicted return of the best so far,
-    from the start on; seconds; trace (iterations + 1, B, *shape): the parameters of the best so far, see ``plan_at``.
+    from the start on, -inf where none was finite yet; seconds; trace (iterations + 1, B, *shape): the parameters of the
+    best so far, see ``plan_at``.
     """
 
     actions: Tensor

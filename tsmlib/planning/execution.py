@@ -31,9 +31,10 @@ SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be re
 class Trial:
     """Actions executed in the true simulator.
 
-    actions (B, T, du); states (B, T + 1, dx) from the start on; executed_return (B,): undiscounted; final_distance
-    (B,): metres, or as the task's measure of success has it, NaN where it has none; plan: where the actions came from,
-    with the predicted return, if from a plan; observed (B, T + 1, dx): what the sensors said, where they are noisy.
+    actions (B, T, du), of a controller zero after the end of an episode; states (B, T + 1, dx) from the start on;
+    executed_return (B,): undiscounted; final_distance (B,): metres, or as the task's measure of success has it, NaN
+    where it has none; plan: where the actions came from, with the predicted return, if from a plan; observed
+    (B, T + 1, dx): what the sensors said, where they are noisy.
 
     Behind delayed actions ``actions`` are those that were given. The executed return charges those that arrived, a
     predicted return those given, so that the gap holds the penalty of the last tau torques.
@@ -74,15 +75,17 @@ class Trial:
 def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10) -> Trial:
     """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say.
 
+    Actions beyond [-1, 1] are clipped, and the trial holds and charges them as they were executed.
     past_len: steps of past that a controller sees; those before the episode are x_0 repeated and no action.
     A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
     """
     actions = plan.actions if isinstance(plan, Plan) else plan
     if isinstance(actions, Tensor):
+        actions = actions.clamp(-1, 1)
         seen, run = _run(task, open_loop(actions), actions.shape[1])
     else:
         seen, run = _run(task, actions, task.horizon, past_len)
-        actions = torch.from_numpy(seen.actions)
+        actions = _whole_actions(seen, task.horizon)
     return _measured(task, run, seen, actions, plan if isinstance(plan, Plan) else None)
 
 
@@ -118,7 +121,7 @@ def mpc(
 
     Of the trial's plan, ``predicted_return`` is the first plan's, ``curve`` (plans, B) every plan's for the whole
     episode, the return executed until then included, and ``states`` (1, B, T, dx) the part of every predicted rollout
-    that was executed.
+    that was executed; where all episodes ended before, the last of them repeats.
     """
     if every < 1:
         raise ValueError(f"every is {every}, expected a positive number of steps")
@@ -132,9 +135,11 @@ def mpc(
             return actions
 
         seen, run = _run(task, controller, horizon, past_len=horizon + past_len)
-    actions, returns = torch.from_numpy(seen.actions), torch.stack(planning.returns)
+    actions, returns = _whole_actions(seen, horizon), torch.stack(planning.returns)
+    states = torch.cat(planning.rollouts, 2)[:, :, : seen.horizon]
+    after = states[:, :, -1:].expand(-1, -1, horizon - seen.horizon, -1)
     made = Plan(
-        actions=actions, parameters=actions, states=torch.cat(planning.rollouts, 2)[:, :, : seen.horizon],
+        actions=actions, parameters=actions, states=torch.cat([states, after], 2),
         predicted_return=returns[0], curve=returns, seconds=time.perf_counter() - began,
     )  # fmt: skip
     return _measured(task, run, seen, actions, made)
@@ -198,6 +203,11 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
         return torch.cat([per_step[..., done : done + 1] + executed, per_step[..., done + 1 :]], -1)
 
     return total
+
+
+def _whole_actions(seen: Trajectories, horizon: int) -> Tensor:
+    """The actions (B, T, du) of episodes that may all have ended before: zeros from there on."""
+    return F.pad(torch.from_numpy(seen.actions), (0, 0, 0, horizon - seen.horizon))
 
 
 def _measured(task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None) -> Trial:

@@ -52,16 +52,14 @@ def adam(
         if not iteration:
             _check_gradient(states, returns)
         search.update(parameters.detach(), returns.detach())
-        optimizer.zero_grad()
-        (-returns.sum()).backward()
-        assert parameters.grad is not None
-        sound = torch.isfinite(parameters.grad)
+        (gradient,) = torch.autograd.grad(-returns.sum(), parameters)  # of what is searched alone, not of weights
+        sound = torch.isfinite(gradient)
         if not iteration and not sound.all():
             raise FloatingPointError(
                 "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
                 "reward, and add a tiny constant under it"
             )
-        parameters.grad[~sound] = 0  # where the model diverges later on, a restart stays
+        parameters.grad = gradient.where(sound, 0)  # where the model diverges later on, a restart stays
         optimizer.step()
     search.update(parameters.detach(), search.returns_of(parameters))
     return search.plan()
@@ -157,7 +155,7 @@ Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, seed: int, progress: str) -> Plan:
     """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
     generator, space = torch.Generator().manual_seed(seed), search.space
-    search.update(search.start, search.returns_of(search.start))
+    search.update(search.start, search.returns_of(search.start), needed=False)  # candidates may do what it cannot
     mean = search.parameters
     deviation = torch.full_like(mean, space.scale)
     for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
@@ -304,10 +302,11 @@ class _Search:
         judged_by_all = torch.zeros_like(rough, dtype=torch.bool).scatter(0, best, True)
         return torch.full_like(rough, -torch.inf).scatter(0, best, returns), judged_by_all
 
-    def update(self, parameters: Tensor, returns: Tensor) -> None:
+    def update(self, parameters: Tensor, returns: Tensor, *, needed: bool = True) -> None:
+        """Keep what is better; FloatingPointError where nothing finite is found until now, and it is ``needed``."""
         value, index = returns.where(torch.isfinite(returns), -torch.inf).max(0)
         hopeless = torch.isinf(torch.maximum(value, self.returns))
-        if hopeless.any():
+        if needed and hopeless.any():
             raise FloatingPointError(
                 f"no candidate for target {int(hopeless.nonzero()[0])} has a predicted return that is finite; the "
                 "model diverges on all of them, or the reward is infinite"

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
+import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -35,8 +36,8 @@ class Task:
     the arm's tasks, in metres, and what has to arrive there, fingertip or object; (B, 0) and None of others.
 
     ``from_env`` makes one of any environment; ``standard`` gives the paper's, ``with_reward`` another reward from the
-    same starts. ValueError where a target is out of the arm's reach, or the reward is not one number per step;
-    FloatingPointError where it is NaN.
+    same starts. ValueError where a target is out of the arm's reach, the horizon beyond the environment's limit of
+    time, or the reward not one number per step; FloatingPointError where it is NaN.
     """
 
     name: str
@@ -57,25 +58,37 @@ class Task:
     @classmethod
     def from_env(
         cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 1000, success: Success | None = None,
-        tolerance: float = 0.0, name: str = "",
+        tolerance: float | None = None, name: str = "",
     ) -> Task:  # fmt: skip
         """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
         states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
 
-        Neighbouring seeds share starts, so the default lies far from the 0 of ``collect_random``: what is measured does
-        not begin where training data began.
+        Neighbouring seeds share starts: ``collect_random`` begins its episode i by the reset of its ``seed + i``. The
+        default is held out from up to 1,000 episodes of its seed 0; of more, or of another seed, give the first beyond
+        theirs, which is that seed plus the number of episodes.
 
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
+
+        ValueError where ``success`` gives distances, and no ``tolerance``, the distance within which they are one.
         """
         seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
         seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
-        return cls(
-            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance, seeds, success,
-            begun.action_dim,
+        task = cls(
+            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance or 0.0, seeds,
+            success, begun.action_dim,
         )  # fmt: skip
+        if success is not None and tolerance is None:
+            away, _ = task.judged(torch.from_numpy(start)[:, None].expand(-1, horizon + 1, -1))  # standing still
+            if not away.isnan().all():
+                raise ValueError(
+                    f"success of task {task.name!r} is a distance, {float(away[0]):.3g} at the first start, and no "
+                    "tolerance is given; give the distance within which a trial is a success, tolerance=0.05 for "
+                    "example, or a success that is true or false"
+                )
+        return task
 
     @classmethod
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
@@ -87,6 +100,12 @@ class Task:
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
+        spec = gymnasium.registry.get(self.env) if self.seeds else None  # an arm goes on
+        if spec and (limit := spec.max_episode_steps) and self.horizon > limit:
+            raise ValueError(
+                f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; give horizon={limit} or "
+                f"less, or register a longer one: gymnasium.register(id, ..., max_episode_steps={self.horizon})"
+            )
         if self.seeds and len(self.seeds) != len(self):
             raise ValueError(f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each")
         if self.position is not None:
