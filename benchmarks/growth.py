@@ -118,7 +118,6 @@ def axes_of(threads: int) -> dict[str, tuple[tuple[int, ...], dict[str, Callable
 
     def learn(copies: int) -> float:
         policy: Any = OneStepPolicy(reach.start.shape[1], DU, angles=small.features.angles, copies=copies)
-        policy.features.load_state_dict(small.features.state_dict())
         draw = episodes_from(torch.from_numpy(reach.start))
         options = LearningOptions(iterations=2, record_every=2)
         return learn_policy(policy, small, getattr(rewards, reach.name), draw, options).seconds[-1]

@@ -50,7 +50,6 @@ def main() -> None:
             if space == "latent"
             else OneStepPolicy(state_dim, 2, angles=model.features.angles, copies=copies)
         )
-        learner.features.load_state_dict(model.features.state_dict())
         options = LearningOptions(iterations=n, record_every=n, horizon=horizon)
         return learn_policy(learner, model, reward, draw, options).seconds[-1]
 

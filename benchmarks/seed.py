@@ -180,14 +180,8 @@ def policies(net: Any, prior: Any, task: Task, n: int, iterations: int) -> Part:
         OneStepPolicy(dx, 2, angles=angles, copies=3) if prior is None
         else SegmentPolicy(dx, prior, angles=angles, copies=3)
     )  # fmt: skip
-    learner.features.load_state_dict(net.features.state_dict())
-
-    def updates() -> float:
-        return learn_policy(learner, net, task.reward_for, draw, LearningOptions(iterations=n, record_every=n)).seconds[
-            -1
-        ]
-
-    return Part("policy", updates, iterations / n)
+    few = LearningOptions(iterations=n, record_every=n)
+    return Part("policy", lambda: learn_policy(learner, net, task.reward_for, draw, few).seconds[-1], iterations / n)
 
 
 if __name__ == "__main__":

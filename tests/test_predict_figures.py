@@ -104,6 +104,17 @@ def test_both_ensembles_are_named_by_their_loss() -> None:
     assert {"ensemble (Gaussian)", "ensemble (squared error)"} <= set(named)
 
 
+def test_on_a_logarithmic_axis_the_mean_over_seeds_is_that_of_the_logarithm() -> None:
+    rows = np.array([[1.0, 1.0], [4.0, 4.0]])
+    (ax,) = figures.against_horizon({"error": {TSM: rows}}, "units", log=["error"]).axes
+    np.testing.assert_allclose(lines(ax, TSM)[0].get_ydata(), 2.0)
+    (shade,) = ax.collections
+    edge = shade.get_paths()[0].vertices[:, 1]
+    assert edge.min() * edge.max() == pytest.approx(4.0)  # as far up as down, as factors of 2
+    with pytest.raises(ValueError, match="0 cannot stand on a logarithmic axis"):
+        figures.against_horizon({"error": {TSM: np.array([[0.0], [4.0]])}}, "units", log=["error"])
+
+
 def test_the_line_against_training_time_joins_the_first_trainings_and_the_others_are_marked() -> None:
     seconds, values = np.array([2320.0, 580, 2320]), np.array([1.0, 4, 3])
     (ax,) = figures.training_time({"cost": {TSM: (seconds, values)}}).axes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -308,6 +309,8 @@ def test_a_curve_is_nearly_done_when_it_has_95_of_100_of_its_gain() -> None:
     curve = torch.tensor([[-10.0, -5.0, -1.0], [-2.0, -5.0, -1.0], [-0.4, -5.0, -1.0], [0.0, -5.0, 4.0]])
     assert iterations_to(curve).tolist() == [2, 0, 3]
     assert iterations_to(curve, 0.5).tolist() == [1, 0, 3]
+    late = torch.tensor([[-math.inf], [-5.0], [-3.0], [-1.0]])  # of a start without a finite return
+    assert iterations_to(late).tolist() == [3]
 
 
 def test_mppi_at_a_low_temperature_takes_the_best_candidate_and_at_a_high_one_their_mean() -> None:

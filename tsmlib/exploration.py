@@ -34,7 +34,7 @@ from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json, StoreError, spelled, unspelled, writer_lock
+from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.fit import Loss, TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
@@ -52,7 +52,6 @@ class Trainable(DynamicsModel, Protocol):
 Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
 Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
 Episodes = Callable[[int], Trajectories | None]  # round -> episodes that no plan made, or none
-DISCARDED = "discarded"
 
 
 @dataclass(frozen=True)
@@ -159,13 +158,13 @@ def explore(
         if folder is not None:
             stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
-            place = None if folder is None else _Round(folder / f"round-{k:03d}", spelled(identity))
+            place = None if folder is None else _Round(folder / f"round-{k:03d}", encode_nonfinite(identity))
             new, record = (
                 _collected(k, model, prior, train, tasks, options, seed, place)
                 if episodes is None else (episodes(k), dict[str, float]())
             )  # fmt: skip
             found.episodes.append(new)
-            before = (found.records[-1]["env_steps"] if found.records else 0) + record.pop(DISCARDED, 0)
+            before = (found.records[-1]["env_steps"] if found.records else 0) + int(record.get("discarded_steps", 0))
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))
                 found.held_out = found.held_out.joined(new.take(slice(n)))
@@ -183,10 +182,7 @@ def _collected(
     k: int, model: Trainable, prior: ActionPrior | None, like: Trajectories, tasks: Tasks,
     options: ExplorationOptions, seed: int, place: _Round | None,
 ) -> tuple[Trajectories, dict[str, float]]:  # fmt: skip
-    """The episodes of round k and what is said of them, from the folder if they are there.
-
-    DISCARDED, said beside what a record has: steps of attempts that became unstable.
-    """
+    """The episodes of round k and what is said of them, from the folder if they are there."""
     if place is not None and (stored := place.episodes()) is not None:
         return stored
     task = tasks(k)
@@ -215,7 +211,7 @@ def _collected(
                 raise
             discarded += (fault.step + 1) * len(aim)
             aim, lost = aim.take([i for i in range(len(aim)) if i != fault.episode]), lost + 1
-    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost, DISCARDED: discarded}
+    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost, "discarded_steps": discarded}
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
     episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
     if place is not None:
@@ -324,7 +320,7 @@ class _Round:
             shutil.rmtree(checkpoint)
 
     def _header(self, record: Mapping[str, float]) -> dict[str, Json]:
-        return {"identity": dict(self.identity), "record": spelled(dict(record))}
+        return {"identity": dict(self.identity), "record": encode_nonfinite(dict(record))}
 
     def _record(self, path: Path) -> dict[str, float]:
         header = artifacts.read_header(path)
@@ -336,4 +332,4 @@ class _Round:
                 f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "
                 "or go back to those settings"
             )
-        return dict(unspelled(header["record"]))
+        return dict(decode_nonfinite(header["record"]))

@@ -30,7 +30,6 @@ def main() -> None:
     reward = task.reward_for
     for name, (iterations, decay) in TRIES.items():
         policy = OneStepPolicy(starts.shape[1], 2, angles=model.features.angles, copies=3)
-        policy.features.load_state_dict(model.features.state_dict())
         curve = learn_policy(
             policy, model, reward, episodes_from(starts),
             LearningOptions(horizon=task.horizon, iterations=iterations, lr_decay=decay, record_every=iterations),

@@ -261,7 +261,7 @@ def stamp(lines: pd.DataFrame) -> str:
     models = ", ".join(zoo.look(model).name for model in dict.fromkeys(several_of["model"]))
     return (
         f"{EnvSpec.parse(str(lines['env'].iloc[0])).name}, training seed 0"
-        + f"; small marks: the others of seeds {seeds} after {more}, of {models}" * bool(more)
+        + f"; small marks: the other training seeds of {seeds}, after {more}, of {models}" * bool(more)
         + f"; one network each; predictions: n = {EPISODES} fresh episodes, plans and "
         f"violations: n = {targets} validation targets"
     )

@@ -24,11 +24,11 @@ the true simulator returns as much in codes of the last prior as in those of the
 run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
 reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
-beside them, in the files that are named: mbrl-lib's loop in 10_explore and the scores of its models as peers_pets (both
-benchmarks/peers), policies without a model as model_free
-(benchmarks/model_free), in place of those of the same algorithm and environment.
+beside them, in the files that are named: of benchmarks/peers mbrl-lib's loop in 10_explore and the scores of its models
+in peers_pets, of benchmarks/model_free policies without a model in model_free.
 
-Rows take the place of those of the same environment, model, method, metric and seed in data/results; all others stay.
+Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
+those of all seeds of the same environment and algorithm; all others stay.
 """
 
 from __future__ import annotations

@@ -119,18 +119,23 @@ def band(lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, half
 
 
+def interval_ends(lines: np.ndarray, log: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and ends of the 95 % interval, (T,) each, of lines (k, T); log: those of the logarithm."""
+    mean, half = band(np.log(lines) if log else lines)
+    found = mean, mean - half, mean + half
+    return (np.exp(found[0]), np.exp(found[1]), np.exp(found[2])) if log else found
+
+
 def curve(
-    ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, look: Props, shift: float = 0,
-    marks: Sequence[int] = (), factor: bool = False,
+    ax: Axes, at: np.ndarray, mean: np.ndarray, low: np.ndarray, high: np.ndarray, look: Props, shift: float = 0,
+    marks: Sequence[int] = (),
 ) -> None:  # fmt: skip
-    """A line, or a single point above all lines, and its band; shift: a share of the way from one marker to the next,
-    so that those of lines part; marks: the places in ``at`` that markers stand at instead; factor: ``half`` is one, by
-    which the band reaches up and down."""
+    """A line, or a single point above all lines, and its band from ``low`` to ``high``; shift: a share of the way from
+    one marker to the next, so that those of lines part; marks: the places in ``at`` that markers stand at instead."""
     every = max(1, len(at) // 5)
     ax.plot(at, mean, **look, zorder=3 if len(at) > 1 else 4, markevery=list(marks) or (int(shift * every), every))
-    if (half != factor).any():
-        ends = (mean / half, mean * half) if factor else (mean - half, mean + half)
-        ax.fill_between(at, *ends, color=look["color"], alpha=0.11, lw=0, zorder=2)
+    if (low < high).any():
+        ax.fill_between(at, low, high, color=look["color"], alpha=0.11, lw=0, zorder=2)
 
 
 def bars(ax: Axes, at: np.ndarray, mean: np.ndarray, half: np.ndarray, main: str) -> None:

@@ -185,7 +185,8 @@ def _panel(
         ended = 0.0 if word == "seconds" else 0.01 * far * (1 + sum(m not in strip for m in [*drawn][:i]))
         place = np.array([strip.get(method, at[-1] + ended)])
         if method not in fixed:
-            axes.curve(ax, at, mean, half if banded else np.zeros(len(at)), look, shift=i / len(drawn))
+            reach = half if banded else np.zeros(len(at))
+            axes.curve(ax, at, mean, mean - reach, mean + reach, look, shift=i / len(drawn))
         if method in strip:
             ax.plot(place, mean[-1:], **{**look, "ls": ""}, zorder=4)
         if barred and half[-1]:

@@ -133,24 +133,23 @@ def against_horizon(
     figure, grid = panels(len(titles), columns, 1.55, width=width, head=0.1)
     banded = False
     for i, (title, ax) in enumerate(zip(titles, grid, strict=True)):
-        mine, factor = own.get(title, {}), title in log
+        mine, logarithmic = own.get(title, {}), title in log
         every = {**mine, **checked[title]}.values()
         medians, means = (np.concatenate([of(rows, 0) for rows in every]) for of in (np.median, np.mean))
-        _scale(ax, title, medians, means, reference.get(title), title in log)
-        lines = {
-            method: np.exp(axes.band(np.log(rows))) if factor else axes.band(rows)
-            for method, rows in checked[title].items()
-        }
+        if logarithmic and (least := min(rows.min() for rows in every)) <= 0:
+            raise ValueError(f"{title}: {axes.spell(least)} cannot stand on a logarithmic axis")
+        _scale(ax, title, medians, means, reference.get(title), logarithmic)
+        lines = {method: axes.interval_ends(rows, logarithmic) for method, rows in checked[title].items()}
         notes = []
-        for j, (method, (mean, half)) in enumerate(lines.items()):
+        for j, (method, (mean, lowest, highest)) in enumerate(lines.items()):
             steps = np.arange(1, len(mean) + 1)
             marks = [step - 1 for step in list(measured)[j % 3 :: 3] if step <= len(mean)]
-            axes.curve(ax, steps, mean, half, look_of[method], j / len(lines), marks, factor)
+            axes.curve(ax, steps, mean, lowest, highest, look_of[method], j / len(lines), marks)
             notes += axes.outside(ax, steps, mean, method)
-            banded |= bool((half != factor).any())
+            banded |= bool((lowest < highest).any())
         for method, rows in mine.items():
             some = np.linspace(0, rows.shape[1] - 1, 5).astype(int)
-            notes += axes.diamonds(ax, "y", some + 1, rows.mean(0)[some], method)
+            notes += axes.diamonds(ax, "y", some + 1, axes.interval_ends(rows, logarithmic)[0][some], method)
         ax.set_xlim(0, max(rows.shape[1] for part in (checked[title], mine) for rows in part.values()) + 1)
         ax.set(title=axes.wrapped(title, width / columns - 0.2), ylabel=ylabels[title])
         axes.foot(ax, "steps ahead" if i + columns >= len(titles) else "", notes, width / columns - 0.4)
@@ -162,8 +161,6 @@ def against_horizon(
 
 def _scale(ax: axes.Axes, title: str, points: np.ndarray, near: np.ndarray, level: float | None, log: bool) -> None:
     """The y axis for points of lines, for others where they are near, and a dashed reference."""
-    if log and points.min() <= 0:
-        raise ValueError(f"{title}: {axes.spell(points.min())} cannot stand on a logarithmic axis")
     low, high = axes.limits(points, near, [] if level is None else [level], log)
     ax.locator_params(nbins=6)
     if log:

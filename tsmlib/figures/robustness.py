@@ -76,7 +76,7 @@ def filtering_errors(
             at, (mean, half) = np.arange(1, row.shape[1] + 1), axes.band(row)
             if method in now[title]:
                 at, mean, half = np.append(0, at), np.append(now[title][method], mean), np.append(0, half)
-            axes.curve(ax, at, mean, half, look_of[method])
+            axes.curve(ax, at, mean, mean - half, mean + half, look_of[method])
             notes += axes.outside(ax, at, mean, method)
         for method, row in own.get(title, {}).items():
             some = np.arange(0, row.shape[1], 3)

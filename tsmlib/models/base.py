@@ -92,11 +92,12 @@ class Adapted:
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         if not self.samples:
             return self._checked(past, actions)
-        if generator is None or isinstance(generator, torch.Generator | NoNoise):
-            return self._checked(past, actions, generator=generator)
-        parts = by_generator(len(actions), generator)
-        each = (self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own) for rows, own in parts)
-        return torch.cat(list(each))
+        if generator is None or isinstance(generator, NoNoise):
+            return self._checked(past, actions, generator=None)
+        return torch.cat([  # one after the other, since parts may share a generator, which is set back between them
+            self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own)
+            for rows, own in by_generator(len(actions), generator)
+        ])  # fmt: skip
 
     def _checked(self, past: Segment, actions: Tensor, **noise: Noise | None) -> Tensor:
         """The model's own prediction; TypeError where it is of another shape."""

@@ -203,9 +203,10 @@ def plan_at(plan: Plan, iteration: int, predict: Predictor, reward: Reward, spac
 def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
     """After how many iterations a plan's ``curve`` (iterations + 1, B) has ``share`` of all that it gains: (B,).
 
-    A curve that gains nothing is there from the start (claim C15).
+    A curve that gains nothing is there from the start (claim C15). It begins with its first finite value.
     """
-    return (curve >= curve[0] + share * (curve[-1] - curve[0])).int().argmax(0)
+    first = curve.gather(0, curve.isfinite().int().argmax(0, keepdim=True))[0]
+    return (curve >= first + share * (curve[-1] - first)).int().argmax(0)
 
 
 @torch.no_grad()

@@ -70,7 +70,7 @@ class Task:
         reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
         environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
 
-        ValueError where ``success`` gives distances, and no ``tolerance``, the distance within which they are one.
+        ValueError where ``success`` gives a distance and no ``tolerance``, the distance that counts as a success.
         """
         seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:

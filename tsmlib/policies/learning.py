@@ -265,7 +265,7 @@ def _clip(parameters: Sequence[Tensor], norm: float) -> Tensor:
     found = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
     if norm:
         for g in gradients:
-            g *= (norm / found.clamp(min=norm)).reshape(-1, *[1] * (g.ndim - 1))
+            g *= (norm / found).clamp(max=1).reshape(-1, *[1] * (g.ndim - 1))
     return found
 
 

@@ -182,21 +182,22 @@ def loads(text: str | bytes) -> Json:
     return json.loads(text, parse_constant=refuse)
 
 
-def spelled(value: Json) -> Any:
-    """JSON with the numbers that it does not have as texts: "nan", "inf", "-inf"."""
+def encode_nonfinite(value: Json) -> Any:
+    """JSON in which the numbers that it does not have are the texts "nan", "inf" and "-inf"."""
     if isinstance(value, float | np.floating):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, Mapping):
-        return {name: spelled(item) for name, item in value.items()}
-    return [spelled(item) for item in value] if isinstance(value, list | tuple) else value
+        return {name: encode_nonfinite(item) for name, item in value.items()}
+    return [encode_nonfinite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def unspelled(value: Json) -> Any:
-    """What ``spelled`` was given; tuples have become lists."""
+def decode_nonfinite(value: Json) -> Any:
+    """The numbers again. Any text that is one of the three becomes one, so only for values without texts of their own;
+    tuples have become lists."""
     if isinstance(value, Mapping):
-        return {name: unspelled(item) for name, item in value.items()}
+        return {name: decode_nonfinite(item) for name, item in value.items()}
     if isinstance(value, list):
-        return [unspelled(item) for item in value]
+        return [decode_nonfinite(item) for item in value]
     return float(value) if isinstance(value, str) and value in ("nan", "inf", "-inf") else value
 
 

@@ -86,14 +86,18 @@ def readme_plans(env: str) -> str:
         way.model: cost for way, cost in planning_results.costs_of(rows).items() if way.search_space == "latent"
     }  # fmt: skip
     there = [model for model in BASELINES if model in costs]
+    spell, apart = planning_results.spell_effect, planning_results.paired_differences
     said = [
-        f"`{model}` {', '.join(planning_results.spell_effect((costs[model] - costs[each]).dropna()) for each in there)}"
+        f"`{model}` {', '.join(spell(apart(costs[model], costs[each])) for each in there)}"
         for model in (OURS, PAPERS) if there and model in costs
     ]  # fmt: skip
     if not said:
         return ""
     others = ", ".join(f"`{each}`" for each in there)
-    return f"Cost of plans (m) minus that of {others}, 95 % over targets (over seeds too): {'; '.join(said)}. "
+    return (
+        f"Cost of plans (m) minus that of {others}, ± 95 % over targets (in brackets over targets and seeds): "
+        f"{'; '.join(said)}. "
+    )
 
 
 def readme_loops(env: str) -> str:
@@ -124,8 +128,8 @@ def readme_training(env: str) -> str:
 
     scores = "; ".join(f"`{model}` {ratio(before, model)}, {ratio(after, model)}" for model in (PAPERS, OURS))
     return (
-        f"[Training time](benchmarks/settings/README.md) decides: the energy score 80 steps ahead over the best "
-        f"baseline's, after {shorter / shipped:g} of it and as shipped ({_seeds(before)}, validation): {scores}."
+        f"[Training time](benchmarks/settings/README.md) decides: energy score 80 steps ahead over the best "
+        f"baseline's, after {shorter / shipped:g} of it and as shipped ({_seeds(before)}): {scores}."
     )
 
 
@@ -158,10 +162,9 @@ def _leaning(verdict: evaluate.Verdict) -> str:
     the readings by which it fails."""
     if verdict.word != INCONCLUSIVE:
         return ""
-    against = sum(effect.against for effect in verdict.effects[""])
-    told = f"the intervals of {against} of its {len(verdict.effects[''])} checks lie against it" * (against > 0)
-    fails = ", ".join(dict.fromkeys(reading.split()[0] for reading in verdict.against))
-    said = "; ".join(filter(None, [told, f"by reading {fails} it fails" * bool(fails)]))
+    against = sum(effect.against for effect in verdict.checks)
+    told = f"the intervals of {against} of its {len(verdict.checks)} checks lie against it" * (against > 0)
+    said = "; ".join(filter(None, [told, claims_report.failing(verdict)]))
     return f" ({said})" * bool(said)
 
 
@@ -270,7 +273,7 @@ mode), where there are rows:
 
 The cross-entropy method over codes; the cost of `{OURS}` and its size of the gap minus those of each other method on
 the same targets, means over the training seeds above; half the 95 % interval is over targets, in brackets over targets
-and training seeds (two-way random effects, with as many degrees of freedom as there are seeds but one):
+and training seeds (two-way random effects, with one degree of freedom fewer than seeds):
 
 {table.markdown(planning_results.paired_table(by_target, PUSH, OURS))}
 
@@ -285,7 +288,7 @@ Target by target, as above:
 ## Policies
 
 Learned inside the models, and model-free ones in the environment; means of the last record
-over k training seeds, or over k copies of the only one, with half the 95 % t interval.
+with half the 95 % t interval over training seeds, or over the copies that learned in the models of a single one.
 
 {policies_results.policies_table(policies_results.learning_curves(learned))}
 

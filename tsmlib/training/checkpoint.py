@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json, StoreError, spelled, unspelled, writer_lock
+from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.training.precision import native_bf16
 
@@ -72,7 +72,9 @@ class TrainingState(Generic[C]):
         self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
         configuration = model.config() if isinstance(model, Configured) else {}
         began = artifacts.digest(model.state_dict())[:16]
-        self.identity: dict[str, Json] = spelled({**identity, "configuration": configuration, "began with": began})
+        self.identity: dict[str, Json] = encode_nonfinite(
+            {**identity, "configuration": configuration, "began with": began}
+        )
         self.folder = folder
         self.step, self.seconds = 0, 0.0
         self.keep(math.inf)
@@ -108,7 +110,7 @@ class TrainingState(Generic[C]):
             identity=self.identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
             made_by=self._made_by(), best_step=self.best_step, best_loss=self.best_loss,
         )  # fmt: skip
-        save_generation(self.folder, self.step, tensors, header=spelled(header))
+        save_generation(self.folder, self.step, tensors, header=encode_nonfinite(header))
 
     def load(self) -> None:
         """Go on from the newest whole generation, if there is one.
@@ -136,7 +138,10 @@ class TrainingState(Generic[C]):
                 for name, tensor in groups[group].items():
                     index, _, moment = name.partition(".")
                     held.setdefault(int(index), {})[moment] = tensor
-            curve, made_by = type(self.curve)(**unspelled(header["curve"])), {"device": "cpu", **header["made_by"]}
+            curve, made_by = (
+                type(self.curve)(**decode_nonfinite(header["curve"])),
+                {"device": "cpu", **header["made_by"]},
+            )
             step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:

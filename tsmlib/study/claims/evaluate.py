@@ -132,13 +132,18 @@ class Verdict:
         return min(self.effects[""], key=lambda effect: effect.ease)
 
     @property
-    def against(self) -> list[str]:
-        """The other readings of the paper under which it fails, where it is not decided as the paper words it."""
+    def checks(self) -> list[Effect]:
+        """The effects that have to hold: of the primary reading, without premises."""
+        return [effect for effect in self.effects[""] if not effect.check.premise]
+
+    @property
+    def failing_readings(self) -> dict[str, int]:
+        """The other readings of the paper under which an inconclusive claim fails -> training seeds of what fails."""
         named = self.effects.items() if self.word == INCONCLUSIVE else ()
-        return [
-            reading + ", by one training seed" * all(effect.seeds == 1 for effect in found if effect.state == "fails")
+        return {
+            reading: max(effect.seeds for effect in found if effect.state == "fails")
             for reading, found in named if reading and state_of(found) == "fails"
-        ]  # fmt: skip
+        }  # fmt: skip
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -233,7 +238,7 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
         "fails": (FAILED, f"{measured} {failing} of {len(effects[''])} checks fail."),
         "open": (
             INCONCLUSIVE,
-            f"{measured} {_undecided(key, len(effects['']))}" + f" It fails with: {'; '.join(fails)}." * bool(fails),
+            f"{measured} {_undecided(key, len(effects['']))}" + f" It fails under {', '.join(fails)}." * bool(fails),
         ),
         "missing": (UNTESTABLE, key.why),
         "void": (UNTESTABLE, key.why),

@@ -21,7 +21,7 @@ from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import ROOT
 
 DECIDED = (REPLICATED, DEPENDENT, FAILED)
-ANSWERS = {REPLICATED: "yes", FAILED: "no", INCONCLUSIVE: "open", UNTESTABLE: "not measured"}  # to our own questions
+ANSWERS = {REPLICATED: "yes", FAILED: "no", INCONCLUSIVE: "open", UNTESTABLE: "not testable"}  # to our own questions
 
 
 def counts(verdicts: Sequence[Verdict]) -> str:
@@ -40,11 +40,11 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
     """
     lines = []
     for verdict, other in zip(verdicts, ours, strict=True):
-        claim, key, checks = verdict.claim, verdict.key, len(verdict.effects[""])
+        claim, key, checks = verdict.claim, verdict.key, len(verdict.checks)
         found = "no rows yet" if key.value is None else key.estimate
         lines.append({
             "": claim.id, "the paper says": f"{claim.statement} ({claim.place})",
-            "verdict": f"**{verdict.word}**" + against(verdict),
+            "verdict": "; ".join(filter(None, [f"**{verdict.word}**", failing(verdict)])),
             "with our model": other.word.lower(), "measured": claim.statistic,
             "deciding check": f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}",
             "n": key.n, "shown in": _links(claim, root),
@@ -52,9 +52,10 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
     return markdown(pd.DataFrame(lines))
 
 
-def against(verdict: Verdict) -> str:
-    """Readings under which an inconclusive claim fails, in words; else empty."""
-    return f"; not replicated by {'; '.join(verdict.against)}" if verdict.against else ""
+def failing(verdict: Verdict) -> str:
+    """Readings under which an inconclusive claim fails, in words; '' without any."""
+    told = (f"{name}{' (one training seed)' * (seeds == 1)}" for name, seeds in verdict.failing_readings.items())
+    return f"it fails under {', '.join(told)}" if verdict.failing_readings else ""
 
 
 def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
@@ -88,9 +89,10 @@ def readings(verdicts: Sequence[Verdict]) -> str:
     """The claims of which a check changes sides under another reading of the paper, and those of which none does."""
     found: dict[str, tuple[list[str], list[str]]] = {}
     for verdict in verdicts:
-        first = [effect.right_side for effect in verdict.effects[""]]
+        first = [effect.right_side for effect in verdict.checks]
         for reading, effects in verdict.effects.items():
-            if reading and any(effect.value is not None for effect in effects):
+            asked = state_of(effects) != "void" and state_of(verdict.effects[""]) != "void"
+            if reading and asked and any(effect.value is not None for effect in effects):
                 same = [effect.right_side for effect in effects] == first
                 found.setdefault(reading, ([], []))[same].append(verdict.claim.id)
     lines = [(reading, *map(", ".join, sides)) for reading, sides in sorted(found.items())]
@@ -101,7 +103,7 @@ def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
     """One claim as a section in Markdown: what the paper says, verdict, every check with all its seeds, the verdict
     under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
     claim, effects = verdict.claim, verdict.effects[""]
-    checks = sum(effect.state != "void" for effect in effects)
+    checks = len(verdict.checks)
     several = f"All of {checks} checks have to hold" if checks > 1 else "One check has to hold"
     known = verdict.why if verdict.word in (DEFINITIONAL, UNTESTABLE) else claim.why.get(verdict.word, "")
     known = f" {known}" if known else ""
@@ -161,7 +163,7 @@ def _deciding(effects: Sequence[Effect]) -> str:
 
 def change(verdict: Verdict) -> str:
     """What would change a verdict, from the check that decides it, in words."""
-    key, checks = verdict.key, len(verdict.effects[""])
+    key, checks = verdict.key, len(verdict.checks)
     if verdict.word == DEFINITIONAL:
         return "nothing that could be measured."
     if verdict.word == UNTESTABLE:

@@ -157,12 +157,12 @@ def both_ways(found: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Finished plans open and closed loop, of methods with closed loops and the seeds that were executed both ways; of
     a method without any such seed, its closed loops alone."""
     opened, closed = (table.with_method(plans_of(found, execution=way)) for way in (OPEN, CLOSED))
-    keys = [list(zip(part["env"], part["method"], part["seed"], strict=True)) for part in (opened, closed)]
-    both = set(keys[0]) & set(keys[1])
-    paired = {(env, method) for env, method, _ in both}
-    of_both = np.array([key in both for key in keys[0]], dtype=bool)
-    of_both_or_alone = np.array([key in both or key[:2] not in paired for key in keys[1]], dtype=bool)
-    return opened[of_both], closed[of_both_or_alone]
+
+    def key(part: pd.DataFrame, *more: str) -> pd.MultiIndex:
+        return pd.MultiIndex.from_frame(part[["env", "method", *more]])
+
+    opened = opened[key(opened, "seed").isin(key(closed, "seed"))]
+    return opened, closed[key(closed, "seed").isin(key(opened, "seed")) | ~key(closed).isin(key(opened))]
 
 
 def by_target(found: pd.DataFrame, metric: str, *, apart: bool = False) -> dict[Method, np.ndarray]:
@@ -194,10 +194,8 @@ def final_distances(found: pd.DataFrame, env: str) -> dict[Method, dict[str, np.
         {method: part["value"].to_numpy() for method, part in table.groups(own, "method")}
         for own in both_ways(table.select(found, env=env, metric="final_distance"))
     )
-    return {
-        method: ({"open": opened[method]} if method in opened else {}) | {"closed": distances}
-        for method, distances in closed.items()
-    }
+    ways = {method: {"open": opened.get(method), "closed": distances} for method, distances in closed.items()}
+    return {method: {way: each for way, each in own.items() if each is not None} for method, own in ways.items()}
 
 
 def return_panels(
@@ -337,19 +335,22 @@ def paired_table(found: pd.DataFrame, env: str, subject: str, *, execution: str 
     gaps, ours = gap_sizes(planned), next((way for way in costs if way.model == subject), None)
     lines = []
     for method, cost in sorted(costs.items(), key=lambda each: each[1].to_numpy().mean()):
-        line = {"method": method, "cost (m)": f"{cost.to_numpy().mean():.2f}"}
+        line, n = {"method": method, "cost (m)": f"{cost.to_numpy().mean():.2f}"}, cost.shape[1]
         if ours is not None and method is not ours:
-            apart = _paired(costs[ours], cost)
+            apart = paired_differences(costs[ours], cost)
+            n = apart.shape[1]
             line[f"cost of {subject} minus this"] = spell_effect(apart)
             if apart.size and len(apart) > 1:
                 line["in each seed"] = ", ".join(table.spell(row, "{:+.2f} ± {:.2f}") for row in apart.to_numpy())
             if method in gaps:
-                line[f"size of the gap of {subject} minus this"] = spell_effect(_paired(gaps[ours], gaps[method]))
-        lines.append(line | {"n": cost.shape[1]})
+                line[f"size of the gap of {subject} minus this"] = spell_effect(
+                    paired_differences(gaps[ours], gaps[method])
+                )
+        lines.append(line | {"n": n})
     return pd.DataFrame(lines)
 
 
-def _paired(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
+def paired_differences(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
     """Differences (seeds, targets), without targets that either lacks, and then without such seeds."""
     return (ours - theirs).dropna(axis="columns", how="all").dropna()
 

@@ -122,7 +122,7 @@ def _records(found: pd.DataFrame) -> pd.DataFrame:
 def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
     """The input of ``figures.figure7``: task -> method -> curves, from rows of policies, in the order of the zoo.
 
-    A method's k lines are those that are ``independent``. Seconds are the CPU's where a table has them, else the
+    A method's k lines are those of ``seed_means``. Seconds are the CPU's where a table has them, else the
     clock's, which are more on a busy machine; training of the model is counted. ValueError where lines were not
     measured at the same points, or where one task was learned in two environments.
     """
@@ -150,20 +150,21 @@ def _curves(own: pd.DataFrame) -> Curves:
             f"{metric} of seed {seed}, copy {copy} was measured at {len(points)} points up to {points.max()}, expected "
             f"the {wide.shape[1]} up to {wide.columns.max()} of the others"
         )
-    at, wide = wide.columns.to_numpy(dtype=int), independent(wide)
-    curves = {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
+    at, wide = wide.columns.to_numpy(dtype=int), seed_means(wide)
+    curves: Curves = {"seeds": np.array(own["seed"].nunique())}
+    curves |= {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
     curves["seconds"] = curves.pop(clock).mean(0)
     if not own["search_space"].iloc[0]:
         return curves | {"steps": at, "samples": at}
     samples, before = (own[own["metric"] == metric]["value"].mean() for metric in ("samples", "train_seconds"))
     (task, scale), within = own[["task", "scale"]].iloc[0], own[own["metric"] == "within_data"]
-    within = independent(within.set_index(["seed", "copy"])[["value"]])
+    within = seed_means(within.set_index(["seed", "copy"])[["value"]])
     curves |= {"iterations": at, "steps": at * model_steps(task, scale)}
     return curves | {"samples": np.full(len(at), samples), "seconds": curves["seconds"] + before,
                      "within_data": within.to_numpy()}  # fmt: skip
 
 
-def independent(values: pd.DataFrame) -> pd.DataFrame:
+def seed_means(values: pd.DataFrame) -> pd.DataFrame:
     """Of values by seed and copy, levels of the index: each copy's, or, where there are several training seeds, the
     mean over the copies of each, since copies that learn in one model are no samples of training it."""
     if values.index.unique("seed").size < 2:
@@ -245,13 +246,18 @@ def learned_told(found: pd.DataFrame, plans: pd.DataFrame, models: Sequence[str]
             yield text + "."
 
 
+def _counted(seeds: int, lines: int) -> str:
+    """What the lines of a method are."""
+    return f"{seeds} seeds" if seeds > 1 else f"{lines} cop{'ies' if lines > 1 else 'y'} of 1 seed"
+
+
 def _ends(curves: Mapping[str, Mapping[Method, Curves]]) -> pd.DataFrame:
     shown = {"return_true": "executed return", "return_predicted": "predicted return",
              "final_distance": "final distance (m)", "success": ARRIVED,
              "within_data": "steps within the data"}  # fmt: skip
     counts = {"iterations": "iterations", "samples": "environment steps", "seconds": "seconds"}
     ends = [
-        {"task": task, "method": method, "k": len(own["return_true"])}
+        {"task": task, "method": method, "means over": _counted(int(own["seeds"]), len(own["return_true"]))}
         | {title: table.spell(own[metric][:, -1], "{:.3f} ± {:.3f}") if len(own.get(metric, ())) else ""
            for metric, title in shown.items()}
         | {title: f"{own[word][-1]:,.0f}" if word in own else "" for word, title in counts.items()}

@@ -28,7 +28,7 @@ from tsmlib.trajectory import Trajectories
 
 SEGMENTS = range(10, 100, 30)  # steps at which the segments that are scored from the true past begin
 HORIZONS = (1, 2, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
-WORST = 0.05  # share of episodes that the subset TRIMMED leaves out
+TRIMMED_SHARE = 0.05  # of episodes, which the subset TRIMMED leaves out
 TRIMMED = "without the worst 5 %"  # of the episodes, by the model's own mean log-likelihood
 LOWER_IS_BETTER = ("energy_score", "crps", "energy_score_noise", "crps_noise", "nrmse")
 NAMES = {  # of metrics, as readers meet them
@@ -72,7 +72,7 @@ def rows(env: str, model: str, open_loop: Scores, segments: Scores, test: Trajec
 
 def _trimmed(scores: Scores) -> Row:
     """``ll_own`` without the episodes in which it is lowest: a mean of log scores is decided by few that all miss."""
-    by_episode = scores.values["ll_own"].mean(1).sort().values[int(WORST * len(scores.outside)) :]
+    by_episode = scores.values["ll_own"].mean(1).sort().values[int(TRIMMED_SHARE * len(scores.outside)) :]
     return dict(metric="ll_own", subset=TRIMMED, value=float(by_episode.mean()), n=len(by_episode))
 
 

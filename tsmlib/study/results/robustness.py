@@ -19,7 +19,7 @@ from tsmlib.evaluation.filtering import PARTS, rmse
 from tsmlib.figures.method import Method
 from tsmlib.study import zoo
 from tsmlib.study.results import table
-from tsmlib.study.results.policies import independent, model_steps
+from tsmlib.study.results.policies import model_steps, seed_means
 from tsmlib.study.results.prediction import paired, select, values
 from tsmlib.study.results.table import PolicyHeader, Row
 
@@ -159,7 +159,7 @@ def policies_table(found: pd.DataFrame, last: int = LAST) -> pd.DataFrame:
     shown = {"return_true": "executed return", "final_distance": "final distance (m)", "success50": "within 0.05 m"}
     ends = _ends(found, last, *shown)
     said = {
-        key: table.spell(independent(own.set_index(["seed", "copy"])[["value"]])["value"])
+        key: table.spell(seed_means(own.set_index(["seed", "copy"])[["value"]])["value"])
         for key, own in table.groups(ends, ["world", "metric", "method"])
     }
     columns: dict[str, list[object]] = {"method": list(ends["method"].unique())}
@@ -179,10 +179,10 @@ def lost(found: pd.DataFrame, method: Method, arm: str, last: int, random: float
 
 def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Method, dict[str, np.ndarray]]]:
     """The input of ``figures.figure8``: world -> method -> curves against steps in the model, those that are
-    ``policies.independent``, of up to ``last`` iterations."""
+    ``policies.seed_means``, of up to ``last`` iterations."""
     curves: dict[str, dict[Method, dict[str, np.ndarray]]] = {}
     for (arm, method), own in table.groups(_policies(found, last, "return_true"), ["world", "method"]):
-        wide = independent(own.pivot(index=["seed", "copy"], columns="iteration", values="value"))
+        wide = seed_means(own.pivot(index=["seed", "copy"], columns="iteration", values="value"))
         steps = wide.columns.to_numpy(dtype=float) * model_steps(*own[["task", "scale"]].iloc[0])
         curves.setdefault(arm, {})[method] = {"steps": steps, "return_true": wide.to_numpy()}
     return curves

@@ -36,8 +36,8 @@ def c02(q: Query) -> Checks:
 
 @Claim("C03", "section 1", HORIZON,
        statistic="growth of the error from step 1 to step 50, as a logarithm: one-step minus TSM",
-       why={REPLICATED: "It is growth: on pushing and on the plain arm mostly a larger error of TSM at the first step, "
-                        "and not so much a smaller one at step 50."})
+       why={REPLICATED: "On pushing and on the plain arm TSM's error grows less mostly because it is larger at the "
+                        "first step, not because it is much smaller at step 50."})
 def c03(q: Query) -> Checks:
     """One-step models drift away from the truth because their small errors add up."""
     for arm in ARMS:

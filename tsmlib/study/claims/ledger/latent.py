@@ -20,7 +20,8 @@ def c45(q: Query) -> Checks:
        statistic="plain arm: KL per segment in nats, active units, spread of samples over that of the data",
        why={FAILED: "The codes carry next to nothing and no unit is active. But the decoder does not ignore noise put "
                     "into them altogether.",
-            REPLICATED: "So they are with the obstacle, by KL and active units, where the paper would have them used."})
+            REPLICATED: "Codes are ignored with the obstacle too (KL, active units), where the paper would have "
+                        "them used."})
 def c46(q: Query) -> Checks:
     """Where dynamics are simple and certain, codes are ignored."""
     yield q.latent("kl", REACHER) <= 0.1
@@ -66,8 +67,8 @@ def c50(q: Query) -> Checks:
 
 @Claim("C51", "section 5.3.5, figure 10", FIGURE10, headline=True, picture=True, readings=ADAM,
        statistic="area under the curve of a classifier that tells them from held-out training torques",
-       why={FAILED: "So are random draws of the prior and training torques rebuilt through it: the classifier tells "
-                    "what a prior of these codes draws, planned or not."})
+       why={FAILED: "The classifier also tells apart random draws of the prior and training torques rebuilt "
+                    "through it: it recognises this prior's decoder, planned or not."})
 def c51(q: Query) -> Checks:
     """Planned through the prior, torques look like training data."""
     for task in TASKS:
