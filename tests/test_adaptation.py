@@ -321,9 +321,9 @@ def test_a_way_of_training_has_no_look_of_a_model() -> None:
 def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> None:
     common = dict(env=PUSH, model="lstm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=9)
     rows = tables.frame([
-        common | dict(metric=metric, env_steps=steps, value=low + 0.01 * seed + steps / 1e5, seed=seed, scale="paper")
-        for metric, low in (("return_true", -9.0), ("success", 0.5)) for steps in (0, 20_000, 40_000)
-        for seed in range(3)
+        common | dict(metric=metric, env_steps=20_000 * k, iteration=k, value=low + 0.01 * seed + k / 5, seed=seed,
+                      scale="paper")
+        for metric, low in (("return_true", -9.0), ("success", 0.5)) for k in range(3) for seed in range(3)
     ]).assign(source=table.YOURS)  # fmt: skip
     (drawing,) = drawings.rounds(rows, PUSH, results.DRAWN[PUSH])
     first, second = drawing.figure.axes

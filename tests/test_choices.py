@@ -253,7 +253,7 @@ def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() 
     lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
     rest = "; one network each; predictions: n = 200 fresh episodes, plans and violations: n = 100 validation targets"
     assert quality.stamp(lines) == (
-        f"ReacherPush, training seed 0 (after 2320 s seeds 0, 1, 2 of TSM: small marks, the line joins means){rest}"
+        f"ReacherPush, training seed 0; small marks: the other training seeds of 0, 1, 2, after 2320 s, of TSM{rest}"
     )
     assert quality.stamp(lines[lines["seed"] == 0]) == f"ReacherPush, training seed 0{rest}"
 

@@ -175,9 +175,9 @@ def test_an_inconclusive_claim_names_the_readings_under_which_it_fails() -> None
     rows = [score("tsm", k, value) for k, value in enumerate((-1.0, 0.1, 1.0))]
     rows += [score("tsm", k, value, metric="ll_shared") for k, value in enumerate((-1.2, -1.1, -1.0))]
     verdict = evaluate.judge(rule, frames(of_03_predict=rows))
-    assert (verdict.word, verdict.against) == (INCONCLUSIVE, ["A1b one shared variance"])
-    assert "It fails with: A1b one shared variance." in verdict.why
-    assert "INCONCLUSIVE**; not replicated by A1b one shared variance" in report.table([verdict], [verdict])
+    assert (verdict.word, verdict.failing_readings) == (INCONCLUSIVE, {"A1b one shared variance": 3})
+    assert "It fails under A1b one shared variance." in verdict.why
+    assert "INCONCLUSIVE**; it fails under A1b one shared variance" in report.table([verdict], [verdict])
 
 
 @pytest.mark.parametrize(("lstm", "word"), [(2.0, REPLICATED), (0.0, UNTESTABLE)])
