@@ -195,10 +195,7 @@ def drawings_of_rows() -> Iterator[Drawing]:
     words = [word for word in zoo.words("dynamics", "ablation") if word in set(imperfect["model"])]
     yield drawings.filtering(imperfect, asked.worlds["noise"], words)
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
-    subject, clean = asked.subject, predict
-    if subject not in words:  # the forerunner, with rivals that were trained as it was
-        subject, clean = "tsm+energy+direct", imperfect
-    yield from drawings.advantage_map(imperfect, clean, subject, asked.rivals, asked.noises, asked.delays)
+    yield from drawings.advantage_map(imperfect, predict, asked.subject, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
         yield from drawings.rounds(explored, env, titles)
     yield from drawings.ways(explored, WEAK_MOTORS.env)
