@@ -67,7 +67,7 @@ def differences(found: pd.DataFrame, envs: Sequence[str], subject: str) -> Itera
         published, yours = table.pair(found, partial(prediction.paired_panels, subject=subject, titles=SCORES, env=env))
         if published:
             lower = [SCORES["energy_score_noise"]] if SCORES["energy_score_noise"] in published else []
-            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "log-likelihood (nats per step)")
+            ours, xlabels = zoo.method(subject), dict.fromkeys(published, "log-likelihood (nats)")
             xlabels |= dict.fromkeys(lower, "energy score (data's s.d.)")
             figure = figures.differences(published, xlabels, ours, lower_is_better=lower, yours=yours)
             yield Drawing(figure, f"03_differences_{EnvSpec.parse(env).name}", _whole(found, [env]))
