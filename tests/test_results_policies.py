@@ -147,7 +147,9 @@ def test_what_belongs_to_no_point_of_a_curve_is_passed_over() -> None:
 def test_the_table_has_one_line_per_policy_with_its_last_record() -> None:
     _, _, line = policies_results.policies_table(curves_of([*rows(), *rows(seed=2)])).splitlines()
     cells = [cell.strip() for cell in line.split("|")[1:-1]]
-    assert cells[:3] == ["reach", "TSM, latent", "2"]  # seeds, not the two copies of each
+    assert cells[:3] == ["reach", "TSM, latent", "2 seeds"]  # not the two copies of each
+    _, _, line = policies_results.policies_table(curves_of(rows())).splitlines()
+    assert line.split("|")[3].strip() == "2 copies of 1 seed"
     assert cells[3].startswith("-3.500 ±")
     assert cells[-2:] == ["50,000", "200"]
 

@@ -92,8 +92,8 @@ class Adapted:
     def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
         if not self.samples:
             return self._checked(past, actions)
-        if generator is None or isinstance(generator, NoNoise):
-            return self._checked(past, actions, generator=None)
+        if generator is None or isinstance(generator, NoNoise):  # which tells a model with members whose mode is asked
+            return self._checked(past, actions, generator=generator)
         return torch.cat([  # one after the other, since parts may share a generator, which is set back between them
             self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own)
             for rows, own in by_generator(len(actions), generator)
