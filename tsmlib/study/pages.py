@@ -222,9 +222,10 @@ def results_page() -> str:
     )
     planned = ", ".join(f"{_seeds(planning_results.plans_of(control, env=env))} for {task}" for env, task in
                         ((REACH, "reaching"), (PUSH, "pushing")))  # fmt: skip
-    peers = "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`)." * (
-        "pets" in set(predict["model"])
-    )
+    peers = (
+        "\n`pets` is the same kind of model as `ensemble`, by mbrl-lib (`benchmarks/peers`), from the episodes as they "
+        "were collected: of pushing the others also had them turned and mirrored."
+    ) * ("pets" in set(predict["model"]))
     over = {env: prediction_results.over_the_best(predict, OURS, "energy_score_noise", env=env, steps_ahead=(10, 80))
             for env in MUJOCO_IDS}  # fmt: skip
     beside = "\n\n".join(f"`{env}`:\n\n{table.markdown(lines)}" for env, lines in over.items() if len(lines))
