@@ -99,8 +99,8 @@ class Exploration:
     records: ``round``; ``env_steps`` executed up to and with it; ``executed_return`` and, by the task's measures,
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
     of the ``gap``; ``lost``, episodes in which the simulation became unstable, whereupon the others begin anew
-    (``env_steps`` counts what all had executed until then); after training the losses on held-out data, ``validation``
-    and ``prior_validation``, and what ``measure`` gave.
+    (``discarded_steps``, what all had executed until then, which ``env_steps`` counts); after training the losses on
+    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave.
     """
 
     train: Trajectories
