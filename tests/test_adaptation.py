@@ -227,6 +227,7 @@ def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round(
     (["predict", "--envs", PENDULUM, "--models", "rtsm"], "predict takes no Pendulum-v1"),
     (["predict", "--envs", PUSH, "--models", "oracle"], "predict takes no oracle; --models are some of tsm, rtsm"),
     (["control", "--envs", PUSH, "--models", "oracle", "--planners", "adam"], "--planners of oracle are cem and mppi"),
+    (["convergence", "--scale", "laptop", "--envs", PUSH, "--models", "tsm"], "nothing converges at scale laptop"),
     (["adaptation", "--models", "rtsm", "--variants", "mass2"], "cannot be chosen: it has no object"),
     (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
     (["adaptation", "--models", "ensemble+mse", "--envs", PUSH], "no pretrained ensemble"),

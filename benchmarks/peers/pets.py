@@ -229,7 +229,8 @@ def main() -> None:
     data, validation, test = (study.dataset(run, arguments.env, split) for split in study.SPLITS)
     test, word = test.take(slice(arguments.episodes)), MODELS[arguments.form]
     features = Features(data.states.shape[2], data.angles).fit(torch.from_numpy(data.states))
-    model, took = train(arguments.form, features, data, validation, seconds=arguments.seconds, seed=arguments.seed)
+    copies, _ = study.training_data(run, arguments.env, "ensemble")
+    model, took = train(arguments.form, features, copies, validation, seconds=arguments.seconds, seed=arguments.seed)
     peer = Peer(network_of(model), features)
     check(model, peer, test)
     print(f"{arguments.env}, {word}: " + ", ".join(f"{name} {value:,.4g}" for name, value in took.items()))

@@ -12,7 +12,8 @@ each model, of ours and the paper's in both search spaces, of the others direct 
 --iterations where the run has none; name all models in one call, since how soon a policy learns is told by the plateau
 of the best of them. Models, scores, plans and policies are those of the run, so what is missing is made first. torques:
 of plans by --planners in both search spaces, beside held-out torques and those of the prior, and the signal of
-gradients at the first 50 starts (07_action_prior).
+gradients at the first 50 starts (07_action_prior). convergence: of Adam in codes, how many of 500 iterations until its
+plans are nearly done, for 25 targets (05_control).
 
 gradients: their errors (02_train). collect, latent and robustness execute 01_collect, 04_latent and 06_robustness in
 the run's folder for --envs and --models, as far as these ask for them, and publish what their tables then say:
@@ -44,7 +45,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, notebooks, parameters, rounds, runs, zoo
+from tsmlib.study import adaptation, needed, notebooks, parameters, rounds, runs, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
@@ -54,8 +55,8 @@ from tsmlib.study.runs import RESULTS
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
-    "latent": "04_latent", "robustness": "06_robustness", "torques": "07_action_prior", "rounds": "10_explore",
-    "adaptation": "10_explore",
+    "latent": "04_latent", "convergence": "05_control", "robustness": "06_robustness", "torques": "07_action_prior",
+    "rounds": "10_explore", "adaptation": "10_explore",
 }  # fmt: skip
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
@@ -104,6 +105,16 @@ def controlled(
         more, more_targets = planning.rows(tasks, loops, run, execution=planning.CLOSED)
         rows, targets = [*rows, *more], [*targets, *more_targets]
     return rows, targets
+
+
+def convergence(run: runs.Run, envs: list[str], models: list[str]) -> list[Row]:
+    """Rows of 05_control_rows.csv that say how soon a long optimisation was nearly done."""
+    asked = needed.control(run)
+    tasks, ways = [study.load_task(env).take(asked.n_few) for env in envs], zoo.methods(models, "adam", ["latent"])
+    long = asked.converging_iterations
+    study.precompute(run, [job for task in tasks for job in plan_jobs(task.env, len(task), ways, iterations=long)])
+    plans = [(task, way, study.plan(run, task, way, iterations=long)) for task, way in product(tasks, ways)]
+    return [row for task, way, plan in plans for row in planning.convergence(task, plan, run, way)]
 
 
 def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[str]) -> list[Row]:
@@ -216,11 +227,15 @@ def main() -> None:
         parser.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    if given.part == "convergence" and not needed.control(run).converging:
+        parser.error(f"nothing converges at scale {run.scale}; --scale of convergence is paper or smoke")
     if given.part in ("predict", "ablations"):
         pairs = list(product(given.envs, given.models))
         wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
         study.precompute(run, wanted)
         publish("03_ablation" if given.part == "ablations" else notebook, study.score_rows(run, pairs))
+    elif given.part == "convergence":
+        publish(f"{notebook}_rows", convergence(run, given.envs, given.models))
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":

@@ -90,7 +90,7 @@ def control(run: Run) -> Control:
     push += [method(PAPERS, "latent", "adam"), method(PAPERS, "direct", "mppi")] * smoke
     loops = run.pick(smoke=(OURS, "oracle"), laptop=(OURS,), paper=(OURS, "onestep", "lstm", "oracle"))
     long, at = run.pick(smoke=(4, [0, 2, 4]), laptop=(0, []), paper=(40, [0, 1, 2, 4, 7, 10, 15, 20, 30, 40]))
-    longer, searched = run.pick(smoke=(6, [PAPERS]), laptop=(0, []), paper=(500, [PAPERS]))
+    longer, searched = run.pick(smoke=(6, [PAPERS]), laptop=(0, []), paper=(500, [PAPERS, OURS]))
     return Control(
         n=int(str(run.parameter("n_targets"))) or run.pick(smoke=2, laptop=8, paper=100),
         envs=(REACH, PUSH),

@@ -78,7 +78,7 @@ def means(task: Task, trial: Trial, among: Trials, execution: str = OPEN) -> dic
     if trial.plan is not None:
         found["exploitation_gap"] = (float(trial.gap.mean()), "m")
         found["gap_absolute"] = (float(trial.gap.abs().mean()), "m")
-        found["relative_gap_median"] = (float((trial.gap.abs() / executed.abs()).median()), "share")
+        found["relative_gap_median"] = (float((trial.gap.abs() / executed.abs()).quantile(0.5)), "share")
         found["plan_seconds"] = (trial.plan.seconds, "s")
         most = worst(trial.gap.numpy())
         found |= {f"{name}_worst": (float(each[name][0][most].mean()), "share") for name in VIOLATIONS if name in each}
