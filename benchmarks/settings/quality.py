@@ -60,7 +60,7 @@ MEASURES = {  # column -> title and unit; of each a smaller value is better
     "nrmse_10": "nRMSE, 10 steps", "nrmse_80": "nRMSE, 80 steps", "cost": "cost of plans (m)", "gap": "gap (m)",
     "violations": "violations (share of steps)",
 }  # fmt: skip
-KEY = ["env", "model", "seed", "seconds", "muon"]
+KEY = ["env", "model", "seed", "seconds", "muon", "decay"]
 SCORES = ("energy_10", "energy_80")  # set against those of the best baseline
 
 
@@ -80,6 +80,7 @@ def described(path: Path) -> dict[str, object]:
     return {
         "env": env, "model": header["model"], "seed": header["seed"],
         "seconds": round(share * zoo.BUDGET[EnvSpec.parse(env).standard.name]), "muon": schedule[0]["muon"],
+        "decay": schedule[0]["weight_decay"],
         "updates": sum(curve["step"][-1] for curve in curves),
         "cpu_seconds": round(sum(curve["seconds"][-1] for curve in curves)),
         "validation": min(curves[-1]["validation"]),
@@ -158,7 +159,7 @@ def over_the_best(lines: pd.DataFrame) -> pd.DataFrame:
 
 def several(lines: pd.DataFrame) -> pd.DataFrame:
     """The lines of those trainings that were made with more than one seed."""
-    return lines[lines.groupby(["env", "model", "seconds", "muon"])["seed"].transform("nunique") > 1]
+    return lines[lines.groupby(["env", "model", "seconds", "muon", "decay"])["seed"].transform("nunique") > 1]
 
 
 def over_seeds(lines: pd.DataFrame) -> pd.DataFrame:
@@ -220,7 +221,7 @@ def _known(texts: pd.DataFrame) -> pd.DataFrame:
 def spelled(lines: pd.DataFrame) -> pd.DataFrame:
     """Each line as texts; measures that it has nothing of are left out."""
     measures = {name: title for name, title in MEASURES.items() if lines[name].notna().any()}
-    return lines[["env", "model", "seconds", "cpu_seconds", "updates", "muon"]].assign(
+    return lines[["env", "model", "seconds", "cpu_seconds", "updates", "muon", "decay"]].assign(
         **{title: lines[name].map("{:.3g}".format) for name, title in measures.items()},
         **{"80 % coverage": lines["coverage80"].map("{:.0%}".format)},
         **{"within 5 cm": lines["within"].map("{:.0%}".format)},
