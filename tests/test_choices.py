@@ -232,7 +232,8 @@ def test_a_doubling_of_the_training_time_is_read_from_neighbouring_lines_of_a_mo
 
 
 def test_a_line_without_violations_is_spelled_without_them() -> None:
-    line = {"env": "e", "model": "tsm", "seconds": 80, "cpu_seconds": 70, "updates": 9, "muon": 0.0, "coverage80": 0.8}
+    line = {"env": "e", "model": "tsm", "seconds": 80, "cpu_seconds": 70, "updates": 9, "coverage80": 0.8}
+    line |= {"muon": 0.0, "decay": 0.0}
     whole = pd.DataFrame([line | dict.fromkeys([*quality.MEASURES, "within"], 0.5)])
     violations = quality.MEASURES["violations"]
     assert violations in quality.spelled(whole)
