@@ -38,6 +38,20 @@ def test_nothing_is_reached_by_what_was_not_measured() -> None:
     assert set(found["measured"]) == {"not measured"}
 
 
+def test_what_is_said_of_gaps_is_of_their_means_over_seeds_target_by_target() -> None:
+    row = dict(env=PUSH, planner="cem", search_space="latent", execution="open loop", scale="paper", n=1)
+    sizes = {OURS: [0.0] * 9 + [1.0], "lstm": [1.0] * 10}
+    rows = tables.frame([
+        row | dict(model=model, seed=seed, target=i, metric=metric, value=-3.0 + (metric == "return_predicted") * gap)
+        for model, gaps in sizes.items() for seed in (0, 1) for i, gap in enumerate(gaps)
+        for metric in ("return_true", "return_predicted")
+    ])  # fmt: skip
+    said = aims.gap_told(rows)
+    assert "the 5 largest of `rtsm` are 100% of its 0.10 m" in said
+    assert "the medians are 0.00 and 1.00 m" in said
+    assert aims.gap_told(rows[rows["model"] == OURS]) == ""
+
+
 def test_the_sentence_names_every_aim_that_was_missed_with_what_was_found_and_no_other() -> None:
     found = aims.table.thresholds([
         ("one", "at most", 1.0, 2.0, "{:.0f}"), ("two", "at least", 1.0, 2.0, "{:.0f}"),

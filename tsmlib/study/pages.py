@@ -245,6 +245,8 @@ the other model that is hardest to be ahead of, which is named:
 
 {table.markdown(aims())}
 
+{aims_results.gap_told(by_target)}
+
 ## Prediction
 
 {n:,} test episodes, 32 samples of each, open loop with the true torques for 90 steps after ten
