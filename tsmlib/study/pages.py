@@ -275,6 +275,13 @@ mean over all members judges. A model without samples has its one rollout.
 
 {planning_results.plans_table(control[control["metric"] != "plan_seconds"])}
 
+Two of eight frozen targets (`docs/hero.py`, training seed 0), over codes, open loop, predicted above executed: the one
+with the median final distance by `{OURS}`, and the one where it ends nearest.
+
+![Plans of the recurrent TSM and of the one-step model for the median target](../figures/hero_median.png)
+
+![The same for the target where the recurrent TSM ends nearest](../figures/hero_best.png)
+
 By gradients (Adam, as in the paper, {plans.ITERATIONS["adam"]["paper"]} iterations from zero, judged by the
 mode), where there are rows:
 
