@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -376,6 +377,26 @@ def test_the_ledger_holds_every_claim_once_and_in_order() -> None:
     assert sum(c.headline for c in LEDGER) == 21
     assert [c.id for c in LEDGER if c.definition] == ["C14", "C49"]
     assert set().union(*(c.why for c in LEDGER)) <= set(VERDICTS)
+
+
+@pytest.mark.parametrize("claim", LEDGER, ids=lambda c: c.id)
+def test_a_claim_quotes_the_paper_shortly_or_names_the_figure_it_is_read_off(claim: Claim) -> None:
+    assert claim.quote or "figure" in claim.place
+    assert len(claim.quote.split()) <= 30
+    assert claim.quote.rstrip(".").lower() != claim.statement.rstrip(".").lower()
+    assert "…" not in claim.quote
+    assert claim.quote == claim.quote.strip()
+
+
+def test_what_is_shown_as_a_quotation_is_the_papers_and_never_our_words() -> None:
+    quoted = replace(superiority(LSTM), quote="it is better", place="section 1")
+    assert report.quotation(quoted) == "> “it is better” (section 1)"
+    assert report.quotation(replace(quoted, quote="", place="figure 6")) == "Read off figure 6."
+    shown = set(re.findall(r"^> “(.*)” \(", publish.FULL_PAGE.read_text(), re.MULTILINE))
+    assert shown == {c.quote for c in LEDGER if c.quote}
+    pages_ = [path.read_text() for path in (publish.README, publish.CLAIMS_PAGE, publish.FULL_PAGE)]
+    ours = [f"{mark}{c.statement.rstrip('.')}" for c in LEDGER for mark in ("“", '"', "> ")]
+    assert not [words for words in ours for page in pages_ if words in page]
 
 
 def test_the_page_says_how_often_simulated_verdicts_were_wrong() -> None:

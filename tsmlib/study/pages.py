@@ -31,7 +31,7 @@ METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise"
 README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
 BASELINES = [model for model in README_MODELS if model not in (PAPERS, OURS)]
 NEAR, FAR = "energy_10", "energy_80"  # of QUALITY
-README_CLAIMS = ("C02", "C32")  # what the paper says of predictions and plans
+README_CLAIMS = ("C02", "C32")  # on predictions and on plans
 
 
 def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
@@ -151,12 +151,17 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
     )  # fmt: skip
     named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
     said = "; ".join(
-        f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" + _leaning(verdict)
+        f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" + _leaning(verdict)
         for verdict in named
     )
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
 With `{OURS}` in its place, {claims_report.counts(ours)}.
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
+
+
+def _clause(statement: str) -> str:
+    """A sentence as part of another."""
+    return statement[0].lower() + statement[1:].rstrip(".")
 
 
 def _leaning(verdict: evaluate.Verdict) -> str:

@@ -43,7 +43,7 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
         claim, key, checks = verdict.claim, verdict.key, len(verdict.checks)
         found = "no rows yet" if key.value is None else key.estimate
         lines.append({
-            "": claim.id, "the paper says": f"{claim.statement} ({claim.place})",
+            "": claim.id, "the claim, in our words": f"{claim.statement} ({claim.place})",
             "verdict": "; ".join(filter(None, [f"**{verdict.word}**", failing(verdict)])),
             "with our model": other.word.lower(), "measured": claim.statistic,
             "deciding check": f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}",
@@ -100,8 +100,8 @@ def readings(verdicts: Sequence[Verdict]) -> str:
 
 
 def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
-    """One claim as a section in Markdown: what the paper says, verdict, every check with all its seeds, the verdict
-    under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
+    """One claim as a section in Markdown: the paper's words and ours, verdict, every check with all its seeds, the
+    verdict under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
     claim, effects = verdict.claim, verdict.effects[""]
     checks = len(verdict.checks)
     several = f"All of {checks} checks have to hold" if checks > 1 else "One check has to hold"
@@ -114,7 +114,9 @@ def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
     ]
     return f"""## {claim.id}
 
-> {claim.statement} ({claim.place})
+{quotation(claim)}
+
+In our words: {claim.statement}
 
 **{verdict.word}**; with `{ours.claim.subject}` {ours.word.lower()}.{known}
 
@@ -127,6 +129,11 @@ Measured: {claim.statistic}. {several}. Shown in {_links(claim, root)}.
 {markdown(pd.DataFrame(read))}
 
 What would change it: {change(verdict)}"""
+
+
+def quotation(claim: Claim) -> str:
+    """The paper's words as a block quote in Markdown, or the figure that a claim is read off."""
+    return f"> “{claim.quote}” ({claim.place})" if claim.quote else f"Read off {claim.place}."
 
 
 HALF = 18  # characters on either side of the margin
@@ -207,7 +214,7 @@ def seeds_to_decide(effect: Effect) -> int:
 def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, str, np.ndarray, np.ndarray]]:
     """What ``figures.claim_margins`` draws, of every claim with rows.
 
-    Id, what the paper says, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie
+    Id, the claim in our words, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie
     beyond the margin, the deciding one last, and how far the training seeds of that one (seeds,) do.
     """
     found = []
