@@ -53,7 +53,8 @@ APART = ("tsm", "tsm+teacher", "tsm+energy", "tsm+direct", "tsm+energy+direct") 
 
 
 def ablations(run: Run) -> list[tuple[str, str]]:
-    """Environments and models that 03_predict scores beside those that are chosen, where all are; at smoke of seed 0."""
+    """Environments and models that 03_predict scores beside those that are chosen, where all are; at smoke for seed 0
+    alone."""
     envs, words = choice(run)
     told = run.scale == "paper" or (run.scale == "smoke" and run.seed == 0)
     if not told or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
