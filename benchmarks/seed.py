@@ -1,8 +1,8 @@
 """Cost of one seed of the whole study at scale paper: the sum of its parts, in CPU seconds.
 
 The trainings of every model of the three MuJoCo arms and of two imperfect ones, their scores, plans by CEM on 100
-targets of two tasks, and policies: what notebooks 02, 03, 05 and 06 need for every seed. Not counted are the ablations
-and the map of seed 0, other planners, closed loops and the oracle in 05, and what 04 and 07 look at. Of
+targets of two tasks, and policies: what notebooks 02, 03, 05 and 06 need for every seed. Not counted are the ablations,
+the map of seed 0, other planners, closed loops and the oracle in 05, and what 04 and 07 look at. Of
 every part a little is done in each round, with one thread, and multiplied by how often the seed does it: updates of
 each stage of each training, episodes of each score, iterations of each plan, updates of each policy. Every update does
 the same work, and so on. The reference is the budget of two hours on two cores, so this row, unlike all others, depends

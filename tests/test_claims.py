@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -378,9 +380,67 @@ def test_the_ledger_holds_every_claim_once_and_in_order() -> None:
     assert set().union(*(c.why for c in LEDGER)) <= set(VERDICTS)
 
 
+@pytest.mark.parametrize("claim", LEDGER, ids=lambda c: c.id)
+def test_a_claim_quotes_the_paper_shortly_or_names_the_figure_it_is_read_off(claim: Claim) -> None:
+    assert claim.quote or "figure" in claim.place
+    assert len(claim.quote.split()) <= 30
+    assert claim.quote.rstrip(".").lower() != claim.statement.rstrip(".").lower()
+    assert "…" not in claim.quote
+    assert claim.quote == claim.quote.strip()
+
+
+def test_what_is_shown_as_a_quotation_is_the_papers_and_never_our_words() -> None:
+    quoted = replace(superiority(LSTM), quote="it is better", place="section 1")
+    assert report.quotation(quoted) == "> “it is better” (section 1)"
+    assert report.quotation(replace(quoted, quote="", place="figure 6")) == "Read off figure 6."
+    shown = set(re.findall(r"^> “(.*)” \(", publish.FULL_PAGE.read_text(), re.MULTILINE))
+    assert shown == {c.quote for c in LEDGER if c.quote}
+    pages_ = [path.read_text() for path in (publish.README, publish.CLAIMS_PAGE, publish.FULL_PAGE)]
+    ours = [f"{mark}{c.statement.rstrip('.')}" for c in LEDGER for mark in ("“", '"', "> ")]
+    assert not [words for words in ours for page in pages_ if words in page]
+
+
 def test_the_page_says_how_often_simulated_verdicts_were_wrong() -> None:
     printed = run_script(ROOT / "benchmarks" / "verdicts" / "run.py", "--table")
     assert printed in publish.CLAIMS_PAGE.read_text(), "put the output of benchmarks/verdicts/run.py --table there"
+
+
+def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
+    spec = importlib.util.spec_from_file_location("verdicts_run", ROOT / "benchmarks" / "verdicts" / "run.py")
+    assert spec
+    assert spec.loader
+    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    columns = ["claim", "check", "seeds", "margin"]
+    stored, now = pd.read_csv(pages.POWER), module.checks(1, np.random.default_rng(0))
+    again = "checks.csv is of other rows than data/results; run: python benchmarks/verdicts/run.py checks"
+    assert stored[columns].equals(now[columns]), again
+    assert np.allclose(stored["deviation"], now["deviation"].astype(float), rtol=0.01), again
+
+
+def test_the_page_says_what_ten_seeds_would_find_as_the_table_does() -> None:
+    stored = pd.read_csv(pages.POWER)
+    said = re.search(r"Of (\d+) checks with .*?would find (\d+) in 95 % of", publish.CLAIMS_PAGE.read_text())
+    assert said
+    assert [int(number) for number in said.groups()] == [len(stored), sum(stored["power"] >= 0.95)]
+    few = pd.DataFrame({"claim": ["C1", "C2", "C2"], "seeds": 3, "power": [1.0, 0.5, 0.1]})
+    assert "Of 3 checks with 3 training seeds" in (told := pages.power_of_ten_seeds(few))
+    assert told.endswith("would find 1 in 95 % of studies or more, were the truth as far beyond the margin as that is "
+                         "from zero; the others would be found in fewer: C2 (10 %, 50 %).")  # fmt: skip
+    assert "the others" not in pages.power_of_ten_seeds(few[:1])
+
+
+def test_a_claim_rests_on_the_fewest_seeds_of_any_check_and_says_which_have_no_rows() -> None:
+    rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0, q.ll(LSTM, REACHER) > 0, q.ll(ONE_STEP, REACHER) > 0]))
+    whole = evaluate.judge(rule, study(tsm=[-3, -3.1, -3.2], lstm=[1], onestep=[1, 1.1, 1.2]))
+    assert (whole.word, whole.key.seeds, whole.seeds, whole.without_rows) == (FAILED, 3, 1, 0)
+    assert report.counts([whole]).endswith("1 of the decided ones rest on one training seed")
+    part = evaluate.judge(rule, study(tsm=[-3, -3.1, -3.2], onestep=[1, 1.1, 1.2]))
+    assert (part.word, part.seeds, part.without_rows) == (FAILED, 3, 1)
+    assert "rest on one" not in report.counts([part])
+    assert "one of 3; 1 of 3 checks have no rows" in report.table([part], [part])
+    assert "All of 3 checks have to hold; 1 of 3 checks have no rows." in report.in_full(part, part)
+    lines = [[cell.strip() for cell in line.split("|")[1:4]] for line in report.seeds_table([whole, part]).splitlines()]
+    assert lines[2:] == [["1", "1", "X1 (1 of 3 checks)"], ["3", "1", "X1 (1 of 3 checks have no rows)"]]
 
 
 def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows() -> None:

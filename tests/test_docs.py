@@ -35,6 +35,12 @@ def run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, 
     return names
 
 
+def test_the_page_on_reproducing_has_a_command_for_every_table_that_ships() -> None:
+    (block,) = re.findall(r"^rows=.*?^```", (DOCS / "reproducing.md").read_text(), re.DOTALL | re.MULTILINE)
+    shipped = {path.name.partition(".")[0] for path in publish.RESULTS.glob("*.csv*")}
+    assert not [name for name in sorted(shipped) if not re.search(rf"\b{name}\b", block)]
+
+
 def test_the_readme_is_a_screen_and_a_half() -> None:
     assert len(README.read_text().splitlines()) <= 120
     assert README.stat().st_size <= 8000

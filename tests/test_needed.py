@@ -46,6 +46,20 @@ def test_a_change_of_a_schedule_changes_the_settings_of_its_model_alone(tmp_path
     assert changed == {"model", "scores"}
 
 
+@pytest.mark.parametrize(("scale", "asked"), [("smoke", [True, False]), ("laptop", [False] * 2), ("paper", [True] * 2)])
+def test_every_seed_at_paper_scale_has_the_papers_choices_and_seed_0_alone_the_map(
+    scale: str, asked: list[bool], tmp_path: Path
+) -> None:
+    found = [
+        needed.ablations(resolve("03_predict", scale=scale, seed=seed, run_dir=str(tmp_path / scale)))
+        for seed in (0, 1)
+    ]
+    assert [bool(pairs) for pairs in found] == asked
+    assert scale != "paper" or found[0] == found[1]
+    worlds = [resolve("06_robustness", scale="paper", seed=seed, run_dir=str(tmp_path)) for seed in (0, 1)]
+    assert [bool(needed.robustness(run).cells) for run in worlds] == [True, False]
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_every_seed_learns_every_policy_and_those_that_take_long_for_fewer_iterations(
     seed: int, tmp_path: Path

@@ -42,6 +42,16 @@ def test_tables_ship_with_the_rows_of_every_seed_and_all_their_columns(tmp_path:
         assert ("dimension" in rows) == (notebook == "04_latent")
 
 
+def test_a_notebook_with_several_tables_ships_all_of_them_with_every_seed(tmp_path: Path) -> None:
+    run, other = seed(tmp_path, 0), seed(tmp_path, 1)
+    for each, name in ((run, "03_ablation"), (other, "03_ablation"), (run, "08_claims")):
+        row = dict(metric="kl", value=1.0, seed=each.seed, scale="paper", env="tsm/Reacher-v0")
+        tables_storage.save(each.metrics / f"{name}.csv", [row])
+    assert publish.pooled(run)["03_ablation"]["seed"].tolist() == [0, 1]
+    assert list(publish.pooled(run, ["03_predict"])) == ["03_ablation", "03_predict"]
+    assert "08_claims" not in publish.pooled(run)
+
+
 def test_publishing_compresses_a_large_table_once_and_changes_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

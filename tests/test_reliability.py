@@ -8,13 +8,17 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import torch
-from reliability import files, pipelines, simulators, training, world
+from reliability import __main__ as long
+from reliability import cluster, files, pipelines, simulators, training, world
 from reliability.__main__ import CHECKS, said
 from reliability.world import Outcome
 from tqdm.auto import tqdm
+
+from tsmlib.storage import manifest
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for check, quick, _ in part}
@@ -125,6 +129,33 @@ def test_every_check_says_which_number_it_answers() -> None:
         number, what = said(check)
         assert re.fullmatch(r"R\d+(, R\d+)*", number), check
         assert what, check
+
+
+def test_a_table_keeps_the_lines_of_checks_that_were_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "reliability.md"
+    page.write_bytes(long.DOCS.read_bytes())
+    monkeypatch.setattr(long, "DOCS", page)
+    before = page.read_text().splitlines()
+
+    def changed() -> list[str]:
+        lines = page.read_text().splitlines()
+        assert len(lines) == len(before)
+        return [line for line in lines if line not in before and not line.startswith("Python ")]
+
+    long.write_table(tmp_path / "nothing was run")
+    assert not changed()
+    manifest.write_json(tmp_path / "full_disk.json", {"right": 3, "of": 4, "note": "a | b", "seconds": 5})
+    long.write_table(tmp_path)
+    number, what = said(training.full_disk)
+    assert changed() == [f"| {number} | {what} | 3 | 4 | a / b | 5 |"]
+
+
+def test_on_a_cluster_each_kind_is_killed_as_often() -> None:
+    found = cluster.strikes(20)
+    assert len(found) == 60
+    assert {found.count((kind,)) for kind in ("job", "node", "controller")} == {20}
+    assert cluster.strikes(2, ["workflow"]) == [("workflow",)] * 2
+    assert cluster.strikes(0) == [cluster.KILLED]
 
 
 def test_a_child_that_is_killed_while_it_draws_a_progress_bar_stops_no_other() -> None:

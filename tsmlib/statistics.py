@@ -45,6 +45,9 @@ def random_effects(values: ArrayLike, *, crossed: bool = True) -> Estimate:
     is taken; degrees of freedom are those of whatever there is less of, since a variance between few seeds is often
     estimated too small. Not crossed: trials of a seed are its own, so that the means of seeds decide. With one seed the
     trials decide, with one trial the seeds.
+
+    The formula is written out here, since none of the dependencies fits crossed random effects; where neither variance
+    is estimated negative, the error is that of restricted maximum likelihood.
     """
     array = np.asarray(values, dtype=float)
     seeds, trials = array.shape

@@ -1,6 +1,7 @@
 """How often verdicts are wrong: the checker on simulated worlds whose truth is known, and its power on published rows.
 
     python benchmarks/verdicts/run.py
+    python benchmarks/verdicts/run.py checks           one of its parts alone, checks or worlds
     python benchmarks/verdicts/run.py --table          the table of docs/claims.md, from worlds.csv
 
 worlds.csv: claims of 1, 3 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
@@ -113,6 +114,9 @@ def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+PARTS = {"checks": checks, "worlds": worlds}
+
+
 def page_table(found: pd.DataFrame) -> str:
     """What docs/claims.md says of worlds, in Markdown: wrong verdicts at an effect of 1, right ones at 2.
 
@@ -138,6 +142,7 @@ def percent(share: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"{' or '.join(PARTS)} (default: both)")
     parser.add_argument("--studies", type=int, default=400, help="of each line (default 400)")
     parser.add_argument("--out", type=Path, default=HERE, help="folder (default: that of this script)")
     parser.add_argument("--table", action="store_true", help="print the table that docs/claims.md has, and stop")
@@ -145,8 +150,10 @@ def main() -> None:
     if given.table:
         print(page_table(pd.read_csv(HERE / "worlds.csv")))
         return
-    rng = np.random.default_rng(0)
-    for name, lines in {"checks": checks(given.studies, rng), "worlds": worlds(given.studies, rng)}.items():
+    if unknown := set(given.parts) - set(PARTS):
+        parser.error(f"no part is called {', '.join(sorted(unknown))}; there are {' and '.join(PARTS)}")
+    for name in given.parts or PARTS:
+        lines = PARTS[name](given.studies, np.random.default_rng(0))
         files.write_bytes(given.out / f"{name}.csv", lines.to_csv(index=False).encode())
         print(lines.to_string(index=False))
 

@@ -15,7 +15,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,7 @@ PORT = 16817  # of the controller; those of the nodes follow
 NODES = ("n1", "n2")
 SEEDS = "0,2"
 KILLED = ("job", "node", "controller", "workflow")
+IN_TURN = ("job", "node", "controller")
 CONFIGURATION = """ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
 SlurmUser=root
@@ -235,10 +236,11 @@ def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes]) -> None:
         process.kill()
 
 
-def killed_on_a_cluster(trials: int) -> Outcome:
-    """R1, R14: job, node, controller of Slurm and workflow killed, two seeds at smoke: the tables of a local run.
+def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
+    """R1, R14: jobs, nodes and controllers of a Slurm of two nodes killed, two seeds at smoke: the tables of the pool.
 
-    In the first trial all four, one after another; in the others one, in turn.
+    Each of ``kinds`` is killed in ``each`` runs of the workflow, one in a run; for 0 all of KILLED in one run, one
+    after another.
     """
     if lacking := missing():
         return Outcome(note=f"{lacking}: not done")
@@ -247,18 +249,24 @@ def killed_on_a_cluster(trials: int) -> Outcome:
     with folder() as place, slurm() as cluster:
         assert workflow(place / "local", "--executor", "pool").wait(1800) == 0, (place / "local" / "log").read_text()
         expected = made(place / "local")
-        for trial in range(trials):
-            kinds, there = (KILLED[(trial - 1) % len(KILLED)],) if trial else KILLED, place / f"trial{trial}"
+        for trial, killed in enumerate(strikes(each, kinds)):
+            there = place / f"trial{trial}"
             options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
             process = workflow(there, *options, environment=cluster.environment)
-            for how in kinds:
+            for how in killed:
                 strike(cluster, how, process)
                 if how == "workflow":
                     process.wait()
                     process = workflow(there, *options, environment=cluster.environment)
             code, same = process.wait(1800), made(there) == expected
-            said, told = f"{', '.join(kinds)}: exit {code}, same tables {same}", (there / "log").read_text()
+            said, told = f"{', '.join(killed)}: exit {code}, same tables {same}", (there / "log").read_text()
             found.count(code == 0 and same, f"{said}: {told[-800:]}")
             print(said, flush=True)
-    found.note = f"seeds {SEEDS}, {len(NODES)} nodes"
+    often = f"{each} times each" if each else "once each, in one run"
+    found.note = f"{', '.join(kinds if each else KILLED)} killed {often}; seeds {SEEDS}"
     return found
+
+
+def strikes(each: int, kinds: Sequence[str] = IN_TURN) -> list[tuple[str, ...]]:
+    """What is killed in each run of ``killed_on_a_cluster``."""
+    return [(kind,) for _ in range(each) for kind in kinds] or [KILLED]

@@ -22,11 +22,12 @@ VERDICTS = {  # verdict -> colour
 def claim_margins(claims: Sequence[tuple[str, str, str, str, np.ndarray, np.ndarray]]) -> Figure:
     """Every effect against its margin, a row per claim: the margin is the line, the claimed side tinted.
 
-    claims: id, what the paper says, verdict, the deciding effect in words, how far estimate and ends of the interval of
-    each effect (n, 3) lie beyond the margin, the deciding one last, and how far each of its training seeds does; ends
-    that are NaN are no interval. Each effect has a scale of its own, to the furthest end: the further out the estimate,
-    the surer. Thick is the one that decides, with its seeds as ticks; an open mark has no interval, since it is of one
-    training seed. What the paper says stands to the left, over two lines where it is long. ValueError without claims.
+    claims: id, the claim in our words, verdict, the deciding effect in words, how far estimate and ends of the interval
+    of each effect (n, 3) lie beyond the margin, the deciding one last, and how far each of its training seeds does;
+    ends that are NaN are no interval. Each effect has a scale of its own, to the furthest end: the further out the
+    estimate, the surer. Thick is the one that decides, with its seeds as ticks; an open mark has no interval, since it
+    is of one training seed. What is claimed stands to the left, over two lines where it is long. ValueError without
+    claims.
     """
     if not claims:
         raise ValueError("no claim has rows: nothing to draw")

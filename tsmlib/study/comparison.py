@@ -18,7 +18,7 @@ def evidence(run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], tabl
     what follows the notebook's name in the table's, ``_rows`` for instance. What is written stays without the column:
     ``tables.save`` and ``publish`` know nothing of it.
     """
-    own = predictions.pooled_rows(run, rows, table, whole=False)
+    own = predictions.pooled_rows(run, rows, f"{run.notebook}{table}", whole=False)
     return _sourced(published(f"{run.notebook}{table}"), own)
 
 

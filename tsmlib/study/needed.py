@@ -53,9 +53,11 @@ APART = ("tsm", "tsm+teacher", "tsm+energy", "tsm+direct", "tsm+energy+direct") 
 
 
 def ablations(run: Run) -> list[tuple[str, str]]:
-    """Environments and models that 03_predict scores beside those that are chosen: of seed 0, where all are."""
+    """Environments and models that 03_predict scores beside those that are chosen, where all are; at smoke for seed 0
+    alone."""
     envs, words = choice(run)
-    if run.scale == "laptop" or run.seed or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
+    told = run.scale == "paper" or (run.scale == "smoke" and run.seed == 0)
+    if not told or PUSH not in envs or not set(zoo.words("dynamics")) <= set(words):
         return []
     choices = run.pick(smoke=["tsm+plain"], laptop=[], paper=list(zoo.words("choice")))
     return [(PUSH, word) for word in (*APART, "onestep", *choices)]

@@ -10,7 +10,7 @@ from tsmlib.envs.spec import MUJOCO_IDS
 from tsmlib.planning.predictors import JUDGING
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import plans, rounds, zoo
+from tsmlib.study import needed, plans, rounds, runs, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
@@ -23,12 +23,14 @@ from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results import robots as robots_results
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import PUSH, REACH
+from tsmlib.study.runs import ROOT
 from tsmlib.study.zoo import OURS, PAPERS
 
 METRICS = ("ll_paper", "ll_shared", "ll_own", "energy_score_noise", "crps_noise", "nrmse", "coverage80", "diverged")
 README_MODELS = (PAPERS, OURS, "onestep", "multistep", "lstm")
 BASELINES = [model for model in README_MODELS if model not in (PAPERS, OURS)]
-README_CLAIMS = ("C02", "C32")  # what the paper says of predictions and plans
+POWER, ENOUGH = ROOT / "benchmarks" / "verdicts" / "checks.csv", 0.95  # of checks, by simulation
+README_CLAIMS = ("C02", "C32")  # on predictions and on plans
 
 
 def shipped_verdicts(subject: str = PAPERS) -> list[evaluate.Verdict]:
@@ -150,12 +152,17 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
     )  # fmt: skip
     named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
     said = "; ".join(
-        f"“{verdict.claim.statement.rstrip('.')}” is **{verdict.word.lower()}**" + _leaning(verdict)
+        f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" + _leaning(verdict)
         for verdict in named
     )
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
 With `{OURS}` in its place, {claims_report.counts(ours)}.
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
+
+
+def _clause(statement: str) -> str:
+    """A sentence as part of another."""
+    return statement[0].lower() + statement[1:].rstrip(".")
 
 
 def _leaning(verdict: evaluate.Verdict) -> str:
@@ -187,6 +194,14 @@ def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) ->
 - `{OURS}` in its place: {claims_report.counts(ours)}.
 - Not counted, since they hold by definition: {by_definition}.
 
+## How many training seeds each figure and claim rests on
+
+A claim rests on the least number of training seeds that any of its checks has; so are the counts above.
+
+{claims_report.seeds_table(papers)}
+
+{cost_of_a_seed()} {power_of_ten_seeds(pd.read_csv(POWER))}
+
 ## The {headlines} claims that carry the paper
 
 {carry}
@@ -201,6 +216,35 @@ The paper ends on what it leaves to future work (section 6). These questions and
 of `{OURS}`, and are not counted above.
 
 {claims_report.answers(shipped_answers(), root="../")}"""
+
+
+def cost_of_a_seed() -> str:
+    """A sentence: how long one seed of the study takes, by what its steps state."""
+    hours = dict[str, float]()
+    for each in runs.notebooks().values():
+        run = runs.resolve(each.stem, scale="paper", seed=1)
+        hours |= {f"{job.kind} {job.name}": job.seconds(run) / 3600 for job in needed.needs(run)}
+    policies = sum(each for name, each in hours.items() if name.startswith("policy "))
+    return (
+        f"More seeds are more hours: by the budgets of its steps (`study.needs`) one seed takes about "
+        f"{sum(hours.values()):.0f} hours of one core at scale paper, {policies:.0f} of them for policies, and two "
+        "cores were at hand."
+    )
+
+
+def power_of_ten_seeds(checks: pd.DataFrame) -> str:
+    """How many of the checks in benchmarks/verdicts/checks.csv ten seeds would find, and which they would not."""
+    found, seeds = checks["power"] >= ENOUGH, sorted(checks["seeds"].unique())
+    weak = [
+        f"{claim} ({', '.join(f'{power:.0%}'.replace('%', ' %') for power in sorted(each['power']))})"
+        for claim, each in checks[~found].groupby("claim")
+    ]  # fmt: skip
+    others = f"; the others would be found in fewer: {', '.join(weak)}" * bool(weak)
+    return (
+        f"Of {len(checks)} checks with {' to '.join(map(str, seeds))} training seeds and a margin that is not zero "
+        f"(`benchmarks/verdicts/checks.csv`), ten seeds that differ as these do would find {found.sum()} in "
+        f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{others}."
+    ).replace("95%", "95 %")
 
 
 def full_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:

@@ -82,16 +82,16 @@ def score_rows(run: Run, wanted: Iterable[tuple[str, str]]) -> list[dict[str, ob
 
 
 def pooled_rows(
-    run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], table: str = "", *, whole: bool = True
+    run: Run, rows: pd.DataFrame | Iterable[Mapping[str, object]], name: str = "", *, whole: bool = True
 ) -> pd.DataFrame:
     """The given rows, and at scale paper those of the other seeds beside this run.
 
-    table: what follows the notebook's name in the table's, ``_rows`` for instance. Where another seed's notebook did
-    not come to its end: RunError if ``whole``, else that seed is left out, and it is said.
+    name: the table's, by default the notebook's. Where another seed's notebook did not come to its end: RunError if
+    ``whole``, else that seed is left out, and it is said.
     """
-    name, parts = f"{run.notebook}{table}.csv", [tables.frame(rows)]
+    file, parts = f"{name or run.notebook}.csv", [tables.frame(rows)]
     for other in run.seeds() if run.scale == "paper" else ():
-        if other.dir != run.dir and (path := other.dir / "metrics" / name).exists():
+        if other.dir != run.dir and (path := other.dir / "metrics" / file).exists():
             try:
                 require(other, run.notebook)
             except RunError as error:

@@ -1,7 +1,7 @@
 """Publishing: a paper-scale run copied into data/ and figures/, and the results in README and docs/ written from it."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,14 +45,14 @@ POOLED = (
     "07_action_prior",
     "09_your_own",
     "10_explore",
-)  # tables that ship with all seeds
+)  # notebooks whose tables can be published alone
 
 
 def publish(run: Run) -> None:
     """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what is said of them.
 
-    The tables of POOLED have the rows of the other seeds beside this run as well. Raises RunError, before anything is
-    written, unless the notebooks ran to their end and their results are as they left them.
+    Tables have the rows of the other seeds beside this run as well. Raises RunError, before anything is written,
+    unless the notebooks ran to their end and their results are as they left them.
     """
     for notebook in ("01_collect", "02_train", "05_control", *POOLED):
         require(run, notebook)
@@ -68,17 +68,20 @@ def publish(run: Run) -> None:
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 files.write_bytes(copy, path.read_bytes())
     for path in sorted(run.metrics.glob("*.csv")):
-        tables_storage.ship_bytes(RESULTS / path.name, path.read_bytes())
-    for notebook, rows in tables.items():
-        tables_storage.ship(RESULTS / f"{notebook}.csv", rows)
+        if path.stem not in tables:
+            tables_storage.ship_bytes(RESULTS / path.name, path.read_bytes())
+    for name, rows in tables.items():
+        tables_storage.ship(RESULTS / f"{name}.csv", rows)
     manifest.write_manifest(ROOT / "data")
     publish_claims()
 
 
 def publish_table(run: Run, notebook: str) -> None:
-    """Copy the table of one notebook of POOLED, with all its seeds, into data/; rewrite what is said of the results."""
+    """Copy the tables of one notebook of POOLED, with all their seeds, into data/; rewrite what is said of the
+    results."""
     require(run, notebook)
-    tables_storage.ship(RESULTS / f"{notebook}.csv", _pooled(run, notebook))
+    for name, rows in pooled(run, [notebook]).items():
+        tables_storage.ship(RESULTS / f"{name}.csv", rows)
     manifest.write_manifest(RESULTS.parent)
     publish_claims()
 
@@ -92,13 +95,19 @@ def _ships(path: Path) -> bool:
     return ".checkpoint" not in path.name and not (path.parents[1].name == "models" and table_only)
 
 
-def pooled(run: Run) -> dict[str, pd.DataFrame]:
-    """Notebook -> the rows of this run and of every seed beside it. RunError where one did not come to its end."""
-    return {notebook: _pooled(run, notebook) for notebook in POOLED}
+def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
+    """Table -> the rows of this run and of every seed beside it. RunError where one did not come to its end.
 
-
-def _pooled(run: Run, notebook: str) -> pd.DataFrame:
-    return study.pooled_rows(replace(run, notebook=notebook), tables_storage.load(run.metrics / f"{notebook}.csv"))
+    made_by: notebooks; by default all but that of the claims, which are judged anew.
+    """
+    stems = {notebook.stem[:3]: notebook.stem for notebook in runs.notebooks().values()}  # 03_ablation is 03_predict's
+    found = dict[str, pd.DataFrame]()
+    for path in sorted(run.metrics.glob("*.csv")):
+        notebook = stems.get(path.stem[:3], "")
+        if notebook in (made_by or set(stems.values()) - {"08_claims"}):
+            own = replace(run, notebook=notebook)
+            found[path.stem] = study.pooled_rows(own, tables_storage.load(path), path.stem)
+    return found
 
 
 def publish_claims() -> None:

@@ -34,8 +34,9 @@ Rule = Callable[[Query], Checks]
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """A claim of the paper; it decorates the rule that yields its checks, whose docstring is what the paper says.
+    """A claim of the paper; it decorates the rule that yields its checks, whose docstring is the claim in our words.
 
+    quote: the paper's own, ... where words are left out; '' where it is read off a figure, which ``place`` names.
     readings: name -> fields of Query. why: verdict -> what is known of its cause. depends_on: claims that have to hold
     as well. picture: the paper makes it of a video or of one picture. definition: why it cannot fail.
     subject: the model in place of the paper's own.
@@ -49,6 +50,7 @@ class Claim:
     readings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     why: Mapping[str, str] = field(default_factory=dict)
     depends_on: Sequence[Claim] = ()
+    quote: str = ""
     headline: bool = False
     picture: bool = False
     definition: str = ""
@@ -59,6 +61,7 @@ class Claim:
 
     @property
     def statement(self) -> str:
+        """The claim in our words."""
         return inspect.getdoc(self.rule) or ""
 
     @cached_property

@@ -137,6 +137,16 @@ class Verdict:
         return [effect for effect in self.effects[""] if not effect.check.premise]
 
     @property
+    def seeds(self) -> int:
+        """The least number of training seeds that any of its checks with rows has; 0 where there are none."""
+        return min((effect.seeds for effect in self.checks if effect.seeds), default=0)
+
+    @property
+    def without_rows(self) -> int:
+        """How many of its checks have no rows."""
+        return sum(effect.value is None for effect in self.checks)
+
+    @property
     def failing_readings(self) -> dict[str, int]:
         """The other readings of the paper under which an inconclusive claim fails -> training seeds of what fails."""
         named = self.effects.items() if self.word == INCONCLUSIVE else ()

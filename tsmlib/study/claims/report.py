@@ -1,5 +1,6 @@
 """Verdicts as tables and as arrays: deciding effects, causes, and changes under other readings of the paper."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,10 +26,11 @@ ANSWERS = {REPLICATED: "yes", FAILED: "no", INCONCLUSIVE: "open", UNTESTABLE: "n
 
 
 def counts(verdicts: Sequence[Verdict]) -> str:
-    """How often each verdict was given, and by one training seed alone; what holds by definition is left out."""
+    """How often each verdict was given, and how many of those that decide rest on one training seed in some check;
+    what holds by definition is left out."""
     words = [verdict.word for verdict in verdicts]
     given = ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS if word != DEFINITIONAL)
-    single = sum(verdict.word in DECIDED and verdict.key.seeds == 1 for verdict in verdicts)
+    single = sum(verdict.word in DECIDED and verdict.seeds == 1 for verdict in verdicts)
     by_one = f"; {single} of the decided ones rest on one training seed" if single else ""
     return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}{by_one}"
 
@@ -43,13 +45,44 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
         claim, key, checks = verdict.claim, verdict.key, len(verdict.checks)
         found = "no rows yet" if key.value is None else key.estimate
         lines.append({
-            "": claim.id, "the paper says": f"{claim.statement} ({claim.place})",
+            "": claim.id, "the claim, in our words": f"{claim.statement} ({claim.place})",
             "verdict": "; ".join(filter(None, [f"**{verdict.word}**", failing(verdict)])),
             "with our model": other.word.lower(), "measured": claim.statistic,
-            "deciding check": f"{found}, asked {key.check.asked}{f'; one of {checks}' * (checks > 1)}",
+            "deciding check": "; ".join(filter(None, [
+                f"{found}, asked {key.check.asked}", f"one of {checks}" * (checks > 1), unmeasured(verdict),
+            ])),
             "n": key.n, "shown in": _links(claim, root),
         })  # fmt: skip
     return markdown(pd.DataFrame(lines))
+
+
+def unmeasured(verdict: Verdict) -> str:
+    """How many of a claim's checks have no rows, in words; '' where all have some, or none."""
+    some = 0 < verdict.without_rows < len(verdict.checks)
+    return f"{verdict.without_rows} of {len(verdict.checks)} checks have no rows" * some
+
+
+def seeds_table(verdicts: Sequence[Verdict]) -> str:
+    """Claims by the least number of training seeds over all of a claim's checks, in Markdown.
+
+    In brackets how many of the checks have that number, where not all have, and how many have no rows.
+    """
+    counted, lines = [verdict for verdict in verdicts if verdict.word != DEFINITIONAL], []
+    for seeds in sorted({verdict.seeds for verdict in counted}):
+        same = [verdict for verdict in counted if verdict.seeds == seeds]
+        drawn = {int(number) for verdict in same for number in re.findall(r"figure (\d+)", verdict.claim.place)}
+        lines.append({
+            "training seeds": seeds or "no rows", "claims": len(same), "which": ", ".join(map(_resting, same)),
+            "figures of the paper": ", ".join(map(str, sorted(drawn))),
+        })  # fmt: skip
+    return markdown(pd.DataFrame(lines))
+
+
+def _resting(verdict: Verdict) -> str:
+    checks, fewest = len(verdict.checks), sum(effect.seeds == verdict.seeds for effect in verdict.checks)
+    some = f"{fewest} of {checks} checks" * (fewest + verdict.without_rows < checks)
+    told = "; ".join(filter(None, [some, unmeasured(verdict)]))
+    return verdict.claim.id + f" ({told})" * bool(told)
 
 
 def failing(verdict: Verdict) -> str:
@@ -100,13 +133,14 @@ def readings(verdicts: Sequence[Verdict]) -> str:
 
 
 def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
-    """One claim as a section in Markdown: what the paper says, verdict, every check with all its seeds, the verdict
-    under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
+    """One claim as a section in Markdown: the paper's words and ours, verdict, every check with all its seeds, the
+    verdict under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
     claim, effects = verdict.claim, verdict.effects[""]
     checks = len(verdict.checks)
     several = f"All of {checks} checks have to hold" if checks > 1 else "One check has to hold"
     known = verdict.why if verdict.word in (DEFINITIONAL, UNTESTABLE) else claim.why.get(verdict.word, "")
     known = f" {known}" if known else ""
+    several = "; ".join(filter(None, [several, unmeasured(verdict)]))
     pictures = "\n".join([f"{'against':<{HALF}}|{'for it':>{HALF}}", *map(_strip, effects)])
     read = [
         {"reading": reading or "as the paper words it", "verdict": _under(found), "deciding check": _deciding(found)}
@@ -114,7 +148,9 @@ def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
     ]
     return f"""## {claim.id}
 
-> {claim.statement} ({claim.place})
+{quotation(claim)}
+
+In our words: {claim.statement}
 
 **{verdict.word}**; with `{ours.claim.subject}` {ours.word.lower()}.{known}
 
@@ -127,6 +163,11 @@ Measured: {claim.statistic}. {several}. Shown in {_links(claim, root)}.
 {markdown(pd.DataFrame(read))}
 
 What would change it: {change(verdict)}"""
+
+
+def quotation(claim: Claim) -> str:
+    """The paper's words as a block quote in Markdown, or the figure that a claim is read off."""
+    return f"> “{claim.quote}” ({claim.place})" if claim.quote else f"Read off {claim.place}."
 
 
 HALF = 18  # characters on either side of the margin
@@ -207,7 +248,7 @@ def seeds_to_decide(effect: Effect) -> int:
 def margins(verdicts: Sequence[Verdict]) -> list[tuple[str, str, str, str, np.ndarray, np.ndarray]]:
     """What ``figures.claim_margins`` draws, of every claim with rows.
 
-    Id, what the paper says, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie
+    Id, the claim in our words, verdict, the deciding effect in words, how far each estimate and its interval (n, 3) lie
     beyond the margin, the deciding one last, and how far the training seeds of that one (seeds,) do.
     """
     found = []

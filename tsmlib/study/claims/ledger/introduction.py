@@ -12,6 +12,7 @@ from tsmlib.study.claims.query import (
 from tsmlib.study.claims.shown import ACTION_PRIOR, CALIBRATION, HORIZON, RANGE, TRAINING
 
 @Claim("C01", "Abstract", RANGE,
+       quote="It makes stable and accurate predictions over long horizons for complex, stochastic systems",
        statistic="share of 90-step rollouts that leave the physical range; error at 90 steps over that of predicting "
                  "the mean")
 def c01(q: Query) -> Checks:
@@ -21,6 +22,7 @@ def c01(q: Query) -> Checks:
         yield q.score("nrmse", TSM, arm, step=90) < 1
 
 @Claim("C02", "Abstract, section 1", HORIZON, headline=True, readings=LIKELIHOODS,
+       quote="our method makes better predictions over long horizons than one-step models",
        statistic="log-likelihood and error at 20, 50 and 90 steps: TSM minus the better one-step model",
        why={FAILED: "Where its likelihood is ahead, that is mostly the freedom of its variance; the error of its mean, "
                     "which has none, is larger than that of the better one-step model, but for pushing at 90 steps, "
@@ -35,6 +37,8 @@ def c02(q: Query) -> Checks:
             yield tsm - smallest(one, multi) < 0
 
 @Claim("C03", "section 1", HORIZON,
+       quote="the predictions from a one-step model tend to diverge from the true dynamics, either due to the "
+             "accumulation of small errors or deviation from the regime represented by the data",
        statistic="growth of the error from step 1 to step 50, as a logarithm: one-step minus TSM",
        why={REPLICATED: "On pushing and on the plain arm TSM's error grows less mostly because it is larger at the "
                         "first step, not because it is much smaller at step 50."})
@@ -45,6 +49,8 @@ def c03(q: Query) -> Checks:
         yield log(one) - log(tsm) > 0
 
 @Claim("C04", "section 1", HORIZON,
+       quote="our approach can model both uncertainty and complex interactions (like collisions) holistically over a "
+             "segment, even if it makes small errors at individual timesteps",
        statistic="error at ten steps, TSM minus one-step, in the middle one of the three environments",
        why={FAILED: "Where everything is seen, a one-step network is well specified: on the plain arm its mean is "
                     "nearer at ten steps, by the mean of the seeds."})
@@ -53,6 +59,7 @@ def c04(q: Query) -> Checks:
     yield median(*(q.score("nrmse", TSM, arm, step=10) - q.score("nrmse", ONE_STEP, arm, step=10) for arm in ARMS)) < 0
 
 @Claim("C05", "Abstract", CALIBRATION,
+       quote="effectively expressing uncertainty",
        statistic="coverage of the central 50, 80 and 95 % intervals of its samples; energy score minus each "
                  "baseline's, all with residual noise",
        why={FAILED: "Trained by squared error and KL, its codes say little and its samples lie too close together."})
@@ -65,6 +72,7 @@ def c05(q: Query) -> Checks:
             yield q.score("energy_score_noise", TSM, arm) - q.score("energy_score_noise", rival, arm) < 0
 
 @Claim("C06", "Abstract", CALIBRATION, readings=LIKELIHOODS,
+       quote="modeling the effects of collisions, sensory noise, and action delays",
        statistic="log-likelihood after contact, with noise and with delay: TSM minus each baseline",
        why={DEPENDENT: "Under the paper's protocol TSM states a variance per step and dimension, and a baseline one "
                        "for everything; with the same freedom for all the order changes.",
@@ -77,12 +85,16 @@ def c06(q: Query) -> Checks:
             yield q.ll(TSM, arm, subset=subset) - q.ll(rival, arm, subset=subset) > 0
 
 @Claim("C07", "Abstract", TRAINING,
+       quote="The learned dynamics model and action prior can be used for end-to-end, fully differentiable trajectory "
+             "optimization and model-based policy optimization",
        statistic="largest relative difference between gradients and central differences, in float64")
 def c07(q: Query) -> Checks:
     """Model, prior and reward are differentiable from end to end."""
     yield q.gradient_error() <= 1e-5
 
 @Claim("C08", "section 1", ACTION_PRIOR, depends_on=(c12, c16, c51, c53),
+       quote="can be used in a variety of control settings while only considering actions from the regime where the "
+             "model is valid",
        statistic="everything that C12, C16, C51 and C53 measure",
        why={FAILED: "It rests on other claims, and not all of them hold."})
 def c08(_: Query) -> Checks:
