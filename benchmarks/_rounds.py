@@ -130,6 +130,17 @@ def interleaved(ways: Ways, rounds: int, *, warm: bool = True, progress: str = "
     return {way: np.array(taken) for way, taken in seconds.items()}
 
 
+def on_the_cpu(call: Callable[[], object]) -> Callable[[], float]:
+    """The seconds that ``call`` takes of the CPU, whatever else it computes."""
+
+    def timed() -> float:
+        began = time.process_time()
+        call()
+        return time.process_time() - began
+
+    return timed
+
+
 def peak_bytes(call: Callable[[], object]) -> int:
     """The most memory that this process has while ``call`` runs; where Linux does not tell, that it ever had."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")

@@ -57,6 +57,8 @@ TARGETS = (
            starts("train tsm, free-running: targets"), "ratio", True, 1.4),
     Target("share of the CPU's float32 matrix products in training TSM, both stages", "train",
            starts("train tsm, teacher-forced: targets", "train tsm, free-running: targets"), "share", True, 0.55),
+    Target("training rtsm free-running, updates per CPU second over those of tsm+energy+direct at equal batch", "train",
+           starts("train rtsm, free-running, two samples, beside"), "ratio", True, 2.5),
     Target("training on AVX2 alone, any model, updates per second over float32", "avx2",
            starts("train "), "ratio", True, 0.95),
     Target("imagined over MuJoCo's steps per second, pushing, c = 64, same core, best of all batches", "rollout",

@@ -12,8 +12,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 
 HELD = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2"}  # read once, as torch is loaded
@@ -25,7 +23,7 @@ def main() -> None:
             subprocess.run([sys.executable, *sys.argv], env={**os.environ, **HELD}, check=False).returncode
         )
 
-    from _rounds import Row, interleaved, parsed, parser, save
+    from _rounds import Row, interleaved, on_the_cpu, parsed, parser, save
     from train import ENV, training
 
     from tsmlib import study
@@ -58,17 +56,6 @@ def main() -> None:
             )  # fmt: skip
     print(f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads")
     save("avx2", rows)
-
-
-def on_the_cpu(call: Callable[[], object]) -> Callable[[], float]:
-    """The seconds that ``call`` takes of the CPU, whatever else it computes."""
-
-    def timed() -> float:
-        began = time.process_time()
-        call()
-        return time.process_time() - began
-
-    return timed
 
 
 if __name__ == "__main__":

@@ -20,17 +20,18 @@ from unittest import mock
 
 import numpy as np
 from _plain import PlainTSM
-from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
+from _rounds import SGEMM, Products, Row, interleaved, on_the_cpu, parsed, parser, peak_bytes, save
 
 from tsmlib import study
 from tsmlib.models.tsm import TSM
 from tsmlib.study import runs, zoo
-from tsmlib.study.zoo import Updates
+from tsmlib.study.zoo import OURS, Updates
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
 
 ENV = "tsm/ReacherPush-v1"
+BEFORE = "tsm+energy+direct"  # what rtsm took the place of
 WORDS = {"teacher_forced_loss": "teacher-forced", "loss": "free-running", "energy_loss": "energy score"}
 ONE_STEP = {"onestep", "ensemble", "ensemble+mse"}
 Data = tuple[Trajectories, Trajectories]
@@ -55,6 +56,8 @@ def main() -> None:
             if kind not in seen:  # tsm and tsm+energy begin alike
                 rows.append(stage_row(net, model, stage, data, arguments))
             seen.add(kind)
+    if OURS in arguments.models.split(","):
+        rows.append(before_row(run, data, arguments))
     if arguments.batches:
         sizes = [int(word) for word in arguments.batches.split(",")]
         rows += batch_rows(study.initialise(run, "tsm", data[0]), sizes, data, arguments.updates, 2)
@@ -106,6 +109,26 @@ def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) 
         other, targets / seconds["plain"],
         limit=SGEMM, bound=targets / seconds["sgemm"], peak=peak, env=ENV, sim="mujoco", model=model,
         configuration=stage.loss, metric="targets_per_second", horizon=stage.future_len,
+    )  # fmt: skip
+
+
+def before_row(run: Any, data: Data, arguments: Any) -> Row:
+    """Updates per CPU second of the free-running stages of rtsm and of what it took the place of, at equal batch.
+
+    Both draw two samples of two chained segments and compare them by the energy score.
+    """
+    losses, ways = {OURS: "loss", BEFORE: "energy_loss"}, {}
+    for model, loss in losses.items():
+        stage = next(s for s in study.schedule(run, ENV, model) if s.loss == loss and s.future_len == 20)
+        stage = replace(stage, batch=arguments.batch or 128)
+        net = study.initialise(run, model, data[0])
+        ways[model] = on_the_cpu(training(net, stage, data, updates=arguments.updates))
+    seconds = interleaved(ways, arguments.rounds, progress=f"{OURS} and {BEFORE}")
+    speed = {model: arguments.updates / taken for model, taken in seconds.items()}
+    return Row.of(
+        f"train {OURS}, free-running, two samples, beside {BEFORE}: updates per CPU second", speed[OURS], BEFORE,
+        speed[BEFORE], env=ENV, sim="mujoco", model=OURS, configuration="beside", metric="updates_per_second",
+        horizon=20,
     )  # fmt: skip
 
 

@@ -231,8 +231,20 @@ def test_a_doubling_of_the_training_time_is_read_from_neighbouring_lines_of_a_mo
     assert np.allclose(found[list(quality.MEASURES)], -0.5)
 
 
+def test_what_doublings_bring_is_continued_by_the_factor_by_which_it_fell() -> None:
+    values = {100: 16.0, 400: 4.0, 1600: 2.0}  # halved by each doubling, then by the root of a half
+    lines = pd.DataFrame([{"model": "slower", "seconds": s, "energy": v} for s, v in values.items()])
+    steady = pd.DataFrame([{"model": "steady", "seconds": s, "energy": 1 / s} for s in values])
+    found = quality.further(pd.concat([lines, steady]), "energy", times=(4, 16))
+    assert found["model"].tolist() == ["slower", "slower"]
+    assert found["seconds"].tolist() == [6400, 25600]
+    assert np.allclose(found[quality.MEASURES["energy"]], [2**0.5, 2**0.25])
+    assert np.allclose(found["a doubling there"], [2**-0.25 - 1, 2**-0.125 - 1])
+
+
 def test_a_line_without_violations_is_spelled_without_them() -> None:
-    line = {"env": "e", "model": "tsm", "seconds": 80, "cpu_seconds": 70, "updates": 9, "muon": 0.0, "coverage80": 0.8}
+    line = {"env": "e", "model": "tsm", "seconds": 80, "cpu_seconds": 70, "updates": 9, "coverage80": 0.8}
+    line |= {"muon": 0.0, "decay": 0.0}
     whole = pd.DataFrame([line | dict.fromkeys([*quality.MEASURES, "within"], 0.5)])
     violations = quality.MEASURES["violations"]
     assert violations in quality.spelled(whole)

@@ -143,6 +143,26 @@ def doublings(lines: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found)
 
 
+def further(lines: pd.DataFrame, score: str, times: tuple[int, ...] = (4, 16, 64)) -> pd.DataFrame:
+    """A score after ``times`` the longest training, and what a doubling would change there, if what a doubling brings
+    goes on to fall as it did between the last three lines of each model, by the same factor for each quadrupling."""
+    found = []
+    for model, group in lines.groupby("model", sort=False):
+        group = group.sort_values("seconds").tail(3)
+        seconds, values = group["seconds"].to_numpy(float), group[score].to_numpy(float)
+        slopes = np.diff(np.log(values)) / np.diff(np.log2(seconds))  # of each doubling, as a logarithm
+        if len(slopes) < 2 or not 0 < (factor := slopes[1] / slopes[0]) < 1:
+            continue  # nothing that slows down
+        for each in times:
+            steps = np.arange(1, round(np.log2(each) / 2) + 1)  # quadruplings
+            later = np.exp(2 * slopes[1] * (factor**steps).sum())
+            found.append({
+                "model": model, "seconds": round(each * seconds[-1]), MEASURES[score]: values[-1] * later,
+                "a doubling there": np.exp(slopes[1] * factor ** steps[-1]) - 1,
+            })  # fmt: skip
+    return pd.DataFrame(found)
+
+
 def over_the_best(lines: pd.DataFrame) -> pd.DataFrame:
     """Energy scores of models with codes over that of the best other model trained as long, which is named."""
     coded, found = zoo.words(cls=zoo.CODED), []
@@ -249,9 +269,24 @@ def tables(every: pd.DataFrame) -> str:
             table.markdown(over_the_best(lines).drop(columns="env")),
             "A doubling of the time changes these by:",
             table.markdown(each),
+            "If that goes on to fall as it did, by the same factor for each quadrupling (models whose changes do not "
+            "fall are left out):",
+            *(table.markdown(_spelled_further(further(lines, score), score)) for score in ("energy", "energy_80")),
         ]
     parts += seed_tables(every)
     return "\n\n".join(parts)
+
+
+def _spelled_further(found: pd.DataFrame, score: str) -> pd.DataFrame:
+    """``further`` as texts, a line per model."""
+    return pd.DataFrame([
+        {"model": model} | {
+            f"{MEASURES[score]} after {line['seconds']:,} s (a doubling)":
+                f"{line[MEASURES[score]]:.3f} ({line['a doubling there']:+.0%})"
+            for line in own.to_dict("records")
+        }
+        for model, own in found.groupby("model", sort=False)
+    ])  # fmt: skip
 
 
 def stamp(lines: pd.DataFrame) -> str:

@@ -36,6 +36,7 @@ ASKED = {  # parameters for these cells: without the plain arm, and plans for fe
     "04_latent": {"env": f"tsm/ReacherObstacle-v0,{PUSH}"}, "07_action_prior": {"n_targets": "20"},
 }  # fmt: skip
 MARKS = ("<!-- results -->", "<!-- end of results -->")
+AIM_MARKS = ("<!-- aims -->", "<!-- end of aims -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 POOLED = (
     "03_predict",
@@ -116,6 +117,7 @@ def publish_claims() -> None:
     papers, ours = pages.shipped_verdicts(PAPERS), pages.shipped_verdicts(OURS)
     tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
+    _between(README, AIM_MARKS, pages.readme_aims())
     _between(README, MARKS, pages.readme_results())
     _between(RESULTS_PAGE, MARKS, pages.results_page())
     _between(README, CLAIM_MARKS, pages.readme_claims(papers, ours))

@@ -1,0 +1,69 @@
+"""Aims of the study beside what rows say."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from tsmlib.storage import tables
+from tsmlib.study import pages
+from tsmlib.study.results import aims
+from tsmlib.study.results.planning import PUSH
+from tsmlib.study.runs import ROOT
+from tsmlib.study.zoo import OURS
+
+SCORE = dict(env=PUSH, metric=aims.ENERGY, execution="open loop", planner="none", subset="", scale="paper")
+
+
+def scores(values: dict[tuple[str, int], float]) -> pd.DataFrame:
+    """Energy scores 10 steps ahead: model and seed -> value."""
+    return tables.frame([
+        SCORE | dict(model=model, seed=seed, steps_ahead=10, value=value) for (model, seed), value in values.items()
+    ])  # fmt: skip
+
+
+def test_a_score_is_held_against_the_model_that_is_hardest_to_be_ahead_of() -> None:
+    rows = scores({(OURS, 0): 1.0, ("lstm", 0): 4.0, ("tsm", 0): 2.0})
+    assert aims._over_others(rows, PUSH, 10) == (0.5, "tsm")
+
+
+def test_ratios_of_scores_are_paired_by_seed_so_that_a_model_of_one_seed_is_held_against_that_seed_alone() -> None:
+    rows = scores({(OURS, 0): 1.0, (OURS, 1): 9.0, ("pets", 0): 2.0, ("lstm", 0): 4.0, ("lstm", 1): 36.0})
+    assert aims._over_others(rows, PUSH, 10) == (0.5, "pets")
+
+
+def test_nothing_is_reached_by_what_was_not_measured() -> None:
+    none = tables.frame([])
+    found = aims.aims(none, none, none, none)
+    assert not found["reached"].any()
+    assert set(found["measured"]) == {"not measured"}
+
+
+def test_what_is_said_of_gaps_is_of_their_means_over_seeds_target_by_target() -> None:
+    row = dict(env=PUSH, planner="cem", search_space="latent", execution="open loop", scale="paper", n=1)
+    sizes = {OURS: [0.0] * 9 + [1.0], "lstm": [1.0] * 10}
+    rows = tables.frame([
+        row | dict(model=model, seed=seed, target=i, metric=metric, value=-3.0 + (metric == "return_predicted") * gap)
+        for model, gaps in sizes.items() for seed in (0, 1) for i, gap in enumerate(gaps)
+        for metric in ("return_true", "return_predicted")
+    ])  # fmt: skip
+    said = aims.gap_told(rows)
+    assert "the 5 largest of `rtsm` are 100% of its 0.10 m" in said
+    assert "the medians are 0.00 and 1.00 m" in said
+    assert aims.gap_told(rows[rows["model"] == OURS]) == ""
+
+
+def test_the_sentence_names_every_aim_that_was_missed_with_what_was_found_and_no_other() -> None:
+    found = aims.table.thresholds([
+        ("one", "at most", 1.0, 2.0, "{:.0f}"), ("two", "at least", 1.0, 2.0, "{:.0f}"),
+        ("three", "at least", 3.0, 2.0, "{:.0f}"),
+    ])  # fmt: skip
+    said = aims.missed(found)
+    assert "2 of 3 aims" in said
+    assert "one 2 (at most 1); three 2 (at least 3)" in said
+    assert "two" not in said
+    assert aims.missed(found[found["reached"]]) == ""
+
+
+def test_the_first_paragraph_of_the_readme_says_what_was_missed() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert text.index(pages.readme_aims()) < text.index("## Start")

@@ -1,0 +1,146 @@
+"""Aims of the study's own model and of the pushing task beside what the published rows say.
+
+They are ours, not the paper's, and were set before these rows were there. Each is held against the other model that is
+hardest to be ahead of, which is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.stats import bootstrap
+
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.figures.method import Method
+from tsmlib.statistics import interval
+from tsmlib.study import zoo
+from tsmlib.study.results import planning, policies, prediction, table
+from tsmlib.study.results.planning import BASELINES, CLOSED, ORACLE, PUSH, REACH
+from tsmlib.study.zoo import OURS
+
+OBSTACLE = "tsm/ReacherObstacle-v0"
+ENERGY = "energy_score_noise"
+Line = tuple[str, str, float, float, str]  # of table.thresholds
+
+
+class Worst(NamedTuple):
+    """A ratio or a difference against the other model that is hardest to be ahead of, and that model."""
+
+    value: float
+    against: str
+
+
+def aims(predict: pd.DataFrame, plans: pd.DataFrame, targets: pd.DataFrame, learned: pd.DataFrame) -> pd.DataFrame:
+    """Aims with what was measured: columns what, threshold, measured, reached, as of ``table.thresholds``.
+
+    Rows of 03_predict with those of other libraries' models, of 05_control, of 05_control_rows and of policies, those
+    without a model included. Means over training seeds; ratios and differences paired by seed, or by target.
+    """
+    return table.thresholds([*_of_plans(plans, targets), *_of_predictions(predict), *_of_policies(learned)])
+
+
+def missed(found: pd.DataFrame) -> str:
+    """A sentence with the aims of a table of ``aims`` that were not reached; empty if all were."""
+    lines = [f"{line.what} {line.measured} ({line.threshold})" for line in found[~found["reached"]].itertuples()]
+    if not lines:
+        return ""
+    return f"Pushing by `{OURS}`, {len(lines)} of {len(found)} aims are not reached: {'; '.join(lines)}."
+
+
+def gap_told(targets: pd.DataFrame, *, most: int = 5) -> str:
+    """How far the ratio of mean gaps rests on few targets: the share of the ``most`` largest, the 95 % interval when
+    targets are drawn again, and medians. Rows of 05_control_rows; empty without those of both models."""
+    gaps = _latent(planning.gap_sizes(planning.plans_of(targets, env=PUSH, planners=["cem"])))
+    means = {other: float(gaps[other].to_numpy().mean()) for other in BASELINES if {OURS, other} <= {*gaps}}
+    if not means:
+        return ""
+    other = min(means, key=lambda each: means[each])
+    ours, theirs = (gaps[model].mean().to_numpy() for model in (OURS, other))
+    drawn = bootstrap(
+        (ours, theirs), lambda x, y, axis: x.mean(axis) / y.mean(axis), paired=True, vectorized=True,
+        random_state=np.random.default_rng(0),
+    ).confidence_interval  # fmt: skip
+    largest = np.sort(ours)[-most:].sum() / ours.sum()
+    return (
+        f"Few targets decide a mean gap: the {most} largest of `{OURS}` are {largest:.0%} of its {ours.mean():.2f} m. "
+        f"Its ratio to that of `{other}` is {drawn.low:.2f} to {drawn.high:.2f} in 95 % of draws of {len(ours)} "
+        f"targets with replacement; the medians are {np.median(ours):.2f} and {np.median(theirs):.2f} m."
+    )
+
+
+def _latent(found: Mapping[Method, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Model -> values of its plans over codes."""
+    return {way.model: values for way, values in found.items() if way.search_space == "latent"}
+
+
+def _of_plans(plans: pd.DataFrame, targets: pd.DataFrame) -> list[Line]:
+    opened, closed = (
+        table.select(planning.plans_of(plans, env=PUSH, execution=way), planner=["cem", "zero"])
+        for way in ("open loop", CLOSED)
+    )
+
+    def mean(metric: str, model: str, rows: pd.DataFrame = opened) -> float:
+        own = table.select(rows, model=model, metric=metric)
+        own = own[(own["search_space"] == "latent") | (own["planner"] == "zero")]
+        return float(own["value"].mean())
+
+    by_target = planning.plans_of(targets, env=PUSH, planners=["cem"])
+    costs, gaps = _latent(planning.costs_of(by_target)), _latent(planning.gap_sizes(by_target))
+    there = [other for other in BASELINES if {OURS, other} <= {*costs} & {*gaps}]
+    apart = {other: planning.paired_differences(costs[OURS], costs[other]) for other in there}
+    behind = _worst({other: sum(interval(each.mean().to_numpy())) for other, each in apart.items() if each.size})
+    gap = _worst({other: float(gaps[OURS].to_numpy().mean() / gaps[other].to_numpy().mean()) for other in there})
+    return [
+        ("cost of no torque over the oracle's", "at least", 2.0, mean("cost_over_oracle", "none"), "{:.2f}"),
+        ("ends within 5 cm by the oracle", "at least", 0.9,
+         mean("success", ORACLE.model), "{:.0%}"),
+        (f"cost of plans through `{OURS}` over the oracle's", "at most", 1.15, mean("cost_over_oracle", OURS),
+         "{:.2f}"),
+        (f"ends within 5 cm by `{OURS}`, planned again every ten steps", "at least", 0.8,
+         mean("success", OURS, closed), "{:.0%}"),
+        (f"its cost minus that of `{behind.against}` (m), upper end over targets", "at most", 0.0, behind.value,
+         "{:.2f}"),
+        (f"its mean gap over that of `{gap.against}`", "at most", 0.5, gap.value, "{:.2f}"),
+        ("its predicted steps that violate physics", "at most", 0.05, mean("violations", OURS), "{:.1%}"),
+    ]  # fmt: skip
+
+
+def _of_predictions(predict: pd.DataFrame) -> list[Line]:
+    found = list[Line]()
+    for env, steps, bound in ((PUSH, 10, 0.5), (PUSH, 80, 0.5), (OBSTACLE, None, 1.0), (REACH, None, 1.0)):
+        worst = _over_others(predict, env, steps)
+        where = f"{steps} steps ahead" if env == PUSH else f"of {EnvSpec.parse(env).name}"
+        what = f"its energy score {where} over that of `{worst.against}`"
+        found.append((what, "at most", bound, worst.value, "{:.2f}"))
+    return found
+
+
+def _over_others(predict: pd.DataFrame, env: str, steps: int | None) -> Worst:
+    """The mean over seeds that both have of our energy score over another model's; the largest of all models."""
+    rows = prediction.select(predict, ENERGY, env=env, steps_ahead=steps)
+    wide = rows.pivot(index="seed", columns="model", values="value")
+    ours = wide[OURS] if OURS in wide else pd.Series(dtype=float)
+    return _worst({str(other): float((ours / wide[other]).mean()) for other in wide if other != OURS})
+
+
+def _of_policies(learned: pd.DataFrame) -> list[Line]:
+    curves: Mapping[Method, Mapping[str, np.ndarray]] = policies.learning_curves(learned).get("push", {})
+    ends = {method: float(own["return_true"][:, -1].mean()) for method, own in curves.items()}
+    ours = max((ends[method] for method in ends if method.model == OURS), default=float("nan"))
+    inside = {method.model: end for method, end in ends.items() if method.search_space and method.model != OURS}
+    free = {method.model: end for method, end in ends.items() if not method.search_space}
+    return [
+        (f"return of its best policy minus that of {worst.against}", "at least", 0.0, -worst.value, "{:.2f}")
+        for others in (inside, free)
+        for worst in [_worst({zoo.look(model).name: end - ours for model, end in others.items()})]
+    ]  # fmt: skip
+
+
+def _worst(found: Mapping[str, float]) -> Worst:
+    """The largest value and whose it is; NaN of nothing."""
+    known = {word: value for word, value in found.items() if value == value}
+    word = max(known, key=lambda each: known[each], default="")
+    return Worst(known.get(word, float("nan")), word)
