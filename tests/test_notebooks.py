@@ -67,6 +67,25 @@ def test_a_notebook_takes_a_scale_a_seed_and_a_folder(path: Path) -> None:
     assert {type(value) for value in defaults.values()} <= {str, int, float, bool}
 
 
+def test_what_notebooks_assert_of_a_seed_s_own_rows_holds_for_every_published_seed() -> None:
+    """Other assertions on rows are on all that are shown, the published ones of every seed among them."""
+    asserted = {  # notebook -> what the cell says, and what it says it of
+        "01_collect": 'share["limit_share"].max()',
+        "02_train": 'row["value"] <= 1e-5 for row in errors',
+    }
+    for stem, words in asserted.items():
+        (cell,) = [cell for cell in code(runs.NOTEBOOKS / f"{stem}.ipynb") if words in cell.source]
+        lines = [node for node in ast.walk(ast.parse(cell.source)) if isinstance(node, ast.Assert)]
+        rows = study.published(stem)
+        assert lines
+        assert len(rows)
+        for _, own in rows.groupby("seed"):
+            shares, errors = own[own["metric"].str.endswith("_share")], own[own["metric"] == "gradient_error"]
+            share = shares.pivot_table(index="env", columns="metric", values="value")
+            names = dict(share=share, found=tables.records(shares), errors=tables.records(errors))
+            exec(compile(ast.Module(lines, []), stem, "exec"), names)
+
+
 @pytest.mark.skipif("config.option.nbval or config.option.nbval_lax", reason="this session runs them already")
 @pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks")
 def test_all_notebooks_run_in_order_and_leave_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
