@@ -310,6 +310,56 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     assert [label.get_text() for label in ax.get_xticklabels()] == ["0", "20", "500"]
 
 
+def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
+    rng = np.random.default_rng(0)
+    loop = dict(env=PUSH, planner="cem", execution="closed loop", n=9, scale="paper")
+    seeds_of = {results.PLANNED: (2, 0, 1), results.NONE: (0, 1, 2), results.RANDOM: (1, 2)}
+    rows = [
+        loop | dict(model=word, configuration=data, iteration=k, seed=seed, metric=metric, value=rng.uniform())
+        for word in ("rtsm", "lstm") for data, seeds in seeds_of.items() for seed in seeds for k in range(3)
+        for metric in ("return_true", "success") if (word, data) != ("lstm", results.NONE)
+    ]  # fmt: skip
+    value = {(r["model"], r["configuration"], r["iteration"], r["seed"], r["metric"]): r["value"] for r in rows}
+    lines = results.differences_table(tables.frame(rows)).splitlines()
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    expected = []
+    for word, k in (("rtsm", 1), ("rtsm", 2), ("lstm", 1), ("lstm", 2)):
+        cells = []
+        for metric, form in (("return_true", "{:+.2f} ± {:.2f}"), ("success", "{:+.1f} ± {:.1f}")):
+            for data, then in ((results.PLANNED, 0), (results.NONE, k), (results.RANDOM, k)):
+                both = [seed for seed in seeds_of[data] if (word, data, then, seed, metric) in value]
+                differences = [
+                    value[word, results.PLANNED, k, seed, metric] - value[word, data, then, seed, metric]
+                    for seed in both
+                ]
+                scaled = [(100 if metric == "success" else 1) * difference for difference in differences]
+                cells.append(form.format(*interval(scaled)) if both else "")
+        expected.append([f"`{word}`", str(k), *cells, "2 to 3"])
+    assert found[2:] == expected
+    assert found[0][2] == "executed return minus round 0"
+    assert results.differences_table(tables.frame(rows), PENDULUM) == ""
+
+
+def test_what_an_adapted_model_recovers_is_a_share_of_what_its_own_seed_lost() -> None:
+    common = dict(env=WEAK, model="rtsm", planner="none", execution="open loop", n=9, scale="paper",
+                  metric="energy_score_noise", steps_ahead=80)  # fmt: skip
+    given = {"zero-shot": {0: (2.0, 4.0, 3.0)}, "reference": {50_000: (1.0, 2.0)},
+             "all": {500: (1.5, 3.5, 2.0), 2000: (1.0, 3.0, 2.0)}, "scratch": {2000: (3.0, 4.0, 3.0)}}  # fmt: skip
+    rows = tables.frame([
+        common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, each in given.items() for steps, values in each.items() for seed, value in enumerate(values)
+    ])  # fmt: skip
+    lines = results.recovered_table(rows).splitlines()
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    shares = {"all": {5: (0.5, 0.25), 20: (1.0, 0.5)}, "scratch": {20: (-1.0, 0.0)}}  # of the seeds with a reference
+    assert found == [
+        [f"`{WEAK}`", "`rtsm`", results.WAYS[way].name,
+         *("{:.1%} ± {:.1%}".format(*interval(each[n])) if n in each else "" for n in (5, 20)), "2", "9"]
+        for way, each in shares.items()
+    ]  # fmt: skip
+    assert results.recovered_table(rows[rows["configuration"] != "reference"]) == ""
+
+
 def test_a_way_of_training_has_no_look_of_a_model() -> None:
     models = [*(spec.look for spec in zoo.ZOO.values() if spec.group != "choice"), *zoo.LOOKS.values()]
     ways = results.WAYS.values()

@@ -197,6 +197,38 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
 
 
 @table.sourced
+def differences_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
+    """A line for each learner and round of own plans: how much more return, and how many points more of success, than
+    before the first round, and than on other data after as many rounds; paired by seed. seeds: of these comparisons."""
+    lines = []
+    closed = table.select(rows, env=env, execution=CLOSED)
+    for word, own in table.groups(closed, "model"):
+        for k in sorted(set(table.select(own, configuration=PLANNED)["iteration"]) - {0}):
+            line, seeds = Row(), list[int]()
+            for metric, unit, form in (("return_true", 1, "{:+.2f} ± {:.2f}"), ("success", 100, "{:+.1f} ± {:.1f}")):
+                found = unit * paired(table.select(own, metric=metric), k)
+                seeds += [n for n in found.count() if n]
+                title = ROUNDS[env][metric] + " (points)" * (metric == "success")
+                line |= {
+                    f"{title} minus {what}": table.spell(values.dropna(), form) if values.notna().any() else ""
+                    for what, values in found.items()
+                }
+            if seeds:
+                counted = f"{min(seeds)} to {max(seeds)}" if len(set(seeds)) > 1 else seeds[0]
+                lines.append({"model": f"`{word}`", "round": int(k), **line, "seeds": counted})
+    return pd.DataFrame(lines)
+
+
+def paired(rows: pd.DataFrame, k: int) -> pd.DataFrame:
+    """Of rows of one learner and metric, a line for each seed: own plans after round k minus round 0, and minus other
+    data after round k; NaN where a seed lacks one of both."""
+    wide = rows.pivot(index="seed", columns=["configuration", "iteration"], values="value")
+    others = {"round 0": (PLANNED, 0), NONE: (NONE, k), RANDOM: (RANDOM, k)}
+    wide = wide.reindex(columns=pd.MultiIndex.from_tuples([(PLANNED, k), *others.values()]))
+    return pd.DataFrame({what: wide[PLANNED, k] - wide[key] for what, key in others.items()})
+
+
+@table.sourced
 def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
     """A line for each learner: returns that a search through the true simulator ends with in codes of the first prior
     and of the last, and the iterations of both to the former, "> 10" where a seed's search of ten does not reach it."""
@@ -265,6 +297,39 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
         line["CPU s"] = table.spell(table.select(own, metric="train_seconds")["value"], "{:.0f}")
         lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
+
+
+@table.sourced
+def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """A line for each arm, model and way: the share of the loss of energy score that n episodes recover,
+
+        (zero-shot - adapted) / (zero-shot - trained in full),
+
+    paired by seed, at the greatest number of steps ahead. Only where the reference has rows."""
+    lines = []
+    here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
+    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
+    for (env, word), own in table.groups(here, ["env", "model"]):
+        found = recovered(own)
+        for way in [way for way in WAYS if way in found]:
+            line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name}
+            for steps in sorted(found.columns.get_level_values("env_steps").unique()):
+                shares = found[way][steps].dropna() if steps in found[way] else []
+                line[f"{int(steps) // 100} episodes"] = table.spell(shares, "{:.1%} ± {:.1%}") if len(shares) else ""
+            lines.append({**line, "seeds": int(found[way].notna().any(axis=1).sum()), "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+def recovered(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of energy scores of one arm and model, the share recovered of what zero-shot loses against the reference: a line
+    for each seed that has both, a column for each way and number of steps."""
+    wide = rows.pivot(index="seed", columns=["configuration", "env_steps"], values="value")
+    if not {"zero-shot", REFERENCE} <= set(wide.columns.get_level_values(0)):
+        return pd.DataFrame()
+    one = wide.T.groupby(level=0).first().T  # column of each way; those two have one number of episodes
+    zero, full = one["zero-shot"], one[REFERENCE]
+    ways = wide.drop(columns=["zero-shot", REFERENCE], level=0)
+    return ways.rsub(zero, axis=0).div(zero - full, axis=0).dropna(how="all")
 
 
 @table.told
