@@ -340,6 +340,22 @@ def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
     assert results.differences_table(tables.frame(rows), PENDULUM) == ""
 
 
+def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PUSH, model="rtsm", execution="closed loop")
+    returns, shares, gaps = (table.select(rows, metric=m) for m in ("return_true", "success", "gap_absolute"))
+    shown = {
+        what for what, values in results.paired(shares, 5).items() if interval(values)[0] - interval(values)[1] > 0
+    }
+    assert shown == {results.NONE}
+    ends = [interval(values) for _, values in results.paired(returns, 5).items()]
+    assert all(mean - half < 0 < mean for mean, half in ends)  # not shown
+    for each in (returns, shares):
+        own = table.select(each, configuration=results.PLANNED).pivot(index="iteration", columns="seed", values="value")
+        assert own.idxmax().tolist() == [3, 3, 3]
+    gap = table.select(gaps, configuration=results.PLANNED).groupby("iteration")["value"].mean()
+    assert gap[5] > gap[0]
+
+
 def test_what_an_adapted_model_recovers_is_a_share_of_what_its_own_seed_lost() -> None:
     common = dict(env=WEAK, model="rtsm", planner="none", execution="open loop", n=9, scale="paper",
                   metric="energy_score_noise", steps_ahead=80)  # fmt: skip

@@ -316,7 +316,7 @@ def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
             for steps in sorted(found.columns.get_level_values("env_steps").unique()):
                 shares = found[way][steps].dropna() if steps in found[way] else []
                 line[f"{int(steps) // 100} episodes"] = table.spell(shares, "{:.1%} ± {:.1%}") if len(shares) else ""
-            lines.append({**line, "seeds": int(found[way].notna().any(axis=1).sum()), "n": int(own["n"].max())})
+            lines.append({**line, "seeds": len(found[way].dropna(how="all")), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
 
