@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
+from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
@@ -152,6 +157,90 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
     for name in ("measure", "search"):  # without any work
         monkeypatch.setattr(rounds, name, lambda *given: killed)
     assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
+
+
+def test_plans_that_measure_are_those_of_mpc_and_their_judges_draw_nothing_that_predicts_their_return() -> None:
+    few, model, prior = untrained()
+    for judging in (0, 8):
+        sizes = replace(rounds.SIZES["smoke"], judging=judging, every=50)
+        drawn, judge = (1000, tsmlib.expected_predictor) if judging else (0, tsmlib.model_predictor)
+        found = rounds.planned(few, model, prior, sizes, 0).found
+        again = tsmlib.mpc(
+            few, model, rounds.space_of(prior), rounds.planner(sizes, 0), every=50, judge=judge, seed=drawn
+        )
+        assert found is not None
+        assert torch.equal(found.closed.actions, again.actions)
+        assert torch.equal(found.closed.gap, again.gap)
+        assert torch.equal(found.first.actions[:, :50], again.actions[:, :50])  # it begins as the loop does
+    for seed in range(12):
+        start, steps = 1000 * (seed + 1), range(0, 100, 10)
+        judges = {8 * (start + 2 * done) + i for done in steps for i in range(8)}
+        assert not judges & ({start + 2 * done + 1 for done in steps} | {seed})
+
+
+def untrained() -> tuple[tsmlib.Task, tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
+    """Three starts of the pendulum, and a model and a prior that were never trained."""
+    data = rounds.first_episodes(3, 0)
+    model = tsmlib.RecurrentTSM.for_data(data, hidden=8)
+    return rounds.swing_up(3, seed=rounds.TESTED), model, tsmlib.ActionPrior.for_data(data, channels=4)
+
+
+def unstable(bad: np.ndarray, run: Any) -> Any:
+    """A stub of ``execute`` or ``mpc`` in which the episodes that start in ``bad`` (n, dx) become unstable."""
+
+    def stub(task: tsmlib.Task, *given: Any, **named: Any) -> tsmlib.Trial:
+        for i, start in enumerate(task.start):
+            if (start == bad).all(1).any():
+                raise SimulationUnstable(task.env, i, 3, "velocity")
+        return run(task, *given, **named)
+
+    return stub
+
+
+@pytest.mark.parametrize("where", ["mpc", "execute"])
+def test_an_unstable_episode_that_measures_has_failed_and_is_counted(
+    where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, model, prior = untrained()
+    sizes, every = replace(rounds.SIZES["smoke"], starts=3, every=50), replace(task, success=lambda x: x[:, -1, 0] < 2)
+    here = replace(rounds.WORLDS[PENDULUM], tested=every.take)
+    monkeypatch.setattr(rounds, "world", lambda env: here)
+    monkeypatch.setattr(rounds, where, unstable(task.start[:1], getattr(rounds, where)))
+    found = rounds.measure(sizes, 0)(model, prior)
+    others = rounds.planned(every.take([1, 2]), model, prior, sizes, 0).found
+    assert others is not None
+    assert (found["lost"], found["success"]) == (1, pytest.approx(2 / 3))
+    assert found["return_true"] == float(others.closed.executed_return.mean())
+    assert found["gap_absolute"] == float(others.closed.gap.abs().mean())
+    monkeypatch.setattr(rounds, where, unstable(task.start, getattr(rounds, where)))
+    none = rounds.measure(sizes, 0)(model, prior)
+    assert {name: none[name] for name in ("lost", "success")} == {"lost": 3, "success": 0}
+    assert "return_true" not in none
+    rows = results.round_rows(RUN, "rtsm", [{"round": 0, "env_steps": 0, **none}], 3, first=400)
+    assert {row["metric"]: row["value"] for row in rows}["lost"] == 3
+    assert "unstable episodes" in results.rounds_table(tables.frame(rows))
+
+
+def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> None:
+    sizes = replace(rounds.SIZES["smoke"], every=50)
+    found = rounds.loop(RUN, "rtsm", sizes=sizes)
+    assert {row["samples"] for row in found.rows} == {8}
+    assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
+    assert all(float(str(row["value"])) > 0 for row in found.seconds)
+    header = results.rounds_table(tables.frame([*found.rows, *found.seconds])).splitlines()[0]
+    assert all(title in header for title in ("judge", "CPU s", "wall s", "that gap open loop"))
+    by_rollout = rounds.loop(RUN, "lstm", sizes=sizes).rows  # which has no samples
+    assert not any("samples" in row for row in by_rollout)
+    assert "judge" not in results.rounds_table(tables.frame(by_rollout))
+
+
+def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
+    path, sizes = tmp_path / "round-0.json", asdict(rounds.SIZES["smoke"])
+    old = {name: value for name, value in sizes.items() if name not in ("judging", "screened")}
+    path.write_text(json.dumps({"made from": {"sizes": old, "seed": 0}, "found": 1.0}))
+    mode = {"sizes": sizes | {"judging": 0, "screened": 1.0}, "seed": 0}
+    assert rounds._once(path, mode, lambda: 2.0) == 1.0
+    assert rounds._once(path, {"sizes": sizes, "seed": 0}, lambda: 3.0) == 3.0
 
 
 def test_every_measure_of_rounds_that_is_drawn_has_a_unit() -> None:

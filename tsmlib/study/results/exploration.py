@@ -35,11 +35,15 @@ TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
 DATA = (PLANNED, RANDOM, NONE)  # of each round; the last is training alone
 REFERENCE: Final = "reference"
-_BOTH = {"return_true": "executed return", "gap_absolute": "size of the first plan's gap"}
+_BOTH = {
+    "return_true": "executed return", "gap_absolute": "size of the first plan's gap",
+    "gap_open_loop": "that gap open loop", "lost": "unstable episodes",
+}  # fmt: skip
 ROUNDS = {
     PENDULUM: {**_BOTH, "success": "share upright", "highest": "highest by random codes"},
     PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
 }
+SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, without what is measured after it
 EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
@@ -64,19 +68,21 @@ UNITS = {  # of DRAWN, as a figure's axes say them
 
 def round_rows(
     run: Run, word: str, records: Sequence[Mapping[str, float]], n: int, *, first: int, env: str = PENDULUM,
-    data: str = PLANNED, space: str = "latent",
+    data: str = PLANNED, space: str = "latent", samples: int = 0,
 ) -> list[Row]:  # fmt: skip
-    """What was measured on ``n`` starts after each round.
+    """What was measured on ``n`` starts after each round, and the SECONDS of it.
 
-    first: environment steps before round 1; data: one of DATA; space: that is searched.
+    first: environment steps before round 1; data: one of DATA; space: that is searched. samples: by which candidates
+    were judged beside the mode; 0: by the mode, or the one rollout that a model has.
     """
     common = _of_loop(run, word, env, data) | dict(planner="cem", execution=CLOSED, n=n, search_space=space)
+    common |= {"samples": samples} if samples else {}
     return [
         common | dict(
             iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
-            value=float(record[metric]),
+            value=float(record[metric]), **({"unit": "s"} if metric in SECONDS else {}),
         )
-        for record in records for metric in ROUNDS[env] if metric in record
+        for record in records for metric in (*ROUNDS[env], *SECONDS) if metric in record
     ]  # fmt: skip
 
 
@@ -175,20 +181,25 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 @table.sourced
 def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
-    """A line for each learner and round, with the contacts of its episodes where they were counted."""
+    """A line for each learner and round; contacts of its episodes, its seconds and the judge of its candidates where
+    these are known."""
     lines = []
     keys = ["model", "configuration", "iteration"]
     collected, closed = table.select(rows, env=env, subset="data"), table.select(rows, env=env, execution=CLOSED)
-    words = list(closed["model"].unique())
+    words, known = list(closed["model"].unique()), set(closed["metric"])
     for word, data, k in sorted(
         {key for key, _ in table.groups(closed, keys)}, key=lambda of: (words.index(of[0]), DATA.index(of[1]), of[2])
     ):
         own = table.select(closed, model=word, configuration=data, iteration=k)
         steps = own.groupby("seed")["env_steps"].max().mean()
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{steps:,.0f}"}
-        for metric, title in ROUNDS[env].items():
-            values = table.select(own, metric=metric)["value"]
-            line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+        if "samples" in closed and closed["samples"].notna().any():
+            line["judge"] = " / ".join(
+                f"{n:.0f} samples" if n else "mode" for n in sorted(set(own["samples"].fillna(0)))
+            )
+        for metric, title in {name: title for name, title in (ROUNDS[env] | SECONDS).items() if name in known}.items():
+            values, form = table.select(own, metric=metric)["value"], "{:.2f} ± {:.2f}"
+            line[title] = table.spell(values, "{:.0f}" if metric in SECONDS else form) if len(values) else ""
         for metric, title in EPISODES.items() if len(collected) else ():
             values = table.select(collected, model=word, configuration=data, iteration=k, metric=metric)["value"]
             line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
