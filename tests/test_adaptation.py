@@ -43,6 +43,24 @@ def test_the_few_episodes_are_divided_and_never_those_of_the_scores() -> None:
     assert len(np.unique(np.concatenate(starts), axis=0)) == 4 + 1 + 4 + 2
 
 
+@pytest.mark.parametrize(("env", "copies"), [(tsmlib.envs.variant(PUSH, mass=2.0), 8), (WEAK, 1)])
+@pytest.mark.parametrize("way", ["head", "scratch"])
+def test_an_adapted_model_of_pushing_is_trained_on_symmetric_copies(
+    way: adaptation.Way, env: str, copies: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trained(net: Any, loss: Any, train: tsmlib.Trajectories, validation: tsmlib.Trajectories, *_: Any, **__: Any):
+        seen.append((train, validation))
+
+    seen = list[tuple[tsmlib.Trajectories, tsmlib.Trajectories]]()
+    monkeypatch.setattr(adaptation, "fit", trained)
+    monkeypatch.setattr(adaptation, "fine_tune", trained)
+    train, validation = adaptation.few(env, 5)
+    adaptation.adapted("lstm", env, way, (train, validation))
+    ((on, held_out),) = seen
+    assert (len(on), held_out) == (copies * len(train), validation)
+    np.testing.assert_array_equal(on.states[: len(train)], train.states)
+
+
 def test_a_fine_tuned_model_of_the_standard_arm_predicts_the_weak_one_better_than_a_new_one() -> None:
     data, test = adaptation.few(WEAK, 5), adaptation.held_out(WEAK, 8)
     errors = {}
