@@ -526,7 +526,13 @@ def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_pat
     assert first[["way", "episodes"]].to_numpy().tolist() == [["zero-shot", 0], ["head", 5]]
     assert "{" not in run_script(script, *options)  # nothing measured again
     run_script(script, *options, "--targets", "2")
-    assert pd.read_csv(out)["cost"].notna().all()
+    planned = pd.read_csv(out)
+    assert planned["cost"].notna().all()
+    assert set(planned["judge"]) == {"expectation"}
+    assert "{" not in run_script(script, *options, "--targets", "2")
+    planned.assign(judge="mode").to_csv(out, index=False)
+    run_script(script, *options, "--targets", "2")
+    assert set(pd.read_csv(out)["judge"]) == {"expectation"}
 
 
 def test_a_plane_shows_real_states_alone() -> None:
