@@ -509,6 +509,38 @@ def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> N
     assert bars.get_segments()[1][:, 1].tolist() == pytest.approx([mean - half, mean + half])
 
 
+def pushing_rows(low: float) -> pd.DataFrame:
+    """Rounds of three learners, of which the LSTM falls to ``low``."""
+    common = dict(env=PUSH, planner="cem", execution="closed loop", n=9, metric="return_true", scale="paper")
+    ends = {("rtsm", results.PLANNED): -10.0, ("rtsm", results.NONE): -13.0, ("lstm", results.PLANNED): low}
+    return tables.frame([
+        common | dict(model=word, configuration=data, iteration=k, seed=seed, env_steps=20_000 + (end != -13) * 15_000 * k,
+                      value=-12 + (end + 12) * k / 2 + 0.1 * seed)
+        for (word, data), end in ends.items() for k in range(3) for seed in range(3)
+    ]).assign(source=table.YOURS)  # fmt: skip
+
+
+def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> None:
+    (drawing,) = drawings.rounds(pushing_rows(-30.0), PUSH, results.DRAWN[PUSH])
+    (ax,) = drawing.figure.axes
+    assert ax.get_ylim()[0] == results.LOWEST[PUSH]["executed return"]
+    assert "outside: LSTM, own plans to −29.9" in ax.get_xlabel()
+    all_below = pushing_rows(-30.0).assign(value=-25.0)
+    (drawing,) = drawings.rounds(all_below, PUSH, results.DRAWN[PUSH])
+    low, high = drawing.figure.axes[0].get_ylim()
+    assert low < -25 < high
+
+
+def test_training_alone_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
+    panel = results.round_panels(pushing_rows(-15.0), ["executed return"], PUSH, alone=True)["executed return"]
+    drawn = {(method.model, method.variant): at.tolist() for method, (at, _) in panel.items()}
+    alone = ("rtsm", "no new episodes, round 2")
+    assert drawn == {("rtsm", results.PLANNED): [20_000, 35_000, 50_000], alone: [20_000],
+                     ("lstm", results.PLANNED): [20_000, 35_000, 50_000]}  # fmt: skip
+    ((_, values),) = (found for method, found in panel.items() if method.variant == alone[1])
+    assert values.ravel().tolist() == pytest.approx([-13.0, -12.9, -12.8])
+
+
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
     assert pages.exploration_page(tables.frame([])) == ""
     rows = published("10_explore")

@@ -62,6 +62,8 @@ UNITS = {  # of DRAWN, as a figure's axes say them
     PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
 }
 
+LOWEST = {PUSH: {"executed return": -15.0, "share within 5 cm": 0.3}}  # of the axes, of DRAWN: a little below round 0
+
 
 # Rows ----------------------------------------------------------------------------------------------------------------
 
@@ -143,22 +145,24 @@ def adapted_rows(
 
 
 def round_panels(
-    rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM
+    rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM, *, alone: bool = False
 ) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
     """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
     Seeds are compared round by round: lost episodes leave one with fewer steps, and steps are means over seeds. Without
-    those that take no steps.
+    those that take no steps; alone: of these the last round, training alone, at the steps of the first.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
-    rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM])
+    rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM, NONE][: 2 + alone])
     for metric, title in ROUNDS[env].items():
         for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
             if title in titles:
                 wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
                 steps = own[own["seed"].isin(wide.index)].groupby("iteration")["env_steps"].mean()
+                wide = wide.iloc[:, -1:] if data == NONE else wide
+                variant = f"{NONE}, round {wide.columns[-1]}" if data == NONE else data
                 at, values = steps[wide.columns].to_numpy(float), wide.to_numpy(float)
-                found.setdefault(title, {})[zoo.method(word, variant=data)] = at, values
+                found.setdefault(title, {})[zoo.method(word, variant=variant)] = at, values
     return found
 
 
