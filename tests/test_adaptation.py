@@ -514,8 +514,9 @@ def pushing_rows(low: float) -> pd.DataFrame:
     common = dict(env=PUSH, planner="cem", execution="closed loop", n=9, metric="return_true", scale="paper")
     ends = {("rtsm", results.PLANNED): -10.0, ("rtsm", results.NONE): -13.0, ("lstm", results.PLANNED): low}
     return tables.frame([
-        common | dict(model=word, configuration=data, iteration=k, seed=seed, env_steps=20_000 + (end != -13) * 15_000 * k,
-                      value=-12 + (end + 12) * k / 2 + 0.1 * seed)
+        common | dict(model=word, configuration=data, iteration=k, seed=seed,
+                      value=-12 + (end + 12) * k / 2 + 0.1 * seed,
+                      env_steps=20_000 + 15_000 * k * (data != results.NONE))
         for (word, data), end in ends.items() for k in range(3) for seed in range(3)
     ]).assign(source=table.YOURS)  # fmt: skip
 

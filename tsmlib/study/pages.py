@@ -377,7 +377,7 @@ same training on the first random episodes alone:
 
 ![Executed return and share within 5 cm of the arm that pushes against environment steps](../figures/10_pushing.png)
 
-Axes end a little below round 0; what training alone ends with is the pale mark at 20,000 steps.
+Axes end a little below round 0; what training alone ends with is a pale mark at the steps of the first round.
 
 {found}
 """
