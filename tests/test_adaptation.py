@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
+from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
@@ -36,6 +41,24 @@ def test_the_few_episodes_are_divided_and_never_those_of_the_scores() -> None:
     test, held_out = adaptation.held_out(WEAK, 4)
     starts = [data.states[:, 0] for data in (train, validation, test, held_out)]
     assert len(np.unique(np.concatenate(starts), axis=0)) == 4 + 1 + 4 + 2
+
+
+@pytest.mark.parametrize(("env", "copies"), [(tsmlib.envs.variant(PUSH, mass=2.0), 8), (WEAK, 1)])
+@pytest.mark.parametrize("way", ["head", "scratch"])
+def test_an_adapted_model_of_pushing_is_trained_on_symmetric_copies(
+    way: adaptation.Way, env: str, copies: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trained(net: Any, loss: Any, train: tsmlib.Trajectories, validation: tsmlib.Trajectories, *_: Any, **__: Any):
+        seen.append((train, validation))
+
+    seen = list[tuple[tsmlib.Trajectories, tsmlib.Trajectories]]()
+    monkeypatch.setattr(adaptation, "fit", trained)
+    monkeypatch.setattr(adaptation, "fine_tune", trained)
+    train, validation = adaptation.few(env, 5)
+    adaptation.adapted("lstm", env, way, (train, validation))
+    ((on, held_out),) = seen
+    assert (len(on), held_out) == (copies * len(train), validation)
+    np.testing.assert_array_equal(on.states[: len(train)], train.states)
 
 
 def test_a_fine_tuned_model_of_the_standard_arm_predicts_the_weak_one_better_than_a_new_one() -> None:
@@ -152,6 +175,90 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
     for name in ("measure", "search"):  # without any work
         monkeypatch.setattr(rounds, name, lambda *given: killed)
     assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
+
+
+def test_plans_that_measure_are_those_of_mpc_and_their_judges_draw_nothing_that_predicts_their_return() -> None:
+    few, model, prior = untrained()
+    for judging in (0, 8):
+        sizes = replace(rounds.SIZES["smoke"], judging=judging, every=50)
+        drawn, judge = (1000, tsmlib.expected_predictor) if judging else (0, tsmlib.model_predictor)
+        found = rounds.planned(few, model, prior, sizes, 0).found
+        again = tsmlib.mpc(
+            few, model, rounds.space_of(prior), rounds.planner(sizes, 0), every=50, judge=judge, seed=drawn
+        )
+        assert found is not None
+        assert torch.equal(found.closed.actions, again.actions)
+        assert torch.equal(found.closed.gap, again.gap)
+        assert torch.equal(found.first.actions[:, :50], again.actions[:, :50])  # it begins as the loop does
+    for seed in range(12):
+        start, steps = 1000 * (seed + 1), range(0, 100, 10)
+        judges = {8 * (start + 2 * done) + i for done in steps for i in range(8)}
+        assert not judges & ({start + 2 * done + 1 for done in steps} | {seed})
+
+
+def untrained() -> tuple[tsmlib.Task, tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
+    """Three starts of the pendulum, and a model and a prior that were never trained."""
+    data = rounds.first_episodes(3, 0)
+    model = tsmlib.RecurrentTSM.for_data(data, hidden=8)
+    return rounds.swing_up(3, seed=rounds.TESTED), model, tsmlib.ActionPrior.for_data(data, channels=4)
+
+
+def unstable(bad: np.ndarray, run: Any) -> Any:
+    """A stub of ``execute`` or ``mpc`` in which the episodes that start in ``bad`` (n, dx) become unstable."""
+
+    def stub(task: tsmlib.Task, *given: Any, **named: Any) -> tsmlib.Trial:
+        for i, start in enumerate(task.start):
+            if (start == bad).all(1).any():
+                raise SimulationUnstable(task.env, i, 3, "velocity")
+        return run(task, *given, **named)
+
+    return stub
+
+
+@pytest.mark.parametrize("where", ["mpc", "execute"])
+def test_an_unstable_episode_that_measures_has_failed_and_is_counted(
+    where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, model, prior = untrained()
+    sizes, every = replace(rounds.SIZES["smoke"], starts=3, every=50), replace(task, success=lambda x: x[:, -1, 0] < 2)
+    here = replace(rounds.WORLDS[PENDULUM], tested=every.take)
+    monkeypatch.setattr(rounds, "world", lambda env: here)
+    monkeypatch.setattr(rounds, where, unstable(task.start[:1], getattr(rounds, where)))
+    found = rounds.measure(sizes, 0)(model, prior)
+    others = rounds.planned(every.take([1, 2]), model, prior, sizes, 0).found
+    assert others is not None
+    assert (found["lost"], found["success"]) == (1, pytest.approx(2 / 3))
+    assert found["return_true"] == float(others.closed.executed_return.mean())
+    assert found["gap_absolute"] == float(others.closed.gap.abs().mean())
+    monkeypatch.setattr(rounds, where, unstable(task.start, getattr(rounds, where)))
+    none = rounds.measure(sizes, 0)(model, prior)
+    assert {name: none[name] for name in ("lost", "success")} == {"lost": 3, "success": 0}
+    assert "return_true" not in none
+    rows = results.round_rows(RUN, "rtsm", [{"round": 0, "env_steps": 0, **none}], 3, first=400)
+    assert {row["metric"]: row["value"] for row in rows}["lost"] == 3
+    assert "unstable episodes" in results.rounds_table(tables.frame(rows))
+
+
+def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> None:
+    sizes = replace(rounds.SIZES["smoke"], every=50)
+    found = rounds.loop(RUN, "rtsm", sizes=sizes)
+    assert {row["samples"] for row in found.rows} == {8}
+    assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
+    assert all(float(str(row["value"])) > 0 for row in found.seconds)
+    header = results.rounds_table(tables.frame([*found.rows, *found.seconds])).splitlines()[0]
+    assert all(title in header for title in ("judge", "CPU s", "wall s", "that gap open loop"))
+    by_rollout = rounds.loop(RUN, "lstm", sizes=sizes).rows  # which has no samples
+    assert not any("samples" in row for row in by_rollout)
+    assert "judge" not in results.rounds_table(tables.frame(by_rollout))
+
+
+def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
+    path, sizes = tmp_path / "round-0.json", asdict(rounds.SIZES["smoke"])
+    old = {name: value for name, value in sizes.items() if name not in ("judging", "screened")}
+    path.write_text(json.dumps({"made from": {"sizes": old, "seed": 0}, "found": 1.0}))
+    mode = {"sizes": sizes | {"judging": 0, "screened": 1.0}, "seed": 0}
+    assert rounds._once(path, mode, lambda: 2.0) == 1.0
+    assert rounds._once(path, {"sizes": sizes, "seed": 0}, lambda: 3.0) == 3.0
 
 
 def test_every_measure_of_rounds_that_is_drawn_has_a_unit() -> None:
@@ -310,6 +417,72 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     assert [label.get_text() for label in ax.get_xticklabels()] == ["0", "20", "500"]
 
 
+def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
+    rng = np.random.default_rng(0)
+    loop = dict(env=PUSH, planner="cem", execution="closed loop", n=9, scale="paper")
+    seeds_of = {results.PLANNED: (2, 0, 1), results.NONE: (0, 1, 2), results.RANDOM: (1, 2)}
+    rows = [
+        loop | dict(model=word, configuration=data, iteration=k, seed=seed, metric=metric, value=rng.uniform())
+        for word in ("rtsm", "lstm") for data, seeds in seeds_of.items() for seed in seeds for k in range(3)
+        for metric in ("return_true", "success") if (word, data) != ("lstm", results.NONE)
+    ]  # fmt: skip
+    value = {(r["model"], r["configuration"], r["iteration"], r["seed"], r["metric"]): r["value"] for r in rows}
+    lines = results.differences_table(tables.frame(rows)).splitlines()
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    expected = []
+    for word, k in (("rtsm", 1), ("rtsm", 2), ("lstm", 1), ("lstm", 2)):
+        cells = []
+        for metric, form in (("return_true", "{:+.2f} ± {:.2f}"), ("success", "{:+.1f} ± {:.1f}")):
+            for data, then in ((results.PLANNED, 0), (results.NONE, k), (results.RANDOM, k)):
+                both = [seed for seed in seeds_of[data] if (word, data, then, seed, metric) in value]
+                differences = [
+                    value[word, results.PLANNED, k, seed, metric] - value[word, data, then, seed, metric]
+                    for seed in both
+                ]
+                scaled = [(100 if metric == "success" else 1) * difference for difference in differences]
+                cells.append(form.format(*interval(scaled)) if both else "")
+        expected.append([f"`{word}`", str(k), *cells, "2 to 3"])
+    assert found[2:] == expected
+    assert found[0][2] == "executed return minus round 0"
+    assert results.differences_table(tables.frame(rows), PENDULUM) == ""
+
+
+def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PUSH, model="rtsm", execution="closed loop")
+    returns, shares, gaps = (table.select(rows, metric=m) for m in ("return_true", "success", "gap_absolute"))
+    shown = {
+        what for what, values in results.paired(shares, 5).items() if interval(values)[0] - interval(values)[1] > 0
+    }
+    assert shown == {results.NONE}
+    ends = [interval(values) for _, values in results.paired(returns, 5).items()]
+    assert all(mean - half < 0 < mean for mean, half in ends)  # not shown
+    for each in (returns, shares):
+        own = table.select(each, configuration=results.PLANNED).pivot(index="iteration", columns="seed", values="value")
+        assert own.idxmax().tolist() == [3, 3, 3]
+    gap = table.select(gaps, configuration=results.PLANNED).groupby("iteration")["value"].mean()
+    assert gap[5] > gap[0]
+
+
+def test_what_an_adapted_model_recovers_is_a_share_of_what_its_own_seed_lost() -> None:
+    common = dict(env=WEAK, model="rtsm", planner="none", execution="open loop", n=9, scale="paper",
+                  metric="energy_score_noise", steps_ahead=80)  # fmt: skip
+    given = {"zero-shot": {0: (2.0, 4.0, 3.0)}, "reference": {50_000: (1.0, 2.0)},
+             "all": {500: (1.5, 3.5, 2.0), 2000: (1.0, 3.0, 2.0)}, "scratch": {2000: (3.0, 4.0, 3.0)}}  # fmt: skip
+    rows = tables.frame([
+        common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, each in given.items() for steps, values in each.items() for seed, value in enumerate(values)
+    ])  # fmt: skip
+    lines = results.recovered_table(rows).splitlines()
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    shares = {"all": {5: (0.5, 0.25), 20: (1.0, 0.5)}, "scratch": {20: (-1.0, 0.0)}}  # of the seeds with a reference
+    assert found == [
+        [f"`{WEAK}`", "`rtsm`", results.WAYS[way].name,
+         *("{:.1%} ± {:.1%}".format(*interval(each[n])) if n in each else "" for n in (5, 20)), "2", "9"]
+        for way, each in shares.items()
+    ]  # fmt: skip
+    assert results.recovered_table(rows[rows["configuration"] != "reference"]) == ""
+
+
 def test_a_way_of_training_has_no_look_of_a_model() -> None:
     models = [*(spec.look for spec in zoo.ZOO.values() if spec.group != "choice"), *zoo.LOOKS.values()]
     ways = results.WAYS.values()
@@ -336,6 +509,39 @@ def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> N
     assert bars.get_segments()[1][:, 1].tolist() == pytest.approx([mean - half, mean + half])
 
 
+def pushing_rows(low: float) -> pd.DataFrame:
+    """Rounds of three learners, of which the LSTM falls to ``low``."""
+    common = dict(env=PUSH, planner="cem", execution="closed loop", n=9, metric="return_true", scale="paper")
+    ends = {("rtsm", results.PLANNED): -10.0, ("rtsm", results.NONE): -13.0, ("lstm", results.PLANNED): low}
+    return tables.frame([
+        common | dict(model=word, configuration=data, iteration=k, seed=seed,
+                      value=-12 + (end + 12) * k / 2 + 0.1 * seed,
+                      env_steps=20_000 + 15_000 * k * (data != results.NONE))
+        for (word, data), end in ends.items() for k in range(3) for seed in range(3)
+    ]).assign(source=table.YOURS)  # fmt: skip
+
+
+def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> None:
+    (drawing,) = drawings.rounds(pushing_rows(-30.0), PUSH, results.DRAWN[PUSH])
+    (ax,) = drawing.figure.axes
+    assert ax.get_ylim()[0] == results.LOWEST[PUSH]["executed return"]
+    assert "outside: LSTM, own plans to −29.9" in ax.get_xlabel()
+    all_below = pushing_rows(-30.0).assign(value=-25.0)
+    (drawing,) = drawings.rounds(all_below, PUSH, results.DRAWN[PUSH])
+    low, high = drawing.figure.axes[0].get_ylim()
+    assert low < -25 < high
+
+
+def test_training_alone_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
+    panel = results.round_panels(pushing_rows(-15.0), ["executed return"], PUSH, alone=True)["executed return"]
+    drawn = {(method.model, method.variant): at.tolist() for method, (at, _) in panel.items()}
+    alone = ("rtsm", "no new episodes, round 2")
+    assert drawn == {("rtsm", results.PLANNED): [20_000, 35_000, 50_000], alone: [20_000],
+                     ("lstm", results.PLANNED): [20_000, 35_000, 50_000]}  # fmt: skip
+    ((_, values),) = (found for method, found in panel.items() if method.variant == alone[1])
+    assert values.ravel().tolist() == pytest.approx([-13.0, -12.9, -12.8])
+
+
 def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
     assert pages.exploration_page(tables.frame([])) == ""
     rows = published("10_explore")
@@ -353,7 +559,13 @@ def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_pat
     assert first[["way", "episodes"]].to_numpy().tolist() == [["zero-shot", 0], ["head", 5]]
     assert "{" not in run_script(script, *options)  # nothing measured again
     run_script(script, *options, "--targets", "2")
-    assert pd.read_csv(out)["cost"].notna().all()
+    planned = pd.read_csv(out)
+    assert planned["cost"].notna().all()
+    assert set(planned["judge"]) == {"expectation"}
+    assert "{" not in run_script(script, *options, "--targets", "2")
+    planned.assign(judge="mode").to_csv(out, index=False)
+    run_script(script, *options, "--targets", "2")
+    assert set(pd.read_csv(out)["judge"]) == {"expectation"}
 
 
 def test_a_plane_shows_real_states_alone() -> None:

@@ -445,7 +445,7 @@ def test_a_claim_rests_on_the_fewest_seeds_of_any_check_and_says_which_have_no_r
 
 def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows() -> None:
     questions = ledger.questions()
-    assert [c.id for c in questions] == ["Q1", "Q2", "Q3", "Q4", "Q5", "Q6"]
+    assert [c.id for c in questions] == ["Q1", "Q2", "Q3", "Q4", "Q5", "Q6", "Q7"]
     assert {c.subject for c in questions} == {"rtsm"}
     rows = evaluate.tables(questions)
     assert "NOT TESTABLE" not in {evaluate.judge(question, rows).word for question in questions}

@@ -19,6 +19,7 @@ from torch import Tensor
 import tsmlib as tsm
 from tsmlib import exploration
 from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.storage import artifacts
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import StoreError
 from tsmlib.trajectory import TrajectoryError
@@ -238,6 +239,101 @@ def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_unti
     assert len(asked) == 2
 
 
+def unstable_episode(episodes: set[int], env: str = ARM) -> Any:
+    """A stub of ``mpc`` in which the episodes that start where these of round 1 do become unstable at step 7."""
+    whole, bad = exploration.mpc, tasks(1).start[sorted(episodes)]
+
+    def run(task: tsm.Task, *given: Any, **named: Any) -> tsm.Trial:
+        for i, start in enumerate(task.start):
+            if (start == bad).all(1).any():
+                raise SimulationUnstable(env, i, 7, "velocity")
+        return whole(task, *given, **named)
+
+    return run
+
+
+def test_a_round_whose_last_episode_is_stable_is_learned_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 2}))
+    found = explored(*learners(), options=options(rounds=1))
+    assert (found.records[0]["lost"], len(found.train), len(found.held_out)) == (2, 6 + 1, 2)
+    assert found.records[0]["env_steps"] == 8 * EPISODES + 8 * (EPISODES - 1) + HORIZON
+
+
+def test_a_round_that_loses_all_its_episodes_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 1, 2}))
+    learned = learners()
+    found = explored(*learned, folder=tmp_path)
+    first, second = found.records
+    assert (found.episodes[0], first["lost"], first["env_steps"]) == (None, 3, 8 * (3 + 2 + 1))
+    assert "executed_return" not in first
+    assert second["lost"] == 0
+    assert len(found.train) == 6 + EPISODES - 1
+    again = learners()
+    assert explored(*again, folder=tmp_path).records == found.records
+    assert bits(*again) == bits(*learned)
+
+
+def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
+    """Judge and planner of every ``mpc`` that is called."""
+    whole, seen = exploration.mpc, list[tuple[Any, Any]]()
+
+    def watched(task: tsm.Task, model: Any, space: Any, planner: Any, **named: Any) -> tsm.Trial:
+        seen.append((named["judge"], planner))
+        return whole(task, model, space, planner, **named)
+
+    monkeypatch.setattr(exploration, "mpc", watched)
+    return seen
+
+
+@pytest.mark.parametrize(("changes", "judge", "samples", "screened"), [
+    ({}, tsm.expected_predictor, 8, 0.25), ({"judging": 2, "screened": 0.5}, tsm.expected_predictor, 2, 0.5),
+    ({"bonus": 1.0}, tsm.model_predictor, 4, 1.0),
+])  # fmt: skip
+def test_candidates_are_judged_by_samples_and_with_a_bonus_as_ever(
+    changes: Mapping[str, Any], judge: Any, samples: int, screened: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = judged_by(monkeypatch)
+    explored(*learners(), options=options(rounds=1, **changes))
+    ((found, planner),) = seen
+    assert (found.func, found.keywords, planner.keywords["screened"]) == (judge, {"samples": samples}, screened)
+
+
+def test_a_folder_of_plans_by_the_mode_goes_on_as_such_and_is_refused_by_an_expectation(tmp_path: Path) -> None:
+    by_mode = options(rounds=1, judging=0, screened=1.0)
+    found = explored(*learners(), options=by_mode, folder=tmp_path)
+    for path in (tmp_path / "round-001").glob("*.safetensors"):  # as of a version that had no choice
+        forget(path, "judging", "screened")
+    assert explored(*learners(), options=by_mode, folder=tmp_path).records == found.records
+    with pytest.raises(StoreError, match="is of another exploration: options"):
+        explored(*learners(), options=options(rounds=1), folder=tmp_path)
+
+
+def forget(path: Path, *names: str) -> None:
+    """Take options out of what a file says of the loop that wrote it."""
+    kind = "trajectories" if path.stem == "episodes" else "model"
+    tensors, header = artifacts.load(path, kind=kind)
+    identity: Any = header["identity"]
+    identity["options"] = {name: value for name, value in identity["options"].items() if name not in names}
+    artifacts.save(path, tensors, kind=kind, header=header)
+
+
+def test_a_model_without_samples_is_judged_by_its_rollout_whatever_the_options(tmp_path: Path) -> None:
+    def found(**changes: Any) -> list[dict[str, float]]:
+        model = tsm.OneStep.for_data(data(), hidden=8)
+        once = options(rounds=1, model=replace(options().model, past_len=1), **changes)
+        return explored(model, learners()[1], options=once, folder=tmp_path).records
+
+    assert found(judging=0, screened=1.0) == found()
+
+
+def test_the_seconds_of_a_round_are_kept_with_it(tmp_path: Path) -> None:
+    found = explored(*learners(), folder=tmp_path, measure=lambda model, prior: {"asked": 1.0})
+    assert [each.keys() for each in found.seconds] == [set(exploration.SECONDS)] * 2
+    assert all(value > 0 for each in found.seconds for value in each.values())
+    assert not any(set(exploration.SECONDS) & set(record) for record in found.records)
+    assert explored(*learners(), folder=tmp_path).seconds == found.seconds
+
+
 def test_what_disturbs_a_plan_is_no_candidate_of_its_search(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[tuple[Any, float, torch.Generator]] = []
 
@@ -288,7 +384,7 @@ def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> 
 
 @pytest.mark.parametrize(("changes", "said"), [
     ({"rounds": 0}, "at least 1 round"), ({"samples": 1}, "2 samples"), ({"noise": -1}, "zero or above"),
-    ({"held_out": 1.0}, "a share between 0 and 1"),
+    ({"held_out": 1.0}, "a share between 0 and 1"), ({"judging": -1}, "0 samples"), ({"screened": 2.0}, "from 0 to 1"),
 ])  # fmt: skip
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):

@@ -22,14 +22,13 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics
 from tsmlib.models.features import Features
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
-from tsmlib.planning.execution import Trial, mpc
+from tsmlib.planning.execution import Trial, finish, mpc
 from tsmlib.planning.planners import cem
-from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.predictors import JUDGING, expected_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
@@ -52,6 +51,8 @@ class Trainable(DynamicsModel, Protocol):
 Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
 Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
 Episodes = Callable[[int], Trajectories | None]  # round -> episodes that no plan made, or none
+SECONDS = ("cpu_seconds", "wall_seconds")
+BY_MODE: Mapping[str, Json] = {"judging": 0, "screened": 1.0}  # as all plans were judged before there was a choice
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,14 @@ class ExplorationOptions:
     """Schedule of ``explore``.
 
     model, prior: one round's training of each, from the weights it has; prior=None leaves it as it is. every,
-    candidates, elites, iterations: of the planning (``mpc``, ``cem``). held_out: share of each round's episodes that
-    join the held-out data, at least one and never all.
+    candidates, elites, iterations, screened: of the planning (``mpc``, ``cem``). judging: samples by which candidates
+    are judged beside the mode (``expected_predictor``); 0: by the mode alone. held_out: share of each round's episodes
+    that join the held-out data, at least one and never all.
     rms: of the torques that are searched where there is no prior. noise: standard deviation of what is added to the
     parameters of every plan, in those of the search space.
     bonus: reward for each step per unit of disagreement, the standard deviation over ``samples`` predicted states, as a
-    share of the data's, mean over dimensions; 0: none.
+    share of the data's, mean over dimensions; 0: none. With a bonus these samples judge, all candidates, and without
+    the mode.
     """
 
     model: TrainingOptions
@@ -79,6 +82,8 @@ class ExplorationOptions:
     noise: float = 0.0
     bonus: float = 0.0
     samples: int = 4
+    judging: int = JUDGING
+    screened: float = 0.25
 
     def __post_init__(self) -> None:
         if self.rounds < 1 or self.samples < 2:
@@ -90,6 +95,11 @@ class ExplorationOptions:
                 f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
                 "a share between 0 and 1"
             )
+        if self.judging < 0 or not 0 <= self.screened <= 1:
+            raise ValueError(
+                f"judging {self.judging}, screened {self.screened}: expected 0 samples (the mode) or more, and a share "
+                "from 0 to 1"
+            )
 
 
 @dataclass
@@ -100,13 +110,17 @@ class Exploration:
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
     of the ``gap``; ``lost``, episodes in which the simulation became unstable, whereupon the others begin anew
     (``discarded_steps``, what all had executed until then, which ``env_steps`` counts); after training the losses on
-    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave.
+    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave. A round that lost all its
+    episodes says no more of them, and has none.
+    seconds: of each round, to plan, execute and train, without ``measure``: ``cpu_seconds`` and ``wall_seconds``; of a
+    training that was stopped what was spent on it since. Rounds from a folder that has no seconds have none.
     """
 
     train: Trajectories
     held_out: Trajectories
     records: list[dict[str, float]] = field(default_factory=list)
     episodes: list[Trajectories | None] = field(default_factory=list)
+    seconds: list[dict[str, float]] = field(default_factory=list)
 
 
 def explore(
@@ -146,6 +160,8 @@ def explore(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
             "Take bonus=0, or an ensemble or a segment model"
         )
+    if options.bonus or not as_dynamics(model).stochastic:  # judged as ever
+        options = replace(options, judging=0, screened=1.0)
     weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
     identity: dict[str, Json] = {
         "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
@@ -167,12 +183,15 @@ def explore(
             before = (found.records[-1]["env_steps"] if found.records else 0) + int(record.get("discarded_steps", 0))
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))
-                found.held_out = found.held_out.joined(new.take(slice(n)))
+                if n:
+                    found.held_out = found.held_out.joined(new.take(slice(n)))
                 found.train = found.train.joined(new.take(slice(n, None)))
                 before += int(new.steps.sum())
             record = {"round": k, "env_steps": before} | record
             train_on = found.train if augmented is None else augmented(found.train)
-            found.records.append(_trained(k, model, prior, found, train_on, record, options, seed, place, measure))
+            record = _trained(k, model, prior, found, train_on, record, options, seed, place, measure)
+            found.seconds.append({name: record.pop(name) for name in SECONDS if name in record})
+            found.records.append(record)
             if callback is not None:
                 callback(Progress(k, time.process_time() - began, found.records[-1]))
     return found
@@ -181,11 +200,11 @@ def explore(
 def _collected(
     k: int, model: Trainable, prior: ActionPrior | None, like: Trajectories, tasks: Tasks,
     options: ExplorationOptions, seed: int, place: _Round | None,
-) -> tuple[Trajectories, dict[str, float]]:  # fmt: skip
-    """The episodes of round k and what is said of them, from the folder if they are there."""
+) -> tuple[Trajectories | None, dict[str, float]]:  # fmt: skip
+    """The episodes of round k and what is said of them, from the folder if they are there; None where all are lost."""
     if place is not None and (stored := place.episodes()) is not None:
         return stored
-    task = tasks(k)
+    began, task = _now(), tasks(k)
     if task.env != like.env:
         raise ValueError(f"the tasks of round {k} are of {task.env}, the data of {like.env}; expected one robot")
     if len(task) < 2:
@@ -196,22 +215,23 @@ def _collected(
     space = direct if prior is None else LatentActions(prior, task.horizon)
     draw = seed * 1_000_003 + 1000 * k
     planner: Planner = partial(
-        cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations, seed=draw
-    )
+        cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations,
+        screened=options.screened, seed=draw,
+    )  # fmt: skip
     if options.noise:
         planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(-1 - draw))  # of no search
-    judge: Judge = partial(model_predictor, samples=options.samples) if options.bonus else model_predictor
-    lost, discarded = 0, 0
-    while True:
-        try:
-            trial = mpc(aim, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
-            break
-        except SimulationUnstable as fault:
-            if len(aim) <= 2:
-                raise
-            discarded += (fault.step + 1) * len(aim)
-            aim, lost = aim.take([i for i in range(len(aim)) if i != fault.episode]), lost + 1
-    record = _said(trial, bonus=bool(options.bonus)) | {"lost": lost, "discarded_steps": discarded}
+    judge: Judge = model_predictor
+    if options.bonus:
+        judge = partial(model_predictor, samples=options.samples)
+    elif options.judging:
+        judge = partial(expected_predictor, samples=options.judging)
+    through = finish(
+        aim, lambda left: mpc(left, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
+    )
+    record: dict[str, float] = {"lost": through.lost, "discarded_steps": through.discarded_steps}
+    if (trial := through.found) is None:
+        return None, record | _since(began)
+    record = _said(trial, bonus=bool(options.bonus)) | record | _since(began)
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
     episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
     if place is not None:
@@ -226,7 +246,7 @@ def _trained(
     """The record of round k with what training gave; ``model`` and ``prior`` trained, or loaded if they are there."""
     if place is not None and (stored := place.models(model, prior)) is not None:
         return stored
-    parts: list[tuple[str, nn.Module, Loss, Trajectories, TrainingOptions]] = []
+    began, parts = _now(), list[tuple[str, nn.Module, Loss, Trajectories, TrainingOptions]]()
     if prior is not None and options.prior is not None:
         parts.append(("prior_validation", prior, prior.loss, found.train, options.prior))
     parts.append(("validation", cast(nn.Module, model), model.loss, augmented, options.model))
@@ -234,11 +254,21 @@ def _trained(
         checkpoint = None if place is None else place.folder / f"{name}.checkpoint"
         curve = fit(part, loss, data, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
         record[name] = min(curve.validation)
+    record |= {name: record.get(name, 0.0) + spent for name, spent in _since(began).items()}
     if measure is not None:
         record |= measure(model, prior)
     if place is not None:
         place.keep_models(model, prior, record)
     return record
+
+
+def _now() -> tuple[float, float]:
+    """Of this process and on the wall, in the order of SECONDS."""
+    return time.process_time(), time.perf_counter()
+
+
+def _since(began: tuple[float, float]) -> dict[str, float]:
+    return {name: now - then for name, now, then in zip(SECONDS, _now(), began, strict=True)}
 
 
 def _said(trial: Trial, *, bonus: bool) -> dict[str, float]:
@@ -293,9 +323,11 @@ class _Round:
     folder: Path
     identity: Mapping[str, Json]
 
-    def episodes(self) -> tuple[Trajectories, dict[str, float]] | None:
-        path = self.folder / "episodes.safetensors"
-        return (artifacts.load_trajectories(path), self._record(path)) if path.exists() else None
+    def episodes(self) -> tuple[Trajectories | None, dict[str, float]] | None:
+        path, whole = self.folder / "episodes.safetensors", self.folder / "model.safetensors"
+        if path.exists():
+            return artifacts.load_trajectories(path), self._record(path)
+        return (None, self._record(whole)) if whole.exists() else None  # all were lost
 
     def keep_episodes(self, episodes: Trajectories, record: Mapping[str, float]) -> None:
         artifacts.save_trajectories(self.folder / "episodes.safetensors", episodes, self._header(record))
@@ -326,7 +358,8 @@ class _Round:
         header = artifacts.read_header(path)
         stored = cast(dict[str, Json], header.get("identity", {}))
         later: dict[str, Json] = {"episodes": "planned", "configurations": self.identity["configurations"]}
-        found = later | stored | {"options": {"rms": 0.1, **cast(dict[str, Json], stored.get("options", {}))}}
+        options = {"rms": 0.1, **BY_MODE, **cast(dict[str, Json], stored.get("options", {}))}
+        found = later | stored | {"options": options}
         if differs := artifacts.differences(found, dict(self.identity)):
             raise StoreError(
                 f"{path} is of another exploration: {'; '.join(differs)}. Delete {self.folder.parent} to start anew, "

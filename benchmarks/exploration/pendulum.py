@@ -5,7 +5,8 @@
 
 The loop of notebook 10 (``study.rounds.loop``) with the numbers of ``Sizes`` that are given, of training seed 10, which
 no published row has. After every round the model plans from 16 validation starts. A line in pendulum.csv for each
-round: executed return, share upright, mean absolute gap. Lines of the same loop are replaced.
+round: executed return, share upright, mean absolute gap. With --judging 0 --screened 1 the mode judges candidates, of
+an ensemble all members. Lines of the same loop are replaced.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tsmlib.study import rounds, runs
 from tsmlib.study.results.exploration import PENDULUM
 
 PLACE, SEED, STARTS, VALIDATION = Path(__file__).with_suffix(".csv"), 10, 16, 3000
-GIVEN = ("updates", "before", "prior", "candidates", "elites", "iterations", "every")
+GIVEN = ("updates", "before", "prior", "candidates", "elites", "iterations", "every", "judging", "screened")
 METRICS = ("return_true", "success", "gap_absolute")
 
 
@@ -43,7 +44,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", choices=rounds.WORLDS[PENDULUM].learners)
     for name in GIVEN:
-        parser.add_argument(f"--{name}", type=int, default=getattr(default, name), help="default %(default)s")
+        number = getattr(default, name)
+        parser.add_argument(f"--{name}", type=type(number), default=number, help="default %(default)s")
     parser.add_argument("--out", type=Path, default=PLACE, help="default pendulum.csv beside this script")
     given = vars(parser.parse_args())
     torch.set_num_threads(1)

@@ -240,7 +240,8 @@ def main() -> None:
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":
         for env, word, data in wanted_rounds(parser, given):
-            publish(notebook, rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds")).rows)
+            loop = rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds"))
+            publish(notebook, [*loop.rows, *loop.seconds])
     elif given.part == "adaptation":
         for env in wanted_arms(parser, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))

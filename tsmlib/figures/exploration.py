@@ -15,34 +15,45 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from tsmlib.figures import axes
 from tsmlib.figures.checks import finite, per_panel, shaped
 from tsmlib.figures.method import Method
-from tsmlib.figures.style import DARK, GRID, WIDTH, entry, panels, styled
+from tsmlib.figures.style import DARK, GRID, WIDTH, entry, panels, styled, tint
 
 Rounds = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> method -> steps (R,), values (k, R)
 
 
 @styled
-def rounds(curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None = None) -> Figure:
+def rounds(
+    curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None = None,
+    lowest: Mapping[str, float] | None = None,
+) -> Figure:  # fmt: skip
     """What was measured after each round, against environment steps: mean over seeds, bars for the 95 % t interval.
 
     curves: title -> method -> environment steps (R,) and values (k, R); ylabel: one for all, or title -> text; yours:
-    as curves, drawn over them as hollow diamonds. A line begins before the first round. Marks of methods at the same
-    steps stand a little beside each other, so that their bars part.
+    as curves, drawn over them as hollow diamonds; lowest: title -> where an axis ends, so that what falls below it does
+    not squeeze the others (arrows and words say how far), unless most does. A line begins before the first round; a
+    method of one round is a large pale mark. Marks of methods at the same steps stand a little beside each other, so
+    that their bars part.
     """
     own, every = yours or {}, {title: {**(yours or {}).get(title, {}), **rows} for title, rows in curves.items()}
     look_of, ylabels = axes.looks(curves, own), per_panel("ylabel", ylabel, curves)
+    for method in {method for rows in every.values() for method, (at, _) in rows.items() if len(at) == 1}:
+        look_of[method] |= {"ls": "", "ms": 6.5, "mfc": tint(method.look.colour, 0.6)}
     width = WIDTH if len(curves) > 1 else 3.8
     figure, grid = panels(len(curves), len(curves), 2.0, width=width, head=0)
     barred, far = False, max(float(at.max()) for rows in every.values() for at, _ in rows.values())
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
         values = np.concatenate([np.ravel(found) for _, found in every[title].values()])
-        ax.set_ylim(axes.limits(values, values))
+        low, high = axes.limits(values, values)
+        floor = (lowest or {}).get(title, low)
+        ax.set_ylim(max(low, floor) if np.median(values) > floor else low, high)
         notes = []
         for method, given in rows.items():
             at, found = _checked(f"{title}, {method.label}", *given)
             mean, half = axes.band(found)
             beside = at + 0.012 * far * ([*look_of].index(method) - (len(look_of) - 1) / 2)
             axes.bars(ax, beside, mean, half, method.look.colour)
-            ax.plot(beside, mean, **look_of[method] | {"ms": 4.5}, zorder=3 if len(at) > 1 else 4)
+            ax.plot(
+                beside, mean, **look_of[method] | {"ms": 4.5 if len(at) > 1 else 6.5}, zorder=3 if len(at) > 1 else 4
+            )
             notes += axes.outside(ax, beside, mean, method)
             barred |= bool(half.any())
         for method, given in own.get(title, {}).items():

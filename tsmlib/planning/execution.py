@@ -4,8 +4,10 @@ Open loop as in the paper (``execute``), or planning again every few steps from 
 """
 
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from tsmlib.collection import Controller, collect, open_loop
+from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.envs.stepping import Arms, Simulation, make_simulation
 from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.models.base import Model, as_dynamics
@@ -24,6 +27,7 @@ from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, Trajectories, real_steps
 
+T = TypeVar("T")
 SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be repeated
 
 
@@ -87,6 +91,33 @@ def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10)
         seen, run = _run(task, actions, task.horizon, past_len)
         actions = _whole_actions(seen, task.horizon)
     return _measured(task, run, seen, actions, plan if isinstance(plan, Plan) else None)
+
+
+@dataclass(frozen=True)
+class Finished(Generic[T]):
+    """What was found of those instances of a task whose simulation stayed stable.
+
+    task: these instances, and ``found`` what was run of them; None: there is none. lost: how many others there were.
+    discarded_steps: that were executed in vain, since the others begin anew where one is lost.
+    """
+
+    task: Task
+    found: T | None
+    lost: int
+    discarded_steps: int
+
+
+def finish(task: Task, run: Callable[[Task], T]) -> Finished[T]:
+    """``run(task)``; where a simulation becomes unstable, again without that instance, until all others are through."""
+    lost, discarded = 0, 0
+    while True:
+        try:
+            return Finished(task, run(task), lost, discarded)
+        except SimulationUnstable as fault:
+            lost, discarded = lost + 1, discarded + (fault.step + 1) * len(task)
+            if len(task) == 1:
+                return Finished(task, None, lost, discarded)
+            task = task.take([i for i in range(len(task)) if i != fault.episode])
 
 
 def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:

@@ -2,7 +2,8 @@
 
 A way is what is done with ``n`` episodes of the changed arm: ``zero-shot`` nothing, ``all``, ``head`` and ``codes``
 fine-tuning of that part, ``scratch`` a new model trained on them. A fifth of the episodes, at least one, is held out to
-choose among validations. The numbers of updates of a model are the same whatever the arm and the episodes.
+choose among validations; of the pushing arm the others are trained on with their symmetric copies, as the shipped
+models were on theirs. The numbers of updates of a model are the same whatever the arm and the episodes.
 
 What they are held against is the ``reference``: a model trained on the changed arm as the shipped one was on its own,
 by as many episodes and updates.
@@ -17,6 +18,7 @@ from typing import Literal, NamedTuple, cast
 from tsmlib.envs import variant
 from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.prediction import Scores, score
 from tsmlib.fine_tuning import Part, fine_tune
 from tsmlib.models.base import DynamicsModel
@@ -97,6 +99,7 @@ def adapted(
     if data is None:
         raise ValueError(f"a model of {env} by the way {way!r} needs episodes; only zero-shot takes none")
     (train, validation), began, title = data, time.process_time(), f"{env} {word}: {way}"
+    train = symmetric(train)  # as study.models.training_data
     if way == "scratch":
         spec = zoo.find(word)
         arguments = spec.arguments(EnvSpec.parse(env))

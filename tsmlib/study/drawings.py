@@ -173,12 +173,13 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Dra
     """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles."""
     task, units = exploration.TASKS[env].capitalize(), exploration.UNITS[env]
     rows = table.select(found, execution=planning.CLOSED, env=env)
-    curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
+    curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env, alone=True))
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
         ylabels = {f"{task}: {title}": units[title] for title in curves}
-        yield Drawing(figures.rounds(panels, ylabels, yours=own), stem, rows)
+        lowest = {f"{task}: {title}": low for title, low in exploration.LOWEST.get(env, {}).items()}
+        yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest), stem, rows)
 
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:

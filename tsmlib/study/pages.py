@@ -410,8 +410,20 @@ Seeds are of the few episodes and of the updates on them: all begin from one mod
 ![Energy scores of adapted models against the episodes that they know](../figures/10_ways.png)
 
 {exploration_results.ways_table(rows)}
-
+{_recovered(rows)}
 {exploration_results.sentences(rows)}"""
+
+
+def _recovered(rows: pd.DataFrame) -> str:
+    """The part of that page on what adaptation recovers; empty without a model trained in full."""
+    if not (found := exploration_results.recovered_table(rows)):
+        return ""
+    return f"""
+The share of its loss that a model recovers from n episodes, (zero-shot - adapted) / (zero-shot - trained in full) of
+the energy score at the most steps ahead, paired by seed:
+
+{found}
+"""
 
 
 def _pushing_rounds(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
@@ -424,7 +436,16 @@ same training on the first random episodes alone:
 
 ![Executed return and share within 5 cm of the arm that pushes against environment steps](../figures/10_pushing.png)
 
+Axes end a little below round 0; what training alone ends with is a pale mark at the steps of the first round.
+
 {found}
+"""
+    if differences := exploration_results.differences_table(rows):
+        page += f"""
+Own plans minus others, paired by seed: minus the same learner before its first round, and minus those of the other data
+after as many rounds, which have been trained as often:
+
+{differences}
 """
     if free is not None and (beside := exploration_results.steps_table(rows, free)):
         page += f"""

@@ -6,7 +6,7 @@ on as many random episodes, and on no new ones, trained as often. What differs b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -22,14 +22,14 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import make_simulation
 from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.data import contact_counts, shares
-from tsmlib.exploration import ExplorationOptions, Measure, Trainable, explore
+from tsmlib.exploration import BY_MODE, ExplorationOptions, Measure, Trainable, explore
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.base import DynamicsModel
+from tsmlib.models.base import DynamicsModel, as_dynamics, members
 from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib.planning.base import Planner, SearchSpace
-from tsmlib.planning.execution import mpc
+from tsmlib.planning.base import Judge, Planner, SearchSpace
+from tsmlib.planning.execution import Finished, Trial, execute, finish, mpc
 from tsmlib.planning.planners import cem
-from tsmlib.planning.predictors import simulator_predictor
+from tsmlib.planning.predictors import JUDGING, expected_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import BLOCK, TIP
@@ -56,7 +56,8 @@ T = TypeVar("T")
 class Sizes:
     """Of a loop: random episodes before it, rounds, episodes of each, updates of each training, starts that measure.
 
-    candidates, elites, iterations: of every plan; every: steps between plans. before: updates of the model before the
+    candidates, elites, iterations, screened: of every plan; every: steps between plans. judging: samples by which
+    candidates are judged beside the mode; 0: by the mode alone. before: updates of the model before the
     first round; prior: updates of each training of the prior; 0: as many as the model has in a round. searches:
     iterations of the search in which the first prior and the last are compared (``search``); 0: they are not.
     """
@@ -73,6 +74,8 @@ class Sizes:
     prior: int = 0
     searches: int = 0
     every: int = 10
+    judging: int = JUDGING
+    screened: float = 0.25
 
     def training(self, past_len: int, future_len: int, *, updates: int = 0, muon: float = 0.0) -> TrainingOptions:
         """Of a model or a prior, by default in a round."""
@@ -87,8 +90,12 @@ class Sizes:
         return ExplorationOptions(
             model=self.training(past_len, 20, muon=muon), prior=self.training(10, 10, updates=self.prior),
             rounds=self.rounds, every=self.every, candidates=self.candidates, elites=self.elites,
-            iterations=self.iterations, rms=rms,
+            iterations=self.iterations, rms=rms, judging=self.judging, screened=self.screened,
         )  # fmt: skip
+
+    def judged_for(self, model: DynamicsModel) -> Sizes:
+        """The same for a model that may have no samples, whose one rollout judges."""
+        return self if as_dynamics(model).stochastic else replace(self, judging=0, screened=1.0)
 
 
 SIZES = {  # of the pendulum, by scale
@@ -180,23 +187,60 @@ def search(prior: ActionPrior, sizes: Sizes, seed: int, env: str) -> list[float]
 def planner(sizes: Sizes, seed: int) -> Planner:
     """The cross-entropy method with the budget of a loop."""
     return partial(
-        cem, candidates=sizes.candidates, elites=sizes.elites, iterations=sizes.iterations, seed=seed
+        cem, candidates=sizes.candidates, elites=sizes.elites, iterations=sizes.iterations, screened=sizes.screened,
+        seed=seed,
     )  # fmt: skip
 
 
+class Trials(NamedTuple):
+    """Episodes of one task: planned for again every few steps, and the first of these plans executed open loop."""
+
+    closed: Trial
+    first: Trial
+
+
+def planned(
+    task: Task, model: DynamicsModel, prior: ActionPrior | None, sizes: Sizes, seed: int, env: str = PENDULUM
+) -> Finished[Trials]:
+    """Plans with the budget of a loop and their execution, of those episodes whose simulation stays stable."""
+    sizes, space = sizes.judged_for(model), space_of(prior, env)
+    judge: Judge = partial(expected_predictor, samples=sizes.judging) if sizes.judging else model_predictor
+    drawn = 1000 * (seed + 1) if sizes.judging else 0  # of judges 8,000 and more, of predicted returns below
+
+    def run(task: Task) -> Trials:
+        predict = judge(model, task.past(as_dynamics(model).past_len), seed=drawn)
+        plan = planner(sizes, seed)(predict, task.reward, space, len(task))
+        closed = mpc(
+            task, model, space, planner(sizes, seed), every=sizes.every, plan=plan, judge=judge, seed=drawn
+        )  # fmt: skip
+        return Trials(closed, execute(task, plan))
+
+    return finish(task, run)
+
+
 def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
-    """Plans from the same starts after every round; of the pendulum, how high random codes of the prior swing it."""
+    """Plans from the same starts after every round; of the pendulum, how high random codes of the prior swing it.
+
+    Both gaps are of the first plan of an episode: its predicted return minus what planning again returns, and minus
+    what it returns itself, open loop. An episode whose simulation becomes unstable in either has failed and is counted
+    (``lost``); it has no return, and means of return, gap and distance are over the others.
+    """
     task = world(env).tested(sizes.starts)
 
     def measured(model: DynamicsModel, prior: ActionPrior | None) -> dict[str, float]:
-        trial = mpc(task, model, space_of(prior, env), planner(sizes, seed), every=sizes.every)
-        assert trial.success is not None
-        found = {
-            "return_true": float(trial.executed_return.mean()), "gap_absolute": float(trial.gap.abs().mean()),
-            "success": float(trial.success.float().mean()),
-        }  # fmt: skip
-        if task.position is not None:
-            found["final_distance"] = float(trial.final_distance.mean())
+        through = planned(task, model, prior, sizes, seed, env)
+        found = {"lost": float(through.lost), "success": 0.0}
+        if through.found is not None:
+            trial, first = through.found
+            assert trial.success is not None
+            assert trial.plan is not None
+            found |= {
+                "return_true": float(trial.executed_return.mean()), "gap_absolute": float(trial.gap.abs().mean()),
+                "gap_open_loop": float((trial.plan.predicted_return - first.executed_return).abs().mean()),
+                "success": float(trial.success.float().mean()) * len(through.task) / len(task),
+            }  # fmt: skip
+            if task.position is not None:
+                found["final_distance"] = float(trial.final_distance.mean())
         if prior is not None and env == PENDULUM:
             found["highest"] = highest(walks(prior, max(8, sizes.starts)))
         return found
@@ -277,10 +321,14 @@ def require(env: str, word: str) -> World:
 
 
 class Loop(NamedTuple):
-    """What a loop leaves: rows, and the episodes of each round, the random ones first; None: it had no new ones."""
+    """What a loop leaves: rows, and the episodes of each round, the random ones first; None: it had no new ones.
+
+    seconds: rows of what each round took, the only ones that another run of the same loop has not again.
+    """
 
     rows: list[Row]
     episodes: list[Trajectories | None]
+    seconds: Sequence[Row] = ()
 
 
 class Learner(NamedTuple):
@@ -325,6 +373,7 @@ def loop(
     sizes = sizes or here.sizes[run.scale]
     own = None if folder is None else folder / (env if env == PENDULUM else EnvSpec.parse(env).name) / word
     model, prior, train, held_out = learner(word, sizes, seed, env, own)
+    sizes = sizes.judged_for(model)
     measured, began = measure(sizes, seed, env), len(train) + len(held_out)
     options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0), rms=here.rms)
 
@@ -343,10 +392,14 @@ def loop(
         episodes=None if data == PLANNED else new, folder=own and own / slug,
     )  # fmt: skip
     records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **zero}, *found.records]
-    rows = results.round_rows(
-        run, word, records, sizes.starts, first=began * HORIZON, env=env, data=data,
-        space="direct" if prior is None else "latent",
+    rows_of = partial(
+        results.round_rows, run, word, n=sizes.starts, first=began * HORIZON, env=env, data=data,
+        space="direct" if prior is None else "latent", samples=sizes.judging if members(model) == 1 else 0,
     )  # fmt: skip
+    rows, seconds = rows_of(records), rows_of([
+        {"round": record["round"], "env_steps": record["env_steps"], **spent}
+        for record, spent in zip(found.records, found.seconds, strict=True)
+    ])  # fmt: skip
     episodes = [train.joined(held_out), *found.episodes]
     if env == PUSH:
         counted = [(k, len(each), contacts(each)) for k, each in enumerate(episodes) if each is not None]
@@ -356,7 +409,7 @@ def loop(
         curves[LAST_PRIOR] = _once(last, made_from, lambda: search(prior, sizes, seed, env))
         n, steps = min(sizes.starts, SEARCHED), began * HORIZON + int(records[-1]["env_steps"])
         rows += results.prior_rows(run, word, curves, n, env_steps=steps, env=env, data=data)
-    return Loop(rows, episodes)
+    return Loop(rows, episodes, seconds)
 
 
 def _seed(seed: int, k: int) -> int:
@@ -368,8 +421,11 @@ def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], T]) 
     """What ``make`` gives, kept in a file: the same the next time, if it was made from the same."""
     if path is None:
         return make()
-    if path.exists() and (kept := cast(dict[str, Json], files.loads(path.read_bytes())))["made from"] == made_from:
-        return cast(T, kept["found"])
+    if path.exists():
+        kept = cast(dict[str, Json], files.loads(path.read_bytes()))
+        was = cast(dict[str, Json], kept["made from"])
+        if was | {"sizes": {**BY_MODE, **cast(dict[str, Json], was["sizes"])}} == made_from:
+            return cast(T, kept["found"])
     found = make()
     files.write_bytes(path, files.dumps(path, {"made from": made_from, "found": cast(Json, found)}).encode())
     return found

@@ -318,9 +318,9 @@ class Query:
         return self._ask("10_explore", metric, model.word, place, configuration=configuration, env_steps=env_steps,
                          steps_ahead=steps_ahead)  # fmt: skip
 
-    def pushed(self, configuration: str, *, after: int) -> Number:
-        """Executed return after so many rounds of exploration on the arm that pushes."""
-        return self._ask("10_explore", "return_true", PAPERS, PUSH, configuration=configuration, iteration=after,
+    def pushed(self, configuration: str, *, after: int, metric: str = "return_true") -> Number:
+        """Executed return, or another metric, after so many rounds of exploration on the arm that pushes."""
+        return self._ask("10_explore", metric, PAPERS, PUSH, configuration=configuration, iteration=after,
                          execution="closed loop")  # fmt: skip
 
     def searched(self, prior: str, configuration: str = "own plans") -> Number:

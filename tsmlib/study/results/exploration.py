@@ -35,11 +35,15 @@ TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
 DATA = (PLANNED, RANDOM, NONE)  # of each round; the last is training alone
 REFERENCE: Final = "reference"
-_BOTH = {"return_true": "executed return", "gap_absolute": "size of the first plan's gap"}
+_BOTH = {
+    "return_true": "executed return", "gap_absolute": "size of the first plan's gap",
+    "gap_open_loop": "that gap open loop", "lost": "unstable episodes",
+}  # fmt: skip
 ROUNDS = {
     PENDULUM: {**_BOTH, "success": "share upright", "highest": "highest by random codes"},
     PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
 }
+SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, without what is measured after it
 EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
@@ -58,25 +62,29 @@ UNITS = {  # of DRAWN, as a figure's axes say them
     PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
 }
 
+LOWEST = {PUSH: {"executed return": -15.0, "share within 5 cm": 0.3}}  # of the axes, of DRAWN: a little below round 0
+
 
 # Rows ----------------------------------------------------------------------------------------------------------------
 
 
 def round_rows(
     run: Run, word: str, records: Sequence[Mapping[str, float]], n: int, *, first: int, env: str = PENDULUM,
-    data: str = PLANNED, space: str = "latent",
+    data: str = PLANNED, space: str = "latent", samples: int = 0,
 ) -> list[Row]:  # fmt: skip
-    """What was measured on ``n`` starts after each round.
+    """What was measured on ``n`` starts after each round, and the SECONDS of it.
 
-    first: environment steps before round 1; data: one of DATA; space: that is searched.
+    first: environment steps before round 1; data: one of DATA; space: that is searched. samples: by which candidates
+    were judged beside the mode; 0: by the mode, or the one rollout that a model has.
     """
     common = _of_loop(run, word, env, data) | dict(planner="cem", execution=CLOSED, n=n, search_space=space)
+    common |= {"samples": samples} if samples else {}
     return [
         common | dict(
             iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
-            value=float(record[metric]),
+            value=float(record[metric]), **({"unit": "s"} if metric in SECONDS else {}),
         )
-        for record in records for metric in ROUNDS[env] if metric in record
+        for record in records for metric in (*ROUNDS[env], *SECONDS) if metric in record
     ]  # fmt: skip
 
 
@@ -137,22 +145,24 @@ def adapted_rows(
 
 
 def round_panels(
-    rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM
+    rows: pd.DataFrame, titles: Sequence[str], env: str = PENDULUM, *, alone: bool = False
 ) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
     """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
     Seeds are compared round by round: lost episodes leave one with fewer steps, and steps are means over seeds. Without
-    those that take no steps.
+    those that take no steps; alone: of these the last round, training alone, at the steps of the first.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
-    rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM])
+    rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM, NONE][: 2 + alone])
     for metric, title in ROUNDS[env].items():
         for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
             if title in titles:
                 wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
                 steps = own[own["seed"].isin(wide.index)].groupby("iteration")["env_steps"].mean()
+                wide = wide.iloc[:, -1:] if data == NONE else wide
+                variant = f"{NONE}, round {wide.columns[-1]}" if data == NONE else data
                 at, values = steps[wide.columns].to_numpy(float), wide.to_numpy(float)
-                found.setdefault(title, {})[zoo.method(word, variant=data)] = at, values
+                found.setdefault(title, {})[zoo.method(word, variant=variant)] = at, values
     return found
 
 
@@ -175,25 +185,62 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 @table.sourced
 def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
-    """A line for each learner and round, with the contacts of its episodes where they were counted."""
+    """A line for each learner and round; contacts of its episodes, its seconds and the judge of its candidates where
+    these are known."""
     lines = []
     keys = ["model", "configuration", "iteration"]
     collected, closed = table.select(rows, env=env, subset="data"), table.select(rows, env=env, execution=CLOSED)
-    words = list(closed["model"].unique())
+    words, known = list(closed["model"].unique()), set(closed["metric"])
     for word, data, k in sorted(
         {key for key, _ in table.groups(closed, keys)}, key=lambda of: (words.index(of[0]), DATA.index(of[1]), of[2])
     ):
         own = table.select(closed, model=word, configuration=data, iteration=k)
         steps = own.groupby("seed")["env_steps"].max().mean()
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{steps:,.0f}"}
-        for metric, title in ROUNDS[env].items():
-            values = table.select(own, metric=metric)["value"]
-            line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+        if "samples" in closed and closed["samples"].notna().any():
+            line["judge"] = " / ".join(
+                f"{n:.0f} samples" if n else "mode" for n in sorted(set(own["samples"].fillna(0)))
+            )
+        for metric, title in {name: title for name, title in (ROUNDS[env] | SECONDS).items() if name in known}.items():
+            values, form = table.select(own, metric=metric)["value"], "{:.2f} ± {:.2f}"
+            line[title] = table.spell(values, "{:.0f}" if metric in SECONDS else form) if len(values) else ""
         for metric, title in EPISODES.items() if len(collected) else ():
             values = table.select(collected, model=word, configuration=data, iteration=k, metric=metric)["value"]
             line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
         lines.append({**line, "n": int(own["n"].max())})
     return pd.DataFrame(lines)
+
+
+@table.sourced
+def differences_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
+    """A line for each learner and round of own plans: how much more return, and how many points more of success, than
+    before the first round, and than on other data after as many rounds; paired by seed. seeds: of these comparisons."""
+    lines = []
+    closed = table.select(rows, env=env, execution=CLOSED)
+    for word, own in table.groups(closed, "model"):
+        for k in sorted(set(table.select(own, configuration=PLANNED)["iteration"]) - {0}):
+            line, seeds = Row(), list[int]()
+            for metric, unit, form in (("return_true", 1, "{:+.2f} ± {:.2f}"), ("success", 100, "{:+.1f} ± {:.1f}")):
+                found = unit * paired(table.select(own, metric=metric), k)
+                seeds += [n for n in found.count() if n]
+                title = ROUNDS[env][metric] + " (points)" * (metric == "success")
+                line |= {
+                    f"{title} minus {what}": table.spell(values.dropna(), form) if values.notna().any() else ""
+                    for what, values in found.items()
+                }
+            if seeds:
+                counted = f"{min(seeds)} to {max(seeds)}" if len(set(seeds)) > 1 else seeds[0]
+                lines.append({"model": f"`{word}`", "round": int(k), **line, "seeds": counted})
+    return pd.DataFrame(lines)
+
+
+def paired(rows: pd.DataFrame, k: int) -> pd.DataFrame:
+    """Of rows of one learner and metric, a line for each seed: own plans after round k minus round 0, and minus other
+    data after round k; NaN where a seed lacks one of both."""
+    wide = rows.pivot(index="seed", columns=["configuration", "iteration"], values="value")
+    others = {"round 0": (PLANNED, 0), NONE: (NONE, k), RANDOM: (RANDOM, k)}
+    wide = wide.reindex(columns=pd.MultiIndex.from_tuples([(PLANNED, k), *others.values()]))
+    return pd.DataFrame({what: wide[PLANNED, k] - wide[key] for what, key in others.items()})
 
 
 @table.sourced
@@ -265,6 +312,39 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
         line["CPU s"] = table.spell(table.select(own, metric="train_seconds")["value"], "{:.0f}")
         lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
+
+
+@table.sourced
+def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """A line for each arm, model and way: the share of the loss of energy score that n episodes recover,
+
+        (zero-shot - adapted) / (zero-shot - trained in full),
+
+    paired by seed, at the greatest number of steps ahead. Only where the reference has rows."""
+    lines = []
+    here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
+    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
+    for (env, word), own in table.groups(here, ["env", "model"]):
+        found = recovered(own)
+        for way in [way for way in WAYS if way in found]:
+            line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name}
+            for steps in sorted(found.columns.get_level_values("env_steps").unique()):
+                shares = found[way][steps].dropna() if steps in found[way] else []
+                line[f"{int(steps) // 100} episodes"] = table.spell(shares, "{:.1%} ± {:.1%}") if len(shares) else ""
+            lines.append({**line, "seeds": len(found[way].dropna(how="all")), "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+def recovered(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of energy scores of one arm and model, the share recovered of what zero-shot loses against the reference: a line
+    for each seed that has both, a column for each way and number of steps."""
+    wide = rows.pivot(index="seed", columns=["configuration", "env_steps"], values="value")
+    if not {"zero-shot", REFERENCE} <= set(wide.columns.get_level_values(0)):
+        return pd.DataFrame()
+    one = wide.T.groupby(level=0).first().T  # column of each way; those two have one number of episodes
+    zero, full = one["zero-shot"], one[REFERENCE]
+    ways = wide.drop(columns=["zero-shot", REFERENCE], level=0)
+    return ways.rsub(zero, axis=0).div(zero - full, axis=0).dropna(how="all")
 
 
 @table.told

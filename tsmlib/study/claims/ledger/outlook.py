@@ -6,9 +6,12 @@
     Q4    as Q1, on the arm that pushes
     Q5    a prior that is learned from plans is a better space to plan in
     Q6    a segment model that explores is ahead of PETS, as mbrl-lib runs it
+    Q7    as Q4, by at least ten points of success
 
-The margins are zero, and were set when rows of one training seed were there; those of Q4 and Q5 when two rounds of
-seed 0 had been seen, that of Q6 when PETS was known to be ahead on seed 0.
+The margins of Q1 to Q6 are zero, and were set when rows of one training seed were there; those of Q4 and Q5 when two
+rounds of seed 0 had been seen, that of Q6 when PETS was known to be ahead on seed 0. That of Q7 was a target of this
+study from the start, but the question was written when the rows of all three seeds were known. Its "same total of
+training" is read both ways: before the first round, where training had not gone on, and the same training alone.
 """
 # fmt: off
 # isort: off
@@ -69,3 +72,13 @@ def q6(q: Query) -> Checks:
     """Does a segment model that learns from its own plans return more than PETS does after as many steps?"""
     ours, theirs = (q.explored("return_true", model, PENDULUM, "own plans", env_steps=2200) for model in (TSM, PETS))
     yield ours > theirs
+
+@Claim("Q7", "section 6, first question", PUSHED,
+       statistic="share within 5 cm after five rounds of pushing: own plans minus round 0, minus training alone")
+def q7(q: Query) -> Checks:
+    """Do five rounds of own plans bring pushing within 5 cm for at least ten points more of the targets?"""
+    learned, before, trained = (
+        q.pushed(data, after=rounds, metric="success")
+        for data, rounds in (("own plans", 5), ("own plans", 0), ("no new episodes", 5)))
+    yield learned - before >= 0.1
+    yield learned - trained >= 0.1
