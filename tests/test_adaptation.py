@@ -246,7 +246,7 @@ def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> 
     assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
     assert all(float(str(row["value"])) > 0 for row in found.seconds)
     header = results.rounds_table(tables.frame([*found.rows, *found.seconds])).splitlines()[0]
-    assert all(title in header for title in ("judge", "CPU s", "wall s", "that gap open loop"))
+    assert all(title in header for title in ("judge", "CPU s", "wall s", "the first plan's gap open loop"))
     by_rollout = rounds.loop(RUN, "lstm", sizes=sizes).rows  # which has no samples
     assert not any("samples" in row for row in by_rollout)
     assert "judge" not in results.rounds_table(tables.frame(by_rollout))
