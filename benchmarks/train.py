@@ -13,6 +13,7 @@ operations per second training gets.
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -112,7 +113,7 @@ def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) 
     )  # fmt: skip
 
 
-def before_row(run: Any, data: Data, arguments: Any) -> Row:
+def before_row(run: runs.Run, data: Data, arguments: Namespace) -> Row:
     """Updates per CPU second of the free-running stages of rtsm and of what it took the place of, at equal batch.
 
     Both draw two samples of two chained segments and compare them by the energy score.

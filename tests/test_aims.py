@@ -40,7 +40,7 @@ def test_nothing_is_reached_by_what_was_not_measured() -> None:
 
 def test_what_is_said_of_gaps_is_of_their_means_over_seeds_target_by_target() -> None:
     row = dict(env=PUSH, planner="cem", search_space="latent", execution="open loop", scale="paper", n=1)
-    sizes = {OURS: [0.0] * 9 + [1.0], "lstm": [1.0] * 10}
+    sizes = {OURS: [1.0, *[0.0] * 9], "lstm": [1.0] * 10}
     rows = tables.frame([
         row | dict(model=model, seed=seed, target=i, metric=metric, value=-3.0 + (metric == "return_predicted") * gap)
         for model, gaps in sizes.items() for seed in (0, 1) for i, gap in enumerate(gaps)
@@ -50,6 +50,21 @@ def test_what_is_said_of_gaps_is_of_their_means_over_seeds_target_by_target() ->
     assert "the 5 largest of `rtsm` are 100% of its 0.10 m" in said
     assert "the medians are 0.00 and 1.00 m" in said
     assert aims.gap_told(rows[rows["model"] == OURS]) == ""
+    fewer = rows[(rows["model"] == OURS) | (rows["target"] < 5)]
+    assert "the 5 largest of `rtsm` are 100% of its 0.20 m" in aims.gap_told(fewer)  # of the targets that both have
+
+
+def test_of_two_policies_inside_a_model_the_better_one_counts() -> None:
+    row = dict(env=PUSH, task="push", execution="policy", planner="policy", subset="", scale="paper", n=1, seed=0)
+    ends = {(OURS, "latent"): -9.0, ("tsm", "latent"): -8.0, ("tsm", "direct"): -12.0, ("ppo", ""): -10.0}
+    rows = tables.frame([
+        row | dict(model=model, search_space=space, copy=0, metric=metric, value=value)
+        | ({"iteration": 880} if space else {"env_steps": 1_000_000})
+        for (model, space), end in ends.items()
+        for metric, value in {"return_true": end, "seconds": 1.0, "samples": 5.0, "train_seconds": 1.0}.items()
+    ])  # fmt: skip
+    (_, _, _, inside, _), (_, _, _, free, _) = aims._of_policies(rows)
+    assert (inside, free) == (-1.0, 1.0)
 
 
 def test_the_sentence_names_every_aim_that_was_missed_with_what_was_found_and_no_other() -> None:
@@ -58,7 +73,7 @@ def test_the_sentence_names_every_aim_that_was_missed_with_what_was_found_and_no
         ("three", "at least", 3.0, 2.0, "{:.0f}"),
     ])  # fmt: skip
     said = aims.missed(found)
-    assert "2 of 3 aims" in said
+    assert "2 of 3" in said
     assert "one 2 (at most 1); three 2 (at least 3)" in said
     assert "two" not in said
     assert aims.missed(found[found["reached"]]) == ""

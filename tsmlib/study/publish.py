@@ -36,6 +36,10 @@ ASKED = {  # parameters for these cells: without the plain arm, and plans for fe
     "04_latent": {"env": f"tsm/ReacherObstacle-v0,{PUSH}"}, "07_action_prior": {"n_targets": "20"},
 }  # fmt: skip
 MARKS = ("<!-- results -->", "<!-- end of results -->")
+FURTHER = {  # table -> the notebook that writes it beside its own
+    "03_ablation": "03_predict", "03_samples": "03_predict", "05_control_rows": "05_control",
+    "07_starts": "07_action_prior",
+}  # fmt: skip
 AIM_MARKS = ("<!-- aims -->", "<!-- end of aims -->")
 CLAIM_MARKS = ("<!-- claims -->", "<!-- end of claims -->")
 POOLED = (
@@ -100,11 +104,11 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
 
     made_by: notebooks; by default all but that of the claims, which are judged anew.
     """
-    stems = {notebook.stem[:3]: notebook.stem for notebook in runs.notebooks().values()}  # 03_ablation is 03_predict's
+    stems = {notebook.stem for notebook in runs.notebooks().values()}
     found = dict[str, pd.DataFrame]()
     for path in sorted(run.metrics.glob("*.csv")):
-        notebook = stems.get(path.stem[:3], "")
-        if notebook in (made_by or set(stems.values()) - {"08_claims"}):
+        notebook = FURTHER.get(path.stem, path.stem)
+        if notebook in (made_by or stems - {"08_claims"}):
             own = replace(run, notebook=notebook)
             found[path.stem] = study.pooled_rows(own, tables_storage.load(path), path.stem)
     return found

@@ -43,11 +43,9 @@ def aims(predict: pd.DataFrame, plans: pd.DataFrame, targets: pd.DataFrame, lear
 
 
 def missed(found: pd.DataFrame) -> str:
-    """A sentence with the aims of a table of ``aims`` that were not reached; empty if all were."""
+    """A clause with the aims of a table of ``aims`` that were not reached; empty if all were."""
     lines = [f"{line.what} {line.measured} ({line.threshold})" for line in found[~found["reached"]].itertuples()]
-    if not lines:
-        return ""
-    return f"Pushing by `{OURS}`, {len(lines)} of {len(found)} aims are not reached: {'; '.join(lines)}."
+    return f"{len(lines)} of {len(found)} are missed: {'; '.join(lines)}." if lines else ""
 
 
 def gap_told(targets: pd.DataFrame, *, most: int = 5) -> str:
@@ -58,7 +56,10 @@ def gap_told(targets: pd.DataFrame, *, most: int = 5) -> str:
     if not means:
         return ""
     other = min(means, key=lambda each: means[each])
-    ours, theirs = (gaps[model].mean().to_numpy() for model in (OURS, other))
+    both = pd.concat([gaps[OURS].mean(), gaps[other].mean()], axis=1, join="inner").to_numpy()
+    if len(both) < 2:
+        return ""
+    ours, theirs = both.T
     drawn = bootstrap(
         (ours, theirs), lambda x, y, axis: x.mean(axis) / y.mean(axis), paired=True, vectorized=True,
         random_state=np.random.default_rng(0),
@@ -95,16 +96,16 @@ def _of_plans(plans: pd.DataFrame, targets: pd.DataFrame) -> list[Line]:
     gap = _worst({other: float(gaps[OURS].to_numpy().mean() / gaps[other].to_numpy().mean()) for other in there})
     return [
         ("cost of no torque over the oracle's", "at least", 2.0, mean("cost_over_oracle", "none"), "{:.2f}"),
-        ("ends within 5 cm by the oracle", "at least", 0.9,
+        ("pushes by the oracle that end within 5 cm", "at least", 0.9,
          mean("success", ORACLE.model), "{:.0%}"),
         (f"cost of plans through `{OURS}` over the oracle's", "at most", 1.15, mean("cost_over_oracle", OURS),
          "{:.2f}"),
-        (f"ends within 5 cm by `{OURS}`, planned again every ten steps", "at least", 0.8,
+        (f"the same by `{OURS}`, planned again every ten steps", "at least", 0.8,
          mean("success", OURS, closed), "{:.0%}"),
-        (f"its cost minus that of `{behind.against}` (m), upper end over targets", "at most", 0.0, behind.value,
+        (f"`{OURS}`'s cost minus that of `{behind.against}` (m), upper end over targets", "at most", 0.0, behind.value,
          "{:.2f}"),
-        (f"its mean gap over that of `{gap.against}`", "at most", 0.5, gap.value, "{:.2f}"),
-        ("its predicted steps that violate physics", "at most", 0.05, mean("violations", OURS), "{:.1%}"),
+        (f"`{OURS}`'s mean gap over that of `{gap.against}`", "at most", 0.5, gap.value, "{:.2f}"),
+        (f"steps predicted by `{OURS}` that violate physics", "at most", 0.05, mean("violations", OURS), "{:.1%}"),
     ]  # fmt: skip
 
 
@@ -113,7 +114,7 @@ def _of_predictions(predict: pd.DataFrame) -> list[Line]:
     for env, steps, bound in ((PUSH, 10, 0.5), (PUSH, 80, 0.5), (OBSTACLE, None, 1.0), (REACH, None, 1.0)):
         worst = _over_others(predict, env, steps)
         where = f"{steps} steps ahead" if env == PUSH else f"of {EnvSpec.parse(env).name}"
-        what = f"its energy score {where} over that of `{worst.against}`"
+        what = f"`{OURS}`'s energy score {where} over that of `{worst.against}`"
         found.append((what, "at most", bound, worst.value, "{:.2f}"))
     return found
 
@@ -128,12 +129,14 @@ def _over_others(predict: pd.DataFrame, env: str, steps: int | None) -> Worst:
 
 def _of_policies(learned: pd.DataFrame) -> list[Line]:
     curves: Mapping[Method, Mapping[str, np.ndarray]] = policies.learning_curves(learned).get("push", {})
-    ends = {method: float(own["return_true"][:, -1].mean()) for method, own in curves.items()}
-    ours = max((ends[method] for method in ends if method.model == OURS), default=float("nan"))
-    inside = {method.model: end for method, end in ends.items() if method.search_space and method.model != OURS}
-    free = {method.model: end for method, end in ends.items() if not method.search_space}
+    inside, free = dict[str, float](), dict[str, float]()  # returns at the end; of two search spaces the larger
+    for method, own in curves.items():
+        ends, end = inside if method.search_space else free, float(own["return_true"][:, -1].mean())
+        ends[method.model] = max(end, ends.get(method.model, end))
+    ours = inside.pop(OURS, float("nan"))
     return [
-        (f"return of its best policy minus that of {worst.against}", "at least", 0.0, -worst.value, "{:.2f}")
+        (f"return of the best policy inside `{OURS}` minus that of {worst.against}", "at least", 0.0, -worst.value,
+         "{:.2f}")
         for others in (inside, free)
         for worst in [_worst({zoo.look(model).name: end - ours for model, end in others.items()})]
     ]  # fmt: skip
