@@ -360,7 +360,7 @@ def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
     here = here[here["steps_ahead"] == here["steps_ahead"].max()]
     for (env, word), own in table.groups(here, ["env", "model"]):
         found = recovered(own)
-        for way in [way for way in WAYS if way in found and found[way].notna().any(axis=None)]:
+        for way in [way for way in WAYS if way in found and found[way].notna().to_numpy().any()]:
             line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name}
             for steps in sorted(found.columns.get_level_values("env_steps").unique()):
                 shares = found[way][steps].dropna() if steps in found[way] else []
