@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from scripts import run_script
 import tsmlib
 from tsmlib import figures
 from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
@@ -177,23 +179,48 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
     assert rounds.loop(RUN, "rtsm", env=PUSH, folder=tmp_path).rows == whole
 
 
-def test_plans_that_measure_are_those_of_mpc_and_their_judges_draw_nothing_that_predicts_their_return() -> None:
+def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does() -> None:
     few, model, prior = untrained()
     for judging in (0, 8):
         sizes = replace(rounds.SIZES["smoke"], judging=judging, every=50)
-        drawn, judge = (1000, tsmlib.expected_predictor) if judging else (0, tsmlib.model_predictor)
+        judge = tsmlib.expected_predictor if judging else tsmlib.model_predictor
         found = rounds.planned(few, model, prior, sizes, 0).found
         again = tsmlib.mpc(
-            few, model, rounds.space_of(prior), rounds.planner(sizes, 0), every=50, judge=judge, seed=drawn
+            few, model, rounds.space_of(prior), rounds.planner(sizes, 0), every=50, judge=judge, seed=1000
         )
         assert found is not None
+        assert found.first.found is not None
         assert torch.equal(found.closed.actions, again.actions)
         assert torch.equal(found.closed.gap, again.gap)
-        assert torch.equal(found.first.actions[:, :50], again.actions[:, :50])  # it begins as the loop does
-    for seed in range(12):
-        start, steps = 1000 * (seed + 1), range(0, 100, 10)
-        judges = {8 * (start + 2 * done) + i for done in steps for i in range(8)}
-        assert not judges & ({start + 2 * done + 1 for done in steps} | {seed})
+        assert torch.equal(found.first.found.actions[:, :50], again.actions[:, :50])
+
+
+@pytest.mark.parametrize("judging", [0, 1, 8])
+def test_planner_judges_and_predicted_returns_draw_different_random_numbers(
+    judging: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged, fresh = set[int](), set[int]()
+    judge, predictor = rounds.expected_predictor, execution.fresh_predictor
+
+    def judges(*given: Any, samples: int, seed: int) -> Any:
+        judged.update(range(samples * seed, samples * (seed + 1)))
+        return judge(*given, samples=samples, seed=seed)
+
+    def predicts(*given: Any, seed: int) -> Any:
+        fresh.add(seed)
+        return predictor(*given, seed=seed)
+
+    monkeypatch.setattr(rounds, "expected_predictor", judges)
+    monkeypatch.setattr(execution, "fresh_predictor", predicts)
+    few, model, prior = untrained()
+    for seed in range(3):
+        sizes = replace(rounds.SIZES["smoke"], judging=judging, every=25)
+        searched = rounds.planner(sizes, seed).keywords["seed"]  # type: ignore[attr-defined]
+        judged.clear(), fresh.clear()
+        rounds.planned(few.take(1), model, prior, sizes, seed)
+        assert (len(judged), len(fresh)) == (4 * judging, 4)
+        assert not fresh & (judged | {searched})
+        assert searched not in judged
 
 
 def untrained() -> tuple[tsmlib.Task, tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
@@ -215,28 +242,64 @@ def unstable(bad: np.ndarray, run: Any) -> Any:
     return stub
 
 
-@pytest.mark.parametrize("where", ["mpc", "execute"])
-def test_an_unstable_episode_that_measures_has_failed_and_is_counted(
-    where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    task, model, prior = untrained()
-    sizes, every = replace(rounds.SIZES["smoke"], starts=3, every=50), replace(task, success=lambda x: x[:, -1, 0] < 2)
+def measured_everywhere(monkeypatch: pytest.MonkeyPatch) -> tuple[tsmlib.Task, rounds.Sizes]:
+    """A task of three starts in which every episode that ends is a success, and sizes of a loop that measures there."""
+    sizes = replace(rounds.SIZES["smoke"], starts=3, every=50)
+    every = replace(untrained()[0], success=lambda x: x[:, -1, 0] < 2)
     here = replace(rounds.WORLDS[PENDULUM], tested=every.take)
     monkeypatch.setattr(rounds, "world", lambda env: here)
-    monkeypatch.setattr(rounds, where, unstable(task.start[:1], getattr(rounds, where)))
+    return every, sizes
+
+
+def test_an_unstable_episode_that_measures_has_failed_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    task, model, prior = untrained()
+    every, sizes = measured_everywhere(monkeypatch)
+    monkeypatch.setattr(rounds, "mpc", unstable(task.start[:1], rounds.mpc))
     found = rounds.measure(sizes, 0)(model, prior)
     others = rounds.planned(every.take([1, 2]), model, prior, sizes, 0).found
     assert others is not None
     assert (found["lost"], found["success"]) == (1, pytest.approx(2 / 3))
     assert found["return_true"] == float(others.closed.executed_return.mean())
     assert found["gap_absolute"] == float(others.closed.gap.abs().mean())
-    monkeypatch.setattr(rounds, where, unstable(task.start, getattr(rounds, where)))
+    monkeypatch.setattr(rounds, "mpc", unstable(task.start, rounds.mpc))
     none = rounds.measure(sizes, 0)(model, prior)
     assert {name: none[name] for name in ("lost", "success")} == {"lost": 3, "success": 0}
     assert "return_true" not in none
     rows = results.round_rows(RUN, "rtsm", [{"round": 0, "env_steps": 0, **none}], 3, first=400)
     assert {row["metric"]: row["value"] for row in rows}["lost"] == 3
     assert "unstable episodes" in results.rounds_table(tables.frame(rows))
+
+
+def test_a_first_plan_that_is_unstable_open_loop_takes_no_success_from_its_closed_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task, model, prior = untrained()
+    every, sizes = measured_everywhere(monkeypatch)
+    whole = rounds.measure(sizes, 0)(model, prior)
+    gaps = rounds.planned(every, model, prior, sizes, 0).found
+    assert gaps is not None
+    assert gaps.first.found is not None
+    assert gaps.closed.plan is not None
+    apart = (gaps.closed.plan.predicted_return - gaps.first.found.executed_return).abs()
+    assert whole["gap_open_loop"] == pytest.approx(float(apart.mean()))
+    monkeypatch.setattr(rounds, "execute", unstable(task.start[:1], rounds.execute))
+    found = rounds.measure(sizes, 0)(model, prior)
+    assert found.pop("gap_open_loop") == pytest.approx(float(apart[1:].mean()))
+    assert found == {name: value for name, value in whole.items() if name != "gap_open_loop"}
+    monkeypatch.setattr(rounds, "execute", unstable(task.start, rounds.execute))
+    assert rounds.measure(sizes, 0)(model, prior) == found
+
+
+def test_a_measurement_that_lost_all_its_episodes_has_no_row_of_another_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rounds, "mpc", unstable(rounds.world(PUSH).tested(2).start, rounds.mpc))
+    for _ in range(2):  # the second time from the folder
+        rows = tables.frame(rounds.loop(RUN, "lstm", env=PUSH, folder=tmp_path).rows)
+        closed = table.select(rows, execution="closed loop")
+        assert set(closed["metric"]) == {"lost", "success"}
+        assert table.select(closed, metric="lost")["value"].tolist() == [2, 2]
+        assert table.select(closed, metric="success")["value"].tolist() == [0, 0]
 
 
 def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> None:
@@ -250,6 +313,23 @@ def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> 
     by_rollout = rounds.loop(RUN, "lstm", sizes=sizes).rows  # which has no samples
     assert not any("samples" in row for row in by_rollout)
     assert "judge" not in results.rounds_table(tables.frame(by_rollout))
+
+
+def test_a_table_of_rounds_says_of_every_learner_what_judged_its_plans() -> None:
+    record = {"round": 0, "env_steps": 0, "return_true": 1.0}
+    rows = results.round_rows(RUN, "rtsm", [record], 3, first=0, samples=8)
+    rows += results.round_rows(RUN, "rtsm", [record | {"round": 1}], 3, first=0)  # by the mode
+    for word in ("lstm", "ensemble+mse", "pets"):
+        rows += results.round_rows(RUN, word, [record], 3, first=0)
+    lines = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in results.rounds_table(tables.frame(rows)).splitlines()
+    ]
+    where = lines[0].index("judge")
+    assert [(line[0], line[where]) for line in lines[2:]] == [
+        ("`rtsm`", "mode, 8 samples"), ("`rtsm`", "mode"), ("`lstm`", "its rollout"), ("`ensemble+mse`", "members"),
+        ("`pets`", ""),
+    ]  # fmt: skip
 
 
 def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
@@ -447,6 +527,23 @@ def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
     assert results.differences_table(tables.frame(rows), PENDULUM) == ""
 
 
+def test_loops_whose_plans_were_judged_otherwise_are_not_compared() -> None:
+    loop = dict(env=PUSH, model="rtsm", planner="cem", execution="closed loop", n=9, metric="return_true")
+    made_again = {(results.PLANNED, seed) for seed in range(3)} | {(results.RANDOM, 2)}
+    rows = tables.frame([
+        loop | dict(configuration=data, iteration=k, seed=seed, value=float(k * seed),
+                    samples=8 if (data, seed) in made_again else None)
+        for data in results.DATA for seed in range(3) for k in range(2)
+    ])  # fmt: skip
+    found = results.paired(rows, 1)
+    assert found.notna().sum().to_dict() == {"round 0": 3, results.NONE: 0, results.RANDOM: 1}
+    assert found["round 0"].tolist() == [0, 1, 2]
+    (line,) = results.differences_table(rows).splitlines()[2:]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert [cells[3], cells[4], cells[-1]] == ["", "+0.00", "1 to 3"]
+    assert results.paired(rows.drop(columns="samples"), 1).notna().all(axis=None)
+
+
 def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), env=PUSH, model="rtsm", execution="closed loop")
     returns, shares, gaps = (table.select(rows, metric=m) for m in ("return_true", "success", "gap_absolute"))
@@ -481,6 +578,19 @@ def test_what_an_adapted_model_recovers_is_a_share_of_what_its_own_seed_lost() -
         for way, each in shares.items()
     ]  # fmt: skip
     assert results.recovered_table(rows[rows["configuration"] != "reference"]) == ""
+
+
+def test_where_a_model_trained_in_full_is_no_better_nothing_is_recovered() -> None:
+    common = dict(env=WEAK, model="rtsm", planner="none", execution="open loop", n=9, scale="paper",
+                  metric="energy_score_noise", steps_ahead=80)  # fmt: skip
+    scores = {"zero-shot": (0, (2.0, 1.0, 1.0)), "reference": (50_000, (1.0, 1.0, 3.0)), "all": (500, (1.5, 0.5, 0.5))}
+    rows = tables.frame([
+        common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, (steps, values) in scores.items() for seed, value in enumerate(values)
+    ])  # fmt: skip
+    assert results.recovered(rows)["all"].to_dict() == {500: {0: 0.5}}
+    assert "50.0%" in results.recovered_table(rows)
+    assert results.recovered_table(rows[rows["seed"] > 0]) == ""
 
 
 def test_a_way_of_training_has_no_look_of_a_model() -> None:
@@ -524,12 +634,25 @@ def pushing_rows(low: float) -> pd.DataFrame:
 def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> None:
     (drawing,) = drawings.rounds(pushing_rows(-30.0), PUSH, results.DRAWN[PUSH])
     (ax,) = drawing.figure.axes
-    assert ax.get_ylim()[0] == results.LOWEST[PUSH]["executed return"]
+    before = interval([-12.0, -11.9, -11.8])
+    low = results.axis_ends(pushing_rows(-30.0), PUSH)["executed return"]
+    assert low == pytest.approx(1.1 * (before[0] - before[1]))
+    assert ax.get_ylim()[0] == low
     assert "outside: LSTM, own plans to −29.9" in ax.get_xlabel()
     all_below = pushing_rows(-30.0).assign(value=-25.0)
     (drawing,) = drawings.rounds(all_below, PUSH, results.DRAWN[PUSH])
     low, high = drawing.figure.axes[0].get_ylim()
     assert low < -25 < high
+
+
+def test_a_learner_of_which_every_seed_lacks_a_round_is_not_drawn() -> None:
+    rows = pushing_rows(-15.0)
+    gone = {0: 0, 1: 1, 2: 2}  # seed -> round without a return
+    lost = (rows["model"] == "lstm") & (rows["iteration"] == rows["seed"].map(gone))
+    panel = results.round_panels(rows[~lost], ["executed return"], PUSH)["executed return"]
+    assert {method.model for method in panel} == {"rtsm"}
+    alone = table.select(rows[~lost], model="lstm")
+    assert results.round_panels(alone, ["executed return"], PUSH) == {}
 
 
 def test_training_alone_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
@@ -556,6 +679,7 @@ def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_pat
                "--episodes", "5", "--test", "4", "--share", "0.01", "--out", str(out)]  # fmt: skip
     run_script(script, *options)
     first = pd.read_csv(out)
+    assert set(first["copies"]) == {0}  # of reaching, which has no symmetry
     assert first[["way", "episodes"]].to_numpy().tolist() == [["zero-shot", 0], ["head", 5]]
     assert "{" not in run_script(script, *options)  # nothing measured again
     run_script(script, *options, "--targets", "2")
@@ -566,6 +690,43 @@ def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_pat
     planned.assign(judge="mode").to_csv(out, index=False)
     run_script(script, *options, "--targets", "2")
     assert set(pd.read_csv(out)["judge"]) == {"expectation"}
+
+
+def test_lines_of_models_trained_on_symmetric_copies_are_averaged_by_themselves() -> None:
+    script = str(runs.ROOT / "benchmarks" / "adaptation" / "run.py")
+    run = runpy.run_path(script)
+    assert [run["copies"](env, n) for env, n in ((PUSH, 20), (PUSH, 0), (WEAK, 20))] == [8, 0, 0]
+    known = pd.read_csv(runs.ROOT / "benchmarks" / "adaptation" / "table.csv")
+    line = known[(known["way"] == "all") & known["judge"].notna()].iloc[0]
+    both = pd.DataFrame([{**line}, {**line, "copies": 8, "energy_score_10": 9.0}])
+    cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in run["summary"](both).splitlines()]
+    at = cells[0].index("energy_score_10")
+    assert [each[at] for each in cells[2:]] == [f"{line['energy_score_10']:.3g}", "9"]
+
+
+def test_the_benchmark_predicts_returns_by_samples_that_neither_planner_nor_judges_drew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = runpy.run_path(str(runs.ROOT / "benchmarks" / "adaptation" / "run.py"))
+    drawn = dict[str, int]()
+
+    def watched(name: str, whole: Any) -> Any:
+        def call(*given: Any, **named: Any) -> Any:
+            drawn[name] = named["seed"]
+            return whole(*given, **named)
+
+        return call
+
+    for name in ("cem", "expected_predictor", "fresh_predictor"):
+        monkeypatch.setattr(tsmlib, name, watched(name, getattr(tsmlib, name)))
+    env = "tsm/Reacher-v0"
+    model = tsmlib.load_pretrained("rtsm", env=env)
+    task = tsmlib.load_task(env).take(2)
+    found = run["planned"](env, model, 2, 3)
+    judges = range(8 * drawn["expected_predictor"], 8 * drawn["expected_predictor"] + 8)
+    assert drawn["fresh_predictor"] not in {*judges, drawn["cem"]}
+    assert float(found["gap"]) >= 0
+    assert int(found["targets"]) == len(task)
 
 
 def test_a_plane_shows_real_states_alone() -> None:

@@ -26,6 +26,8 @@ from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import zero_torques
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
+from tsmlib.study.results import exploration
+from tsmlib.study.results.exploration import PUSH
 from tsmlib.training import fit as fit_module
 from tsmlib.training.fit import TrainingHistory
 from tsmlib.trajectory import initial_past
@@ -207,6 +209,33 @@ def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_
     published = tables.frame([row, dict(row, configuration="codes")])
     found = tables.records(rows.merged(published, [dict(row, value=2.0)]))
     assert [(line["configuration"], line["value"]) for line in found] == [("codes", 1.0), ("", 2.0)]
+
+
+def test_a_loop_of_rounds_that_is_made_again_takes_the_place_of_all_its_former_rows() -> None:
+    loop = dict(env=PUSH, model="rtsm", configuration=exploration.PLANNED, seed=0, scale="paper", n=2)
+    closed = dict(loop, planner="cem", execution="closed loop")
+    adapted = dict(loop, planner="none", execution="open loop", configuration="all", env_steps=2000, metric="nrmse")
+    former = [
+        *(dict(closed, iteration=k, env_steps=500 + 100 * k, metric="return_true", value=1.0) for k in range(3)),
+        dict(loop, planner="none", subset="data", iteration=2, env_steps=700, metric="contact_share", value=1.0),
+        dict(closed, execution="open loop", subset=exploration.LAST_PRIOR, iteration=4, env_steps=700,
+             metric="return_true", value=1.0),
+    ]  # fmt: skip
+    others = [
+        dict(adapted, value=1.0), *(dict(former[0], **{name: other}) for name, other in (
+            ("seed", 1), ("model", "lstm"), ("configuration", exploration.RANDOM), ("env", "Pendulum-v1"),
+        )),
+    ]  # fmt: skip
+    steps = {0: 500, 1: 590, 2: 690}  # round 1 lost an episode, and after round 2 all that measure were lost
+    new = [dict(closed, iteration=k, env_steps=n, metric="success", value=0.0) for k, n in steps.items()]
+    new += [dict(closed, iteration=k, env_steps=steps[k], metric="return_true", value=2.0) for k in (0, 1)]
+    published = tables.frame([*former, *others])
+    found = tables.frame(rows.merged(rows.without_loops(published, new), new))
+    assert len(found) == len(others) + len(new)
+    assert sorted(found["value"]) == [0, 0, 0, *[1] * len(others), 2, 2]
+    assert "+0.0" in exploration.differences_table(found)
+    with pytest.raises(ValueError, match="duplicate"):
+        exploration.differences_table(tables.frame(rows.merged(published, new)))
 
 
 def test_lines_are_compared_target_by_target_with_the_same_targets_only() -> None:

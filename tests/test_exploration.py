@@ -265,12 +265,27 @@ def test_a_round_that_loses_all_its_episodes_stops_nothing(tmp_path: Path, monke
     found = explored(*learned, folder=tmp_path)
     first, second = found.records
     assert (found.episodes[0], first["lost"], first["env_steps"]) == (None, 3, 8 * (3 + 2 + 1))
-    assert "executed_return" not in first
+    means = ("executed_return", "success", "final_distance", "predicted_return", "gap")
+    assert all(math.isnan(first[name]) for name in means)
     assert second["lost"] == 0
     assert len(found.train) == 6 + EPISODES - 1
     again = learners()
-    assert explored(*again, folder=tmp_path).records == found.records
+    np.testing.assert_equal(explored(*again, folder=tmp_path).records, found.records)  # NaN is NaN
     assert bits(*again) == bits(*learned)
+
+
+@pytest.mark.parametrize("bonus", [0.0, 1.0])
+def test_a_round_without_episodes_has_its_line_in_a_table_of_rounds(
+    bonus: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 1, 2}))
+    table = tsm.CsvCallback(tmp_path / "rounds.csv")
+    for _ in range(2):  # the second time from the folder
+        found = explored(*learners(), options=options(rounds=2, bonus=bonus), folder=tmp_path / "loop", callback=table)
+        assert [list(each) for each in found.records] == [list(found.records[0])] * 2
+        lines = (tmp_path / "rounds.csv").read_text().splitlines()
+        assert lines[0].split(",")[2:] == list(found.records[0])
+        assert [line.split(",")[0] for line in lines] == ["step", "1", "2"]
 
 
 def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
@@ -289,7 +304,7 @@ def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     ({}, tsm.expected_predictor, 8, 0.25), ({"judging": 2, "screened": 0.5}, tsm.expected_predictor, 2, 0.5),
     ({"bonus": 1.0}, tsm.model_predictor, 4, 1.0),
 ])  # fmt: skip
-def test_candidates_are_judged_by_samples_and_with_a_bonus_as_ever(
+def test_candidates_are_judged_by_the_mode_and_samples_and_with_a_bonus_by_its_samples_alone(
     changes: Mapping[str, Any], judge: Any, samples: int, screened: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = judged_by(monkeypatch)

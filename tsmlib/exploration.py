@@ -9,6 +9,7 @@ many random ones.
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -26,7 +27,7 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics
 from tsmlib.models.features import Features
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
-from tsmlib.planning.execution import Trial, finish, mpc
+from tsmlib.planning.execution import Trial, mpc, without_unstable
 from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import JUDGING, expected_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
@@ -62,7 +63,7 @@ class ExplorationOptions:
     model, prior: one round's training of each, from the weights it has; prior=None leaves it as it is. every,
     candidates, elites, iterations, screened: of the planning (``mpc``, ``cem``). judging: samples by which candidates
     are judged beside the mode (``expected_predictor``); 0: by the mode alone. held_out: share of each round's episodes
-    that join the held-out data, at least one and never all.
+    that join the held-out data: at least one and never all, but none of a single one, which is trained on.
     rms: of the torques that are searched where there is no prior. noise: standard deviation of what is added to the
     parameters of every plan, in those of the search space.
     bonus: reward for each step per unit of disagreement, the standard deviation over ``samples`` predicted states, as a
@@ -110,8 +111,8 @@ class Exploration:
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
     of the ``gap``; ``lost``, episodes in which the simulation became unstable, whereupon the others begin anew
     (``discarded_steps``, what all had executed until then, which ``env_steps`` counts); after training the losses on
-    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave. A round that lost all its
-    episodes says no more of them, and has none.
+    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave. Of a round that lost all its
+    episodes the means are NaN.
     seconds: of each round, to plan, execute and train, without ``measure``: ``cpu_seconds`` and ``wall_seconds``; of a
     training that was stopped what was spent on it since. Rounds from a folder that has no seconds have none.
     """
@@ -160,7 +161,7 @@ def explore(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
             "Take bonus=0, or an ensemble or a segment model"
         )
-    if options.bonus or not as_dynamics(model).stochastic:  # judged as ever
+    if options.bonus or not as_dynamics(model).stochastic:  # by the bonus's samples, or by the one rollout
         options = replace(options, judging=0, screened=1.0)
     weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
     identity: dict[str, Json] = {
@@ -225,13 +226,13 @@ def _collected(
         judge = partial(model_predictor, samples=options.samples)
     elif options.judging:
         judge = partial(expected_predictor, samples=options.judging)
-    through = finish(
-        aim, lambda left: mpc(left, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
+    stable = without_unstable(
+        aim, lambda left, _: mpc(left, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
     )
-    record: dict[str, float] = {"lost": through.lost, "discarded_steps": through.discarded_steps}
-    if (trial := through.found) is None:
-        return None, record | _since(began)
-    record = _said(trial, bonus=bool(options.bonus)) | record | _since(began)
+    counted: dict[str, float] = {"lost": stable.lost, "discarded_steps": stable.discarded_steps}
+    if (trial := stable.found) is None:
+        return None, _unknown(task, bonus=bool(options.bonus)) | counted | _since(began)
+    record = _said(trial, bonus=bool(options.bonus)) | counted | _since(began)
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
     episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
     if place is not None:
@@ -282,6 +283,16 @@ def _said(trial: Trial, *, bonus: bool) -> dict[str, float]:
         record["predicted_return"] = float(trial.plan.predicted_return.mean())
         record["gap"] = float(trial.gap.abs().mean())
     return record
+
+
+def _unknown(task: Task, *, bonus: bool) -> dict[str, float]:
+    """The names of ``_said`` for a round without episodes, all NaN, so that every record has the same columns."""
+    final_distance, success = task.judged(torch.from_numpy(task.start)[:, None].expand(-1, task.horizon + 1, -1))
+    names = ["executed_return"]
+    names += ["success"] if success is not None else []
+    names += ["final_distance"] if not final_distance.isnan().any() else []
+    names += [] if bonus else ["predicted_return", "gap"]
+    return dict.fromkeys(names, math.nan)
 
 
 def _with_bonus(reward: Reward, *, weight: float, scale: Tensor) -> Reward:

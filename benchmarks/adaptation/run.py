@@ -7,8 +7,9 @@ of the codes alone; a new model of the same episodes. Predictions are open loop 
 episodes of the variant (``study.adaptation``). Plans are by the cross-entropy method over codes of the standard arm's
 prior, executed once, open loop, on frozen targets; --targets 0 leaves them out, and a later call with targets adds
 them. Their candidates are judged by the mode and eight samples (judge: expectation), of a model without samples by its
-one rollout. A line in table.csv for each model; a line that is there is not measured again, unless plans are wanted and
-those that it has were judged otherwise.
+one rollout; the gap is that of a return predicted from other samples. copies: symmetric ones that are trained on in
+place of each episode, 0 where the arm has none or nothing is trained. A line in table.csv for each model; a line that
+is there is not measured again, unless plans are wanted and those that it has were judged otherwise.
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ import pandas as pd
 import torch
 
 import tsmlib as tsm
+from tsmlib.envs import symmetry
 from tsmlib.study import adaptation
 from tsmlib.study.models import TrainedModel
 from tsmlib.study.results import table
 from tsmlib.trajectory import Trajectories
 
 HERE = Path(__file__).resolve().parent
-KEY = ["arm", "variant", "model", "way", "episodes", "seed"]
+KEY = ["arm", "variant", "model", "way", "episodes", "copies", "seed"]
 SEARCH, JUDGE = dict(candidates=96, elites=9, iterations=5, screened=0.25), "expectation"
 held_out = cache(adaptation.held_out)
 
@@ -52,20 +54,27 @@ def planned(env: str, model: TrainedModel, targets: int, seed: int) -> dict:
     """Cost of plans on frozen targets, and the share that ends within the tolerance."""
     task = tsm.load_task(env).take(targets)
     space = tsm.LatentActions(prior(env), task.horizon)
-    predict = tsm.expected_predictor(model, task.past(model.past_len), seed=1000 + seed)  # not the planner's
+    past, drawn = task.past(model.past_len), 1000 + seed  # not the planner's; of the judges eight times that
+    predict = tsm.expected_predictor(model, past, seed=drawn)
     plan = tsm.cem(predict, task.reward, space, len(task), seed=seed, **SEARCH)
+    plan = tsm.reevaluate(plan, tsm.fresh_predictor(model, past, seed=drawn), task.reward)
     trial = tsm.execute(task, plan)
     assert trial.success is not None
     return {
         "cost": f"{-trial.executed_return.mean():.4g}", "success": f"{trial.success.float().mean():.3g}",
-        "gap": f"{(plan.predicted_return - trial.executed_return).abs().mean():.3g}", "targets": len(task),
-        "judge": JUDGE,
+        "gap": f"{trial.gap.abs().mean():.3g}", "targets": len(task), "judge": JUDGE,
     }  # fmt: skip
 
 
 @cache
 def prior(env: str) -> tsm.ActionPrior:
     return tsm.load_pretrained("prior", env=env)  # type: ignore[return-value]
+
+
+def copies(env: str, episodes: int) -> int:
+    """Symmetric copies in place of each of the episodes that are trained on; 0: the episodes as they are."""
+    n = symmetry.copies(env) if episodes else 0
+    return n if n > 1 else 0
 
 
 def summary(lines: pd.DataFrame) -> str:
@@ -103,7 +112,7 @@ def main() -> None:
             for word in given.models:
                 for way in (way for way in adaptation.ways(word) if way in given.ways):
                     for n in [0] if way == "zero-shot" else given.episodes:
-                        line = dict(zip(KEY, (given.arm, name, word, way, n, seed), strict=True))
+                        line = dict(zip(KEY, (given.arm, name, word, way, n, copies(env, n), seed), strict=True))
                         add(given.out, line, given.targets > 0, partial(measured, env, word, way, n, seed, given))
     print(summary(pd.read_csv(given.out)))
 

@@ -29,7 +29,8 @@ beside them, in the files that are named: of benchmarks/peers mbrl-lib's loop in
 in peers_pets, of benchmarks/model_free policies without a model in model_free.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
-those of all seeds of the same environment and algorithm; all others stay.
+those of all seeds of the same environment and algorithm; all others stay. Rounds take the place of all rows of the
+same environment, model, data and seed, whatever their steps.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ from tsmlib.study.results.table import Row
 from tsmlib.study.runs import RESULTS
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
+LOOP = ("env", "model", "configuration", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
     "latent": "04_latent", "convergence": "05_control", "robustness": "06_robustness", "torques": "07_action_prior",
@@ -71,6 +73,21 @@ def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.Da
     return tables.frame(pd.concat([published[[key not in replaced for key in _keys(published)]], new]))
 
 
+def without_loops(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
+    """The published table without the loops of rounds that ``rows`` are of: a loop made again may lose other episodes,
+    so that its rounds have other steps, and lack a return that was there."""
+    made = set(_loops(tables.frame(rows)))
+    of_rounds = (published["planner"] == "cem") | (published["subset"] == "data")
+    again = pd.Series([loop in made for loop in _loops(published)], index=published.index, dtype=bool)
+    return published[~(of_rounds & again)]
+
+
+def _loops(rows: pd.DataFrame) -> list[tuple[str, ...]]:
+    """Of which loop a row is."""
+    rows = rows if "configuration" in rows else rows.assign(configuration="")
+    return list(rows[list(LOOP)].astype(str).itertuples(index=False, name=None))
+
+
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
     rows = rows if "configuration" in rows else rows.assign(configuration="")
@@ -80,10 +97,12 @@ def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
-def publish(name: str, rows: pd.DataFrame | Iterable[Row]) -> None:
-    """Merge rows into a table of data/results, and its new checksum into the manifest."""
-    path = RESULTS / f"{name}.csv"
-    table = merged(tables.load(path) if tables.stored(path) else tables.frame([]), rows)
+def publish(name: str, rows: pd.DataFrame | Iterable[Row], *, loops: bool = False) -> None:
+    """Merge rows into a table of data/results, and its new checksum into the manifest. loops: of whole loops of
+    rounds, whose former rows go."""
+    path, new = RESULTS / f"{name}.csv", tables.frame(rows)
+    known = tables.load(path) if tables.stored(path) else tables.frame([])
+    table = merged(without_loops(known, new) if loops else known, new)
     tables.ship(path, table)
     manifest.write_manifest(Path(RESULTS).parent)
     print(f"{path.name}: {len(table)} rows")
@@ -166,7 +185,7 @@ def published_peers(files: list[Path]) -> None:
     loops, policies = rows[rows["execution"] == "closed loop"], rows[rows["execution"] == "policy"]
     predicted = rows[rows["planner"] == "none"]
     if len(loops):
-        publish("10_explore", loops)
+        publish("10_explore", loops, loops=True)
     if len(predicted):
         publish("peers_pets", predicted)
     if len(policies):  # a learner's steps may have been others before
@@ -241,7 +260,7 @@ def main() -> None:
     elif given.part == "rounds":
         for env, word, data in wanted_rounds(parser, given):
             loop = rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds"))
-            publish(notebook, [*loop.rows, *loop.seconds])
+            publish(notebook, [*loop.rows, *loop.seconds], loops=True)
     elif given.part == "adaptation":
         for env in wanted_arms(parser, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))

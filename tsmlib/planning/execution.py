@@ -94,30 +94,35 @@ def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10)
 
 
 @dataclass(frozen=True)
-class Finished(Generic[T]):
-    """What was found of those instances of a task whose simulation stayed stable.
+class Stable(Generic[T]):
+    """The result of a run on those instances of a task whose simulation stayed stable.
 
-    task: these instances, and ``found`` what was run of them; None: there is none. lost: how many others there were.
-    discarded_steps: that were executed in vain, since the others begin anew where one is lost.
+    task: these instances; kept: their indices among all. found: what ``run`` gave; None where no instance is left, and
+    ``task`` is then the last that was lost. lost: how many others there were. discarded_steps: executed before an
+    instance was lost, after which the others begin anew.
     """
 
     task: Task
+    kept: list[int]
     found: T | None
     lost: int
     discarded_steps: int
 
 
-def finish(task: Task, run: Callable[[Task], T]) -> Finished[T]:
-    """``run(task)``; where a simulation becomes unstable, again without that instance, until all others are through."""
-    lost, discarded = 0, 0
+def without_unstable(task: Task, run: Callable[[Task, list[int]], T]) -> Stable[T]:
+    """``run(task, indices)``, run again without each instance whose simulation becomes unstable, until none does."""
+    kept, discarded = list(range(len(task))), 0
+    left = task
     while True:
+        lost = len(task) - len(kept)
         try:
-            return Finished(task, run(task), lost, discarded)
+            return Stable(left, kept, run(left, kept), lost, discarded)
         except SimulationUnstable as fault:
-            lost, discarded = lost + 1, discarded + (fault.step + 1) * len(task)
-            if len(task) == 1:
-                return Finished(task, None, lost, discarded)
-            task = task.take([i for i in range(len(task)) if i != fault.episode])
+            discarded += (fault.step + 1) * len(kept)
+            kept = [k for i, k in enumerate(kept) if i != fault.episode]
+            if not kept:
+                return Stable(left, kept, None, lost + 1, discarded)
+            left = task.take(kept)
 
 
 def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:

@@ -178,7 +178,7 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Dra
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
         ylabels = {f"{task}: {title}": units[title] for title in curves}
-        lowest = {f"{task}: {title}": low for title, low in exploration.LOWEST.get(env, {}).items()}
+        lowest = {f"{task}: {title}": low for title, low in exploration.axis_ends(table.drawn(rows), env).items()}
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest), stem, rows)
 
 

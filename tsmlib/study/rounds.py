@@ -6,6 +6,7 @@ on as many random episodes, and on no new ones, trained as often. What differs b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -27,14 +28,14 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics, members
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.planning.base import Judge, Planner, SearchSpace
-from tsmlib.planning.execution import Finished, Trial, execute, finish, mpc
+from tsmlib.planning.execution import Stable, Trial, execute, mpc, without_unstable
 from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import JUDGING, expected_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import BLOCK, TIP
 from tsmlib.storage import files
-from tsmlib.storage.files import Json
+from tsmlib.storage.files import Json, decode_nonfinite, encode_nonfinite
 from tsmlib.study import zoo
 from tsmlib.study.data import random_data
 from tsmlib.study.results import exploration as results
@@ -193,52 +194,66 @@ def planner(sizes: Sizes, seed: int) -> Planner:
 
 
 class Trials(NamedTuple):
-    """Episodes of one task: planned for again every few steps, and the first of these plans executed open loop."""
+    """Episodes of one task: planned for again every few steps, and the first of these plans executed open loop.
+
+    first: of those episodes of ``closed`` whose simulation stays stable open loop, too.
+    """
 
     closed: Trial
-    first: Trial
+    first: Stable[Trial]
 
 
 def planned(
     task: Task, model: DynamicsModel, prior: ActionPrior | None, sizes: Sizes, seed: int, env: str = PENDULUM
-) -> Finished[Trials]:
-    """Plans with the budget of a loop and their execution, of those episodes whose simulation stays stable."""
+) -> Stable[Trials]:
+    """Plans with the budget of a loop and their execution, of those episodes whose closed loop stays stable.
+
+    Where one is dropped, the others are planned for anew, with other random numbers. The planner draws with ``seed``,
+    samples behind predicted returns with 1000 (seed + 1) and the 200 after it, judges with those times their number;
+    none of these coincide (``fresh_predictor``).
+    """
     sizes, space = sizes.judged_for(model), space_of(prior, env)
     judge: Judge = partial(expected_predictor, samples=sizes.judging) if sizes.judging else model_predictor
-    drawn = 1000 * (seed + 1) if sizes.judging else 0  # of judges 8,000 and more, of predicted returns below
+    drawn = 1000 * (seed + 1)
 
-    def run(task: Task) -> Trials:
-        predict = judge(model, task.past(as_dynamics(model).past_len), seed=drawn)
-        plan = planner(sizes, seed)(predict, task.reward, space, len(task))
+    def run(left: Task, _: list[int]) -> Trials:
+        predict = judge(model, left.past(as_dynamics(model).past_len), seed=drawn)
+        plan = planner(sizes, seed)(predict, left.reward, space, len(left))
         closed = mpc(
-            task, model, space, planner(sizes, seed), every=sizes.every, plan=plan, judge=judge, seed=drawn
+            left, model, space, planner(sizes, seed), every=sizes.every, plan=plan, judge=judge, seed=drawn
         )  # fmt: skip
-        return Trials(closed, execute(task, plan))
+        return Trials(closed, without_unstable(left, lambda some, kept: execute(some, plan.actions[kept])))
 
-    return finish(task, run)
+    return without_unstable(task, run)
 
 
 def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
     """Plans from the same starts after every round; of the pendulum, how high random codes of the prior swing it.
 
     Both gaps are of the first plan of an episode: its predicted return minus what planning again returns, and minus
-    what it returns itself, open loop. An episode whose simulation becomes unstable in either has failed and is counted
-    (``lost``); it has no return, and means of return, gap and distance are over the others.
+    what it returns itself, open loop. An episode whose simulation becomes unstable as it is planned for again has
+    failed and is counted (``lost``); it has no return. Means of return, gap and distance are over the episodes that
+    ended; dropping a start changes the draws of the others (``planned``). The open-loop gap is a mean over those of
+    them whose first plan stays stable.
     """
     task = world(env).tested(sizes.starts)
 
     def measured(model: DynamicsModel, prior: ActionPrior | None) -> dict[str, float]:
-        through = planned(task, model, prior, sizes, seed, env)
-        found = {"lost": float(through.lost), "success": 0.0}
-        if through.found is not None:
-            trial, first = through.found
+        stable = planned(task, model, prior, sizes, seed, env)
+        found = {"lost": float(stable.lost), "success": 0.0}
+        if task.position is not None:
+            found["final_distance"] = math.nan  # not that of the round's own episodes, which its record has
+        if stable.found is not None:
+            trial, first = stable.found
             assert trial.success is not None
             assert trial.plan is not None
             found |= {
                 "return_true": float(trial.executed_return.mean()), "gap_absolute": float(trial.gap.abs().mean()),
-                "gap_open_loop": float((trial.plan.predicted_return - first.executed_return).abs().mean()),
-                "success": float(trial.success.float().mean()) * len(through.task) / len(task),
+                "success": float(trial.success.float().mean()) * len(stable.kept) / len(task),
             }  # fmt: skip
+            if first.found is not None:
+                predicted = trial.plan.predicted_return[first.kept]
+                found["gap_open_loop"] = float((predicted - first.found.executed_return).abs().mean())
             if task.position is not None:
                 found["final_distance"] = float(trial.final_distance.mean())
         if prior is not None and env == PENDULUM:
@@ -425,7 +440,8 @@ def _once(path: Path | None, made_from: dict[str, Json], make: Callable[[], T]) 
         kept = cast(dict[str, Json], files.loads(path.read_bytes()))
         was = cast(dict[str, Json], kept["made from"])
         if was | {"sizes": {**BY_MODE, **cast(dict[str, Json], was["sizes"])}} == made_from:
-            return cast(T, kept["found"])
+            return cast(T, decode_nonfinite(kept["found"]))
     found = make()
-    files.write_bytes(path, files.dumps(path, {"made from": made_from, "found": cast(Json, found)}).encode())
+    kept = {"made from": made_from, "found": encode_nonfinite(cast(Json, found))}
+    files.write_bytes(path, files.dumps(path, kept).encode())
     return found

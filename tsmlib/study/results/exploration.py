@@ -11,6 +11,7 @@ Adapted models are ``open loop``, without a planner; ``env_steps`` are those of 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
@@ -20,6 +21,7 @@ import pandas as pd
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import Scores
 from tsmlib.figures.method import Look, Method
+from tsmlib.statistics import interval
 from tsmlib.study import zoo
 from tsmlib.study.results import table
 from tsmlib.study.results.planning import CLOSED, OPEN
@@ -62,8 +64,6 @@ UNITS = {  # of DRAWN, as a figure's axes say them
     PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
 }
 
-LOWEST = {PUSH: {"executed return": -15.0, "share within 5 cm": 0.3}}  # of the axes, of DRAWN: a little below round 0
-
 
 # Rows ----------------------------------------------------------------------------------------------------------------
 
@@ -75,7 +75,7 @@ def round_rows(
     """What was measured on ``n`` starts after each round, and the SECONDS of it.
 
     first: environment steps before round 1; data: one of DATA; space: that is searched. samples: by which candidates
-    were judged beside the mode; 0: by the mode, or the one rollout that a model has.
+    were judged beside the mode; 0: by the mode, or the one rollout that a model has. What is NaN has no row.
     """
     common = _of_loop(run, word, env, data) | dict(planner="cem", execution=CLOSED, n=n, search_space=space)
     common |= {"samples": samples} if samples else {}
@@ -84,7 +84,8 @@ def round_rows(
             iteration=int(record["round"]), env_steps=first + int(record["env_steps"]), metric=metric,
             value=float(record[metric]), **({"unit": "s"} if metric in SECONDS else {}),
         )
-        for record in records for metric in (*ROUNDS[env], *SECONDS) if metric in record
+        for record in records for metric in (*ROUNDS[env], *SECONDS)
+        if math.isfinite(record.get(metric, math.nan))
     ]  # fmt: skip
 
 
@@ -150,7 +151,8 @@ def round_panels(
     """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
     Seeds are compared round by round: lost episodes leave one with fewer steps, and steps are means over seeds. Without
-    those that take no steps; alone: of these the last round, training alone, at the steps of the first.
+    those that take no steps; alone: of these the last round, training alone, at the steps of the first. A seed that
+    lacks a round is left out, and a learner of which no seed is whole.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM, NONE][: 2 + alone])
@@ -158,12 +160,27 @@ def round_panels(
         for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
             if title in titles:
                 wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
+                if wide.empty:
+                    continue
                 steps = own[own["seed"].isin(wide.index)].groupby("iteration")["env_steps"].mean()
                 wide = wide.iloc[:, -1:] if data == NONE else wide
                 variant = f"{NONE}, round {wide.columns[-1]}" if data == NONE else data
                 at, values = steps[wide.columns].to_numpy(float), wide.to_numpy(float)
                 found.setdefault(title, {})[zoo.method(word, variant=variant)] = at, values
     return found
+
+
+def axis_ends(rows: pd.DataFrame, env: str) -> dict[str, float]:
+    """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest 95 % interval of round 0."""
+    ends = {}
+    closed = table.select(rows, env=env, execution=CLOSED)
+    for metric in ("return_true", "success"):
+        found, learner = table.select(closed, metric=metric), ["model", "configuration"]
+        before = [part["value"] for _, part in table.groups(table.select(found, iteration=0), learner)]
+        if (title := ROUNDS[env][metric]) in DRAWN[env] and before:
+            low = min(mean - half for mean, half in map(interval, before))
+            ends[title] = low - 0.1 * abs(low)
+    return ends
 
 
 def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
@@ -185,7 +202,7 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 @table.sourced
 def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
-    """A line for each learner and round; contacts of its episodes, its seconds and the judge of its candidates where
+    """A line for each learner and round; contacts of its episodes, its seconds and what judged its candidates where
     these are known."""
     lines = []
     keys = ["model", "configuration", "iteration"]
@@ -198,8 +215,7 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
         steps = own.groupby("seed")["env_steps"].max().mean()
         line: Row = {"model": f"`{word}`", "what": data, "round": int(k), "steps": f"{steps:,.0f}"}
         if "samples" in closed:  # a column of newer tables
-            judges = [f"mode, {n:.0f} samples" if n else "mode" for n in sorted(set(own["samples"].fillna(0)))]
-            line["judge"] = "; ".join(judges) if word in zoo.ZOO else ""
+            line["judge"] = _judge(word, own["samples"])
         for metric, title in {name: title for name, title in (ROUNDS[env] | SECONDS).items() if name in known}.items():
             values, form = table.select(own, metric=metric)["value"], "{:.2f} ± {:.2f}"
             line[title] = table.spell(values, "{:.0f}" if metric in SECONDS else form) if len(values) else ""
@@ -210,10 +226,20 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def _judge(word: str, samples: pd.Series) -> str:
+    """What judged a learner's candidates, from the column ``samples`` of its rows; empty for another library's."""
+    if word in zoo.words(cls=zoo.CODED):
+        return "; ".join(f"mode, {n:.0f} samples" if n else "mode" for n in sorted(set(samples.fillna(0))))
+    if word in zoo.words(cls=("Ensemble",)):
+        return "members"
+    return "its rollout" if word in zoo.ZOO else ""
+
+
 @table.sourced
 def differences_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
     """A line for each learner and round of own plans: how much more return, and how many points more of success, than
-    before the first round, and than on other data after as many rounds; paired by seed. seeds: of these comparisons."""
+    before the first round, and than on other data after as many rounds; paired by seed (``paired``). seeds: of these
+    comparisons."""
     lines = []
     closed = table.select(rows, env=env, execution=CLOSED)
     for word, own in table.groups(closed, "model"):
@@ -235,11 +261,19 @@ def differences_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
 
 def paired(rows: pd.DataFrame, k: int) -> pd.DataFrame:
     """Of rows of one learner and metric, a line for each seed: own plans after round k minus round 0, and minus other
-    data after round k; NaN where a seed lacks one of both."""
-    wide = rows.pivot(index="seed", columns=["configuration", "iteration"], values="value")
+    data after round k; NaN where a seed lacks one of both, or their candidates were judged by other numbers of
+    ``samples``, as long as only some loops have been made again."""
+    judged = rows.assign(samples=rows["samples"].astype(float).fillna(0) if "samples" in rows else 0.0)
     others = {"round 0": (PLANNED, 0), NONE: (NONE, k), RANDOM: (RANDOM, k)}
-    wide = wide.reindex(columns=pd.MultiIndex.from_tuples([(PLANNED, k), *others.values()]))
-    return pd.DataFrame({what: wide[PLANNED, k] - wide[key] for what, key in others.items()})
+    columns = pd.MultiIndex.from_tuples([(PLANNED, k), *others.values()])
+    values, samples = (
+        judged.pivot(index="seed", columns=["configuration", "iteration"], values=name).reindex(columns=columns)
+        for name in ("value", "samples")
+    )
+    return pd.DataFrame({
+        what: (values[PLANNED, k] - values[key]).where(samples[PLANNED, k] == samples[key])
+        for what, key in others.items()
+    })  # fmt: skip
 
 
 @table.sourced
@@ -319,13 +353,14 @@ def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
 
         (zero-shot - adapted) / (zero-shot - trained in full),
 
-    paired by seed, at the greatest number of steps ahead. Only where the reference has rows."""
+    paired by seed, at the greatest number of steps ahead. Only where the reference has rows, and is better than
+    zero-shot."""
     lines = []
     here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
     here = here[here["steps_ahead"] == here["steps_ahead"].max()]
     for (env, word), own in table.groups(here, ["env", "model"]):
         found = recovered(own)
-        for way in [way for way in WAYS if way in found]:
+        for way in [way for way in WAYS if way in found and found[way].notna().to_numpy().any()]:
             line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name}
             for steps in sorted(found.columns.get_level_values("env_steps").unique()):
                 shares = found[way][steps].dropna() if steps in found[way] else []
@@ -336,14 +371,16 @@ def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 def recovered(rows: pd.DataFrame) -> pd.DataFrame:
     """Of energy scores of one arm and model, the share recovered of what zero-shot loses against the reference: a line
-    for each seed that has both, a column for each way and number of steps."""
+    for each seed that has both, a column for each way and number of steps. NaN where the reference is no better than
+    zero-shot, so that there is nothing to recover."""
     wide = rows.pivot(index="seed", columns=["configuration", "env_steps"], values="value")
     if not {"zero-shot", REFERENCE} <= set(wide.columns.get_level_values(0)):
         return pd.DataFrame()
     one = wide.T.groupby(level=0).first().T  # column of each way; those two have one number of episodes
     zero, full = one["zero-shot"], one[REFERENCE]
     ways = wide.drop(columns=["zero-shot", REFERENCE], level=0)
-    return ways.rsub(zero, axis=0).div(zero - full, axis=0).dropna(how="all")
+    lost = (zero - full).where(zero > full)
+    return ways.rsub(zero, axis=0).div(lost, axis=0).dropna(how="all")
 
 
 @table.told
