@@ -312,7 +312,7 @@ def test_networks_that_judge_together_are_set_against_the_same_networks_one_by_o
         {"models": "lstm lstm", "seeds": "0 1", **about, "costs": "1 2 3"},  # of other targets
         {"models": None, "seeds": None, **about},
     ])  # fmt: skip
-    kind = {"env": "e", "model": "lstm", "seconds": 580, "muon": 0.02, "within": 0.5}
+    kind = {"env": "e", "model": "lstm", "seconds": 580, "muon": 0.02, "decay": 0.0, "within": 0.5}
     singles = pd.DataFrame([
         kind | {"seed": seed, "costs": costs}
         for seed, costs in ((0, "2 3"), (1, "4 7"))

@@ -92,7 +92,7 @@ def alone(lines: pd.DataFrame, singles: pd.DataFrame) -> pd.DataFrame:
     for line in lines[lines["split"] == "validation"].dropna(subset=["models"]).itertuples():
         words = (getattr(line, each).split() for each in TRAININGS)
         trainings = [
-            (line.env, model, int(seed), int(seconds), float(muon))
+            (line.env, model, int(seed), int(seconds), float(muon), 0.0)  # without weight decay
             for model, seed, seconds, muon in zip(*words, strict=True)
         ]
         costs, kinds = np.array(line.costs.split(), float), {(model, *how) for _, model, _, *how in trainings}
