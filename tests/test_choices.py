@@ -289,7 +289,7 @@ def test_models_with_codes_are_set_against_the_best_baseline_that_was_trained_as
 
 
 def test_the_stamp_of_the_figure_says_its_seeds_networks_episodes_and_targets() -> None:
-    about = {"env": "tsm/ReacherPush-v1", "targets": 100, "muon": 0.01}
+    about = {"env": "tsm/ReacherPush-v1", "targets": 100, "muon": 0.01, "decay": 0.0}
     trained = [("lstm", 580, 0), ("tsm", 580, 0), ("lstm", 2320, 0), *(("tsm", 2320, seed) for seed in (0, 2, 1))]
     lines = pd.DataFrame([about | {"model": model, "seconds": s, "seed": seed} for model, s, seed in trained])
     rest = "; one network each; predictions: n = 200 fresh episodes, plans and violations: n = 100 validation targets"
@@ -335,7 +335,8 @@ def test_trainings_of_several_seeds_are_told_apart_seed_by_seed() -> None:
     }
     columns = [*quality.MEASURES, "coverage80", "within"]
     lines = quality.several(pd.DataFrame([
-        {"env": "e", "model": model, "seconds": 580, "muon": 0.01, "seed": seed} | dict.fromkeys(columns, score)
+        {"env": "e", "model": model, "seconds": 580, "muon": 0.01, "decay": 0.0, "seed": seed}
+        | dict.fromkeys(columns, score)
         for (model, seed), score in scores.items()
     ]))  # fmt: skip
     assert quality.over_seeds(lines)["seeds"].tolist() == [3, 2]  # the one-step model was trained once

@@ -86,13 +86,13 @@ def compared(lines: pd.DataFrame, name: str) -> pd.DataFrame:
 def alone(lines: pd.DataFrame, singles: pd.DataFrame) -> pd.DataFrame:
     """Several trainings of one model that judge together, against the same trainings one by one.
 
-    lines: of this table. singles: of ``quality.csv``; of as many targets.
+    lines: of this table. singles: of ``quality.csv``, without weight decay; of as many targets.
     """
-    single, found = singles.set_index(KEY), []
+    single, found = singles[singles["decay"] == 0].set_index(KEY), []
     for line in lines[lines["split"] == "validation"].dropna(subset=["models"]).itertuples():
         words = (getattr(line, each).split() for each in TRAININGS)
         trainings = [
-            (line.env, model, int(seed), int(seconds), float(muon), 0.0)  # without weight decay
+            (line.env, model, int(seed), int(seconds), float(muon))
             for model, seed, seconds, muon in zip(*words, strict=True)
         ]
         costs, kinds = np.array(line.costs.split(), float), {(model, *how) for _, model, _, *how in trainings}

@@ -60,7 +60,7 @@ MEASURES = {  # column -> title and unit; of each a smaller value is better
     "nrmse_10": "nRMSE, 10 steps", "nrmse_80": "nRMSE, 80 steps", "cost": "cost of plans (m)", "gap": "gap (m)",
     "violations": "violations (share of steps)",
 }  # fmt: skip
-KEY = ["env", "model", "seed", "seconds", "muon", "decay"]
+KEY = ["env", "model", "seed", "seconds", "muon"]
 SCORES = ("energy_10", "energy_80")  # set against those of the best baseline
 
 
@@ -320,9 +320,9 @@ def main() -> None:
         net, env = Mixture(map(load, given.files)), str(described(given.files[0])["env"])
         print({**predicted(net, env, given.episodes), **planned(net, env, given.targets), "costs": ""})
     for path in given.files if given.what == "measure" else ():
-        known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame(columns=KEY)
+        known = pd.read_csv(given.out) if given.out.exists() else pd.DataFrame(columns=[*KEY, "decay"])
         said = described(path)
-        if (known[KEY] == [said[name] for name in KEY]).all(axis=1).any():
+        if (known[[*KEY, "decay"]] == [said[name] for name in (*KEY, "decay")]).all(axis=1).any():
             print(f"{path}: measured already")
             continue
         line = measured(path, given.targets, given.episodes)
