@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 BUDGET = {  # seconds of training on one core at scale paper, the same for every dynamics model of an environment
     "Reacher": 320.0, "ReacherObstacle": 480.0, "ReacherPush": 2320.0,
-    "PymunkReacher": 160.0, "PymunkObstacle": 160.0, "PymunkPush": 2320.0,
+    "PymunkReacher": 160.0, "PymunkObstacle": 160.0, "PymunkPush": 580.0,
 }  # fmt: skip
 
 
