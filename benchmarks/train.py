@@ -104,6 +104,7 @@ def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) 
     windows = arguments.updates * stage.batch / seconds["fast"]
     name = stage.loss if stage.loss not in WORDS or model in ONE_STEP else WORDS[stage.loss]
     name = {"loss": "one step ahead", "multi_step_loss": "free-running"}.get(name, name)
+    name += ", longer windows" * (stage.future_len > 20)
     print(f"{model}, {name}: {sorted(windows)[len(windows) // 2]:,.0f} windows a second")
     return Row.of(
         f"train {model}, {name}: targets", targets / seconds["fast"],

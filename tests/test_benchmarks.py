@@ -22,7 +22,7 @@ from tsmlib.study import runs
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],
     "robots": ["--episodes", "3", "--loop-episodes", "2"],
-    "train": ["--models", "tsm,onestep", "--updates", "1", "--batch", "4", "--batches", "4", "--episodes", "3"],
+    "train": ["--models", "tsm,rtsm,onestep", "--updates", "1", "--batch", "4", "--batches", "4", "--episodes", "3"],
     "avx2": ["--models", "onestep,prior", "--updates", "1", "--batch", "4", "--episodes", "3"],
     "rollout": ["--models", "tsm,onestep", "--rows", "2,4", "--horizon", "3", "--episodes", "2"],
     "plan": [
@@ -41,7 +41,9 @@ ROWS = {  # configuration -> metrics
     "collect": {"env.step": {"steps_per_second", "steps_per_core_second"}, "mj_step": SPEEDS},
     "robots": {"VectorEnv.step": {"steps_per_second", "steps_per_core_second"}, "env.step": SPEEDS},
     "train": {
-        "teacher_forced_loss": {"targets_per_second"}, "loss": {"targets_per_second"}, "batch": {"windows_per_second"},
+        "teacher_forced_loss": {"targets_per_second"}, "point_loss": {"targets_per_second"},
+        "loss": {"targets_per_second"},
+        "batch": {"windows_per_second"}, "beside": {"updates_per_second"},
     },
     "avx2": {"loss": {"updates_per_second"}},
     "rollout": {"float32": SPEEDS, "bfloat16": SPEEDS},
