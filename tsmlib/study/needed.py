@@ -90,7 +90,8 @@ def control(run: Run) -> Control:
     push = [*methods((PAPERS, OURS, "onestep", "lstm"), "adam"), *methods(("onestep", "lstm"), "mppi"),
             method(OURS, "latent", "mppi")] * whole  # fmt: skip
     push += [method(PAPERS, "latent", "adam"), method(PAPERS, "direct", "mppi")] * smoke
-    loops = run.pick(smoke=(OURS, "oracle"), laptop=(OURS,), paper=(OURS, "onestep", "lstm", "oracle"))
+    five = (PAPERS, OURS, "onestep", "multistep", "lstm")
+    loops = run.pick(smoke=(OURS, "oracle"), laptop=(OURS,), paper=(*five, "oracle"))
     long, at = run.pick(smoke=(4, [0, 2, 4]), laptop=(0, []), paper=(40, [0, 1, 2, 4, 7, 10, 15, 20, 30, 40]))
     longer, searched = run.pick(smoke=(6, [PAPERS]), laptop=(0, []), paper=(500, [PAPERS, OURS]))
     return Control(
