@@ -118,7 +118,7 @@ def readme_loops(env: str) -> str:
     closed = planning_results.plans_of(published("05_control"), env=env, execution=planning_results.CLOSED)
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
-    again = f"Planned again every ten steps, the object ends within 5 cm by {loops}."
+    again = f"Planned again every ten steps, it ends within 5 cm by {loops}."
     return f"{readme_plans(env)}{again} {readme_scores(env)}".rstrip()
 
 
