@@ -286,8 +286,8 @@ def results_page() -> str:
 ## Aims
 
 What was aimed at for pushing and for `{OURS}`, before these rows were there, means over the training seeds of the
-tables below. Each is against the model that is hardest to be ahead of, which is named: of plans among the baselines, which
-have no codes, of predictions and policies among all others.
+tables below. Each is against the model that is hardest to be ahead of, which is named: of plans among the baselines,
+which have no codes, of predictions and policies among all others.
 
 {table.markdown(aims())}
 
