@@ -71,7 +71,7 @@ def readme_results() -> str:
     narrow = re.sub(r":-+", "---", re.sub(" +", " ", table.markdown(pd.DataFrame(lines))))  # README is to be short
     return f"""{narrow}
 
-*`{env}`, published; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
+*`{env}`; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
 {episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
 truths in 80 % intervals of samples, or, without samples, of a fitted Gaussian. {targets} targets, CEM over codes:
 share, 1 by the simulator, 0 for doing nothing; gap, mean size of predicted minus executed return.*
@@ -89,7 +89,8 @@ def aims() -> pd.DataFrame:
 def readme_aims() -> str:
     """The aims that were not reached."""
     said = aims_results.missed(aims())
-    return f"Of the [aims](docs/results.md#aims) of pushing and `{OURS}` {said}" if said else ""
+    also = "[Some of speed](docs/speed.md#what-is-not-reached) too."
+    return f"Of the [aims](docs/results.md#aims) of pushing and `{OURS}` {said} {also}" if said else ""
 
 
 def readme_plans(env: str) -> str:
@@ -131,10 +132,7 @@ def readme_scores(env: str) -> str:
             return ""
         ratios = [f"{each[model].mean() / min(each[word].mean() for word in BASELINES):.2f}" for each in found]
         said.append(f"`{model}` {' and '.join(ratios)}")
-    return (
-        f"Energy score over the best baseline's, 10 and 80 steps ahead: {', '.join(said)} ([by training "
-        "time](benchmarks/settings/README.md))."
-    )
+    return f"Energy score over the best baseline's, 10 and 80 steps ahead: {', '.join(said)}."
 
 
 def _seeds(rows: pd.DataFrame) -> str:
