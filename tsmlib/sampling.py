@@ -1,7 +1,7 @@
 """Sources of standard normal noise: one generator, common random numbers, separate generators, none."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -35,6 +35,20 @@ class NoNoise:
     first: int = 0
 
 
+@dataclass(frozen=True)
+class GivenNoise:
+    """Numbers that were drawn before, in the order in which they are asked for (``stacked_training``)."""
+
+    numbers: list[Tensor]
+
+
+@dataclass(frozen=True)
+class RecordedNoise:
+    """Zeros, of which the shapes are kept: how much noise a call will draw."""
+
+    shapes: list[torch.Size] = field(default_factory=list)
+
+
 Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
 
 
@@ -46,9 +60,14 @@ def generator_of(*key: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
-def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
+def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNoise, like: Tensor) -> Tensor:
     """Draw N(0, 1) of ``shape`` with the device and type of ``like``: the same numbers on any device."""
     if isinstance(noise, NoNoise):
+        return like.new_zeros(tuple(shape))
+    if isinstance(noise, GivenNoise):
+        return noise.numbers.pop(0)
+    if isinstance(noise, RecordedNoise):
+        noise.shapes.append(torch.Size(shape))
         return like.new_zeros(tuple(shape))
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])

@@ -30,6 +30,7 @@ class Features(nn.Module):
         self.angles = list(angles)
         self.others = [d for d in range(state_dim) if d not in angles]
         self.dim = state_dim + len(angles)
+        self._settled: tuple[slice | Tensor, slice | Tensor] | None = None
         self.register_buffer("mean", torch.zeros(self.dim))
         self.register_buffer("std", torch.ones(self.dim))
         self.register_buffer("step_std", torch.zeros(state_dim))  # of x_{t+1} - x_t, physical units; 0 until fitted
@@ -65,17 +66,31 @@ class Features(nn.Module):
         moving = self.moving
         return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
 
+    def settle(self) -> None:
+        """Find out once which columns change, in place of each time: ``torch.func`` and CUDA graphs cannot ask."""
+        self._settled = tuple(  # type: ignore[assignment]  # of two
+            index if isinstance(index := _columns(some.nonzero()[:, 0].tolist()), slice)
+            else torch.tensor(index, device=some.device)
+            for some in (self.moving, self.scored)
+        )  # fmt: skip
+
     def forward(self, states: Tensor) -> Tensor:
         """(..., dx) -> (..., dim): cosines, sines, the rest; zero mean and unit variance on the training data."""
         return (self._raw(states) - self.mean) / self.std
 
     def difference(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of their features that change within an episode, standardised."""
-        difference, scored = self(predicted) - self(true), self.scored
+        difference = self(predicted) - self(true)
+        if self._settled:
+            return difference[..., self._settled[1]]
+        scored = self.scored
         return difference if scored.all() else difference[..., scored]
 
     def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
+        if self._settled:
+            moving = self._settled[0]
+            return (predicted - true)[..., moving] / self.step_std[moving]
         if self.moving.all():
             return (predicted - true) / self.step_std
         return (predicted - true)[..., self.moving] / self.step_std[self.moving]

@@ -15,7 +15,8 @@ Letters in shapes: B batch, T steps, n hidden size, dz code size, F features, dx
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +32,23 @@ sigmoid_backward, tanh_backward = (
     torch.ops.aten.sigmoid_backward.grad_input,  # dy y (1 - y), into a place that is there
     torch.ops.aten.tanh_backward.grad_input,  # dy (1 - y^2)
 )
+
+
+_by_operations = False  # no ContextVar, which torch.compile does not follow
+
+
+@contextmanager
+def as_operations() -> Iterator[None]:
+    """Within, recurrences of this process are made of torch's own operations, over which ``torch.func`` maps.
+
+    Slower on a CPU.
+    """
+    global _by_operations
+    before, _by_operations = _by_operations, True
+    try:
+        yield
+    finally:
+        _by_operations = before
 
 
 @dataclass(frozen=True)
@@ -64,7 +82,9 @@ class Recurrent:
 
     @staticmethod
     def _arranged(features: Features, v: Tensor) -> Tensor:
-        return (v * features.step_std)[:, features.angles + features.others]
+        order = features.angles + features.others
+        v = v * features.step_std
+        return v if order == sorted(order) else v[:, order]
 
     def _product_type(self, x: Tensor) -> torch.dtype:
         """Number type of the products with W and U: that of ``x``, or of ``torch.autocast`` where it is on."""
@@ -80,6 +100,9 @@ class Recurrent:
         n = self.cell.shape[1] // 4
         cell = self.cell[len(self.cell) - n - given.shape[2] :]
         h = c = past.states.new_zeros(len(past.states), n)
+        if _by_operations:
+            _, memory = self._stepped(None, (h, c), given, given[..., :0])
+            return memory
         keep = torch.is_grad_enabled()
         _, h, c = Recurrence.apply(
             keep, self._product_type(h), self.features, None, h, c, given[..., :0], given, cell, None, None
@@ -102,20 +125,55 @@ class Recurrent:
         """From states (B, dx) under actions (T, B, du) and codes (T, B, dz), the states (T, B, dx) and the memory."""
         order = self.features.angles + self.features.others
         given = torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
-        states, h, c = Recurrence.apply(
-            torch.is_grad_enabled(),
-            self._product_type(x),
-            self.features,
-            x if order == sorted(order) else x[:, order],
-            *memory,
-            codes,
-            given,
-            self.cell,
-            self.hidden,
-            self.out,
-        )
+        x = x if order == sorted(order) else x[:, order]
+        if _by_operations:
+            states, (h, c) = self._stepped(x, memory, given, codes)
+        else:
+            keep = torch.is_grad_enabled()
+            states, h, c = Recurrence.apply(
+                keep, self._product_type(x), self.features, x, *memory, codes, given, self.cell, self.hidden, self.out
+            )
         back = sorted(range(len(order)), key=order.__getitem__)
         return states if order == back else states[..., back], (h, c)
+
+    def _stepped(self, x: Tensor | None, memory: Memory, given: Tensor, codes: Tensor) -> tuple[Tensor, Memory]:
+        """As ``Recurrence``, by one operation after the other; what does not depend on the step before, all at once."""
+        h, c = memory
+        n, dz, known = h.shape[1], codes.shape[2], given.shape[2]
+        of_z, of_h, of_s, of_given = self.cell[len(self.cell) - known - n - self._seen(x) - dz :].split(
+            [dz, n, self._seen(x), known]
+        )
+        q_given, recurrent = given @ of_given, torch.cat([of_h, of_s])
+        if dz:
+            q_given = q_given + codes @ of_z
+        if self.hidden is not None and x is not None:
+            u_s, u_given, u_h = self.hidden.split([self._seen(x), known, n])
+            active_given, u_seen = given @ u_given, torch.cat([u_h, u_s])
+        states = []
+        for t, now in enumerate(q_given.unbind(0)):
+            s = h if x is None else torch.cat([h, self._features_of(x)], dim=1)
+            gates, new = torch.addmm(now, s, recurrent).split([3 * n, n], dim=1)
+            forget, write, read = gates.sigmoid().chunk(3, dim=1)
+            c = forget * c + write * new.tanh()
+            h = read * c.tanh()
+            if x is None:
+                continue
+            if self.hidden is None:
+                x = x + torch.addmm(self.out[-n - 1], h, self.out[-n:])
+            else:
+                active = torch.addmm(active_given[t], torch.cat([h, s[:, n:]], dim=1), u_seen)
+                x = x + torch.addmm(self.out[-1], nn.functional.silu(active), self.out[:-1])
+            states.append(x)
+        return torch.stack(states) if states else given[..., :0], (h, c)
+
+    def _seen(self, x: Tensor | None) -> int:
+        """Number of features beside what is given."""
+        return 0 if x is None else self.features.dim
+
+    def _features_of(self, x: Tensor) -> Tensor:
+        """Features of x (B, dx), whose angles come first."""
+        angle, other = x.split([len(self.features.angles), len(self.features.others)], dim=1)
+        return (torch.cat([angle.cos(), angle.sin(), other], dim=1) - self.features.mean) / self.features.std
 
 
 class Recurrence(torch.autograd.Function):

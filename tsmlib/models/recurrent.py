@@ -149,7 +149,8 @@ class RecurrentTSM(Featured, Configured):
 
     def _run(self, decoder: Recurrent, x: Tensor, memory: Memory, actions: Tensor, z: Tensor) -> Tensor:
         """(B, dx), (B, K, du), (B, n, dz) -> (B, K, dx)."""
-        held = F.pad(z.transpose(0, 1).repeat_interleave(self.code_len, 0), (0, 0, 0, 0, 0, actions.shape[1]))
+        each = z.transpose(0, 1)[:, None].expand(-1, self.code_len, -1, -1).flatten(0, 1)
+        held = F.pad(each, (0, 0, 0, 0, 0, actions.shape[1]))
         states, _ = decoder.run(x, memory, actions.transpose(0, 1), held[: actions.shape[1]])
         return states.transpose(0, 1)
 

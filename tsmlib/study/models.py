@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, TypedDict, cast
 
@@ -24,7 +24,8 @@ from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.training.fit import fit
-from tsmlib.trajectory import Trajectories
+from tsmlib.stacked_training import fit_stacked, stacked
+from tsmlib.trajectory import Segment, Trajectories
 
 if TYPE_CHECKING:
     import pandas as pd  # of the extra "study", which a pretrained model does not need
@@ -44,7 +45,10 @@ class TrainedCurve(TypedDict):
 
 
 class Header(TypedDict, total=False):
-    """What the file of a trained model says of itself. curves, bf16: by the keys of its stages (``zoo.keys``)."""
+    """What the file of a trained model says of itself. curves, bf16: by the keys of its stages (``zoo.keys``).
+
+    seconds: of the CPU; of ``copies`` that were trained as one on a ``processor``, by the clock and of all together.
+    """
 
     fingerprint: dict[str, Json]
     model: str
@@ -59,6 +63,8 @@ class Header(TypedDict, total=False):
     device: str
     finished: str
     seconds: float
+    copies: int
+    processor: str
     inputs: dict[str, str]
 
 
@@ -175,19 +181,85 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
             device=run.device, checkpoint=checkpoints[-1], progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
-    header = {
-        "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": curves,
-        "schedule": [stage.stated() for stage in stages], "symmetries": _symmetries(env, model),
-        "bf16": [key for key, curve in curves.items() if any(curve["bf16"])],  # as the processor had it
-        "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
-        "finished": time.strftime("%Y-%m-%d"),
-        "seconds": sum(curve["seconds"][-1] for curve in curves.values()),  # of the CPU
-        "inputs": _inputs(run, env, path),
-    }  # fmt: skip
-    artifacts.save_model(path, net, header)
+    artifacts.save_model(path, net, _header(run, env, model, curves, path))
     for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)
     return Trained(net, cast(Header, artifacts.read_header(path)))
+
+
+def _header(
+    run: Run, env: str, model: str, curves: Mapping[str, Mapping[str, Json]], path: Path, *, copies: int = 1
+) -> dict[str, Json]:
+    """Of the file of a trained model."""
+    ends = [cast(TrainedCurve, curve)["seconds"][-1] for curve in curves.values()]
+    header: dict[str, Json] = {
+        "fingerprint": fingerprint(env), "model": model, "seed": run.seed, "scale": run.scale, "curves": dict(curves),
+        "schedule": [stage.stated() for stage in schedule(run, env, model)], "symmetries": _symmetries(env, model),
+        "bf16": [key for key, curve in curves.items() if any(cast(TrainedCurve, curve)["bf16"])],  # as the CPU had it
+        "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
+        "finished": time.strftime("%Y-%m-%d"), "seconds": sum(ends), "inputs": dict(_inputs(run, env, path)),
+    }  # fmt: skip
+    if copies > 1:
+        header["copies"] = copies
+        header["processor"] = torch.cuda.get_device_name(run.device) if run.device != "cpu" else "cpu"
+    return header
+
+
+@dataclass(frozen=True)
+class SeedsData:
+    """What a model is trained on with the seeds of several runs at once: the same environment, data of each seed.
+
+    data, held_out: as of ``training_data``. stack: all of ``data``, with ``past_len`` steps of past, on the device of
+    the first run.
+    """
+
+    runs: tuple[Run, ...]
+    env: str
+    data: list[Trajectories]
+    held_out: Trajectories
+    past_len: int
+    stack: Segment
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], env: str, *, past_len: int = 10) -> SeedsData:
+        """past_len: the longest past of the models that are trained on it."""
+        parts = [training_data(run, env, "tsm") for run in runs]
+        data = [part for part, _ in parts]
+        return cls(tuple(runs), env, data, parts[0][1], past_len, stacked(data, past_len, runs[0].device))
+
+    def with_past(self, past_len: int) -> Segment:
+        """The stack with fewer steps of past."""
+        if past_len > self.past_len:
+            raise ValueError(f"past_len {past_len}: these data have {self.past_len} steps of past")
+        return Segment(*(part[:, :, self.past_len - past_len :] for part in self.stack))
+
+
+def train_as_one(seeds: SeedsData, model: str, *, compiled: bool = False) -> list[Trained]:
+    """Train a model with several seeds as one (``fit_stacked``), and store each where its run finds it.
+
+    For a GPU, on which all seeds take about as long as one; on a CPU it is slower than one after the other. compiled:
+    of ``fit_stacked``. Nothing is kept of a training that is stopped.
+    """
+    runs, env = seeds.runs, seeds.env
+    if trained_on(env, model) != env or _symmetries(env, model) != _symmetries(env, "tsm"):
+        raise ValueError(f"{model} is trained on {trained_on(env, model)}, without symmetric copies; found {env}")
+    stages, curves = schedule(runs[0], env, model), [dict[str, dict[str, Json]]() for _ in runs]
+    nets = [initialise(run, model, data) for run, data in zip(runs, seeds.data, strict=True)]
+    past_len, title = nets[0].past_len, f"{EnvSpec.parse(env).name} {model}"
+    for key, stage in zip(zoo.keys(stages), stages, strict=True):
+        found = fit_stacked(
+            [cast(torch.nn.Module, net) for net in nets], stage.loss, seeds.with_past(past_len), seeds.held_out,
+            stage.options(past_len), seeds=[run.seed for run in runs], device=runs[0].device, compiled=compiled,
+            progress=f"{title}: {key}",
+        )  # fmt: skip
+        for own, curve in zip(curves, found, strict=True):
+            own[key] = asdict(curve)
+    made = []
+    for run, net, own in zip(runs, nets, curves, strict=True):
+        path = run.folder(f"models/{EnvSpec.parse(env).name}") / f"{zoo.find(model).word}.safetensors"
+        artifacts.save_model(path, net, _header(run, env, model, own, path, copies=len(runs)))
+        made.append(Trained(net, cast(Header, artifacts.read_header(path))))
+    return made
 
 
 def training_data(run: Run, env: str, model: str) -> tuple[Trajectories, Trajectories]:

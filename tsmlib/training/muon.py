@@ -8,6 +8,7 @@ one computes in the type of the weights, and takes a stack of matrices as severa
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -52,27 +53,53 @@ def orthogonalised(matrix: Tensor, iterations: int = 5) -> Tensor:
 class Muon(torch.optim.Optimizer):
     """Muon for weights (out, in), as of ``nn.Linear``, and stacks (M, in, out), as of ``BatchedLinear``.
 
+    copies: a leading dimension before these. lr may be a tensor, which a CUDA graph reads anew each time.
+
     M <- momentum M + (1 - momentum) G
     W <- (1 - lr weight_decay) W - lr sqrt(max(1, out / in)) orthogonalised(momentum M + (1 - momentum) G)
     """
 
     def __init__(
-        self, params: Iterable[Tensor], lr: float, *, momentum: float = 0.95, weight_decay: float = 0.0
-    ) -> None:
+        self, params: Iterable[Tensor], lr: float | Tensor, *, momentum: float = 0.95, weight_decay: float = 0.0,
+        copies: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__(params, dict(lr=lr, momentum=momentum, weight_decay=weight_decay))
+        self.copies = copies
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         """One update of every weight that has a gradient."""
         for group in self.param_groups:
-            for weight in group["params"]:
-                if weight.grad is None:
-                    continue
-                state = self.state[weight]
-                if not state:
-                    state["momentum_buffer"] = torch.zeros_like(weight)
-                mean = state["momentum_buffer"].lerp_(weight.grad, 1 - group["momentum"])
-                update = orthogonalised(weight.grad.lerp(mean, group["momentum"]))
-                outputs, inputs = weight.shape if weight.ndim == 2 else weight.mT.shape[-2:]
-                weight.mul_(1 - group["lr"] * group["weight_decay"])
-                weight.add_(update, alpha=-group["lr"] * max(1.0, outputs / inputs) ** 0.5)
+            given = ((weight, weight.grad) for weight in group["params"])
+            directions = [(w, self._direction(w, gradient, group)) for w, gradient in given if gradient is not None]
+            if self.copies:
+                directions = [pair for same in _of_one_shape(directions) for pair in _together(same)]
+            for weight, direction in directions:
+                update = direction if self.copies else orthogonalised(direction)
+                outputs, inputs = weight.shape[-2:] if weight.ndim == 2 + self.copies else weight.mT.shape[-2:]
+                scale = max(1.0, outputs / inputs) ** 0.5
+                if group["weight_decay"]:
+                    weight.mul_(1 - group["lr"] * group["weight_decay"])
+                if isinstance(group["lr"], Tensor):
+                    weight.sub_(update * (group["lr"] * scale))
+                else:
+                    weight.add_(update, alpha=-group["lr"] * scale)
+
+    def _direction(self, weight: Tensor, gradient: Tensor, group: dict[str, Any]) -> Tensor:
+        """The momentum, moved on, and the gradient: what is to be orthogonalised."""
+        state = self.state[weight]
+        if not state:
+            state["momentum_buffer"] = torch.zeros_like(weight)
+        mean = state["momentum_buffer"].lerp_(gradient, 1 - group["momentum"])
+        return gradient.lerp(mean, group["momentum"])
+
+
+def _of_one_shape(pairs: list[tuple[Tensor, Tensor]]) -> list[list[tuple[Tensor, Tensor]]]:
+    shapes = dict.fromkeys(weight.shape for weight, _ in pairs)
+    return [[pair for pair in pairs if pair[0].shape == shape] for shape in shapes]
+
+
+def _together(same: list[tuple[Tensor, Tensor]]) -> list[tuple[Tensor, Tensor]]:
+    """Weights and their orthogonalised directions, which are found as one stack."""
+    found = orthogonalised(torch.stack([direction for _, direction in same]))
+    return [(weight, update) for (weight, _), update in zip(same, found, strict=True)]

@@ -1,0 +1,78 @@
+"""Models of several training seeds, trained as one: for a GPU, on which all seeds take about as long as one of them.
+
+    python benchmarks/settings/seeds.py --scale paper --seeds 3 4 5 6 7 8 9 --device cuda --compiled
+
+What is missing of the seeds' data is collected first, by as many processes as there are cores. Then each model is
+trained with all seeds at once (``tsmlib.stacked_training``), --together models side by side in processes of their own,
+in the order in which they are named; the prior is one of them. Files are those that ``python -m tsmlib run train``
+makes of each seed, in runs/paper/seed<k>/models, and say in their headers that they were trained as copies, and on
+what. --compiled is worth its minute or more where a training takes longer than that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
+
+import torch
+
+from tsmlib.study import models, parallel, runs, zoo
+from tsmlib.study.data import dataset
+
+ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
+MODELS = ("rtsm", "tsm", "lstm", "multistep", "onestep", "prior")
+SPLITS = ("train", "validation")
+
+
+def collect(run: runs.Run, env: str) -> None:
+    """In a process of its own."""
+    torch.set_num_threads(1)
+    for split in SPLITS:
+        dataset(run, env, split)
+
+
+def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
+    """In a process of its own; what it says when it is done."""
+    torch.set_num_threads(1)
+    found = models.train_as_one(models.SeedsData.of(of, env), word, compiled=compiled)
+    best = [min(list(made.header["curves"].values())[-1]["validation"]) for made in found]
+    return f"{env} {word}: {found[0].header['seconds']:.0f} s, {' '.join(f'{value:.4g}' for value in best)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument("--envs", nargs="+", default=ENVS, help=f"default {' '.join(ENVS)}")
+    parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.ZOO, metavar="MODEL", help="default six")
+    parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
+    parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
+    parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
+    parser.add_argument("--device", default="", help="default TSM_DEVICE, else cpu")
+    given = parser.parse_args()
+    own = [runs.resolve("02_train", scale=given.scale, seed=seed, device=given.device) for seed in given.seeds]
+    wanted = [(env, word) for env, word in product(given.envs, given.models) if models.trained_on(env, word) == env]
+    began, spawn = time.perf_counter(), multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(parallel.cores(), mp_context=spawn) as collectors,
+        ProcessPoolExecutor(given.together, mp_context=spawn, max_tasks_per_child=1) as trainers,
+    ):
+        splits = {env: [collectors.submit(collect, run, env) for run in own] for env in given.envs}
+        under_way = {}
+        for env, word in wanted:
+            for split in splits[env]:
+                split.result()
+            under_way[trainers.submit(train, own, env, word, given.compiled)] = (env, word)
+        failed = False
+        for done in as_completed(under_way):
+            failed |= (error := done.exception()) is not None
+            said = f"{' '.join(under_way[done])}: {type(error).__name__}: {error}" if error else done.result()
+            print(f"{time.perf_counter() - began:6.0f} s  {said}", flush=True)
+    if failed:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,283 @@
+"""Trainings of several copies of a model as one: weights with a leading dimension of copies, as of several seeds.
+
+Each copy has data, windows, noise, gradient norm and best weights of its own, and is to float tolerance what ``fit``
+makes of it alone. On a GPU an update of many copies takes about as long as that of one: there it is recorded once, as a
+CUDA graph, and replayed.
+
+Letters in shapes: S copies, B batch, N episodes, L steps of past, T steps of an episode, U updates.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, grad_and_value, stack_module_state, vmap
+from tqdm.auto import tqdm
+
+from tsmlib.models.features import Features
+from tsmlib.models.recurrence import as_operations
+from tsmlib.sampling import GivenNoise, RecordedNoise
+from tsmlib.training.checkpoint import TrainingStopped
+from tsmlib.training.fit import TrainingHistory, TrainingOptions, fixed_windows, schedule
+from tsmlib.training.muon import Muon, matrices
+from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, windows
+
+AHEAD = 50  # updates whose windows and noise are drawn at a time
+WARM_UP = 3  # updates before one is recorded
+
+
+def stacked(train: Sequence[Trajectories], past_len: int, device: str = "cpu") -> Segment:
+    """Training data of all copies, as of ``Trajectories.padded``: (S, N, L + T, .).
+
+    TrajectoryError where episodes are not all of one number and length.
+    """
+    for data in train:
+        data.require_equal_lengths("training several copies as one")
+    if len(shapes := {data.states.shape for data in train}) > 1:
+        found = " and ".join(str(shape) for shape in sorted(shapes))
+        raise TrajectoryError(f"copies would be trained on states of shapes {found}; expected one shape")
+    parts = zip(*(data.padded(past_len) for data in train), strict=True)
+    return Segment(*(torch.stack(part).to(device) for part in parts))
+
+
+def fit_stacked(
+    models: Sequence[nn.Module],
+    loss: str,
+    train: Segment,
+    validation: Trajectories,
+    options: TrainingOptions,
+    *,
+    seeds: Sequence[int],
+    device: str = "cpu",
+    compiled: bool = False,  # a third to a sixth of the kernels, after a minute or more
+    progress: str = "",  # title of the progress bar; none without
+) -> list[TrainingHistory]:
+    """Minimise a loss of several models of one configuration at once; leave in each the weights that were best for it.
+
+    loss: name of a method of theirs. train: (S, N, L + T, .), see ``stacked``, L being ``options.past_len``. seeds: of
+    each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. On a GPU products are in TF32
+    where ``options.bf16`` has bfloat16 on CPUs. ValueError where there are not as many models, seeds and data.
+    TrainingStopped where a loss is not finite at a validation, with the best weights so far in the models. Nothing is
+    stored on the way, and ``options.patience`` is not looked at.
+    """
+    if not len(models) == len(seeds) == len(train.states):
+        raise ValueError(f"found {len(models)} models, {len(seeds)} seeds and data of {len(train.states)}")
+    o, began = options, time.perf_counter()
+    histories = [TrainingHistory() for _ in models]
+    stack = _Stack(models, loss, train, validation, o, seeds, device, compiled)
+    update = stack.recorded() if stack.stream is not None else stack.update
+    with torch.cuda.stream(stack.stream), tqdm(total=o.steps, desc=progress, disable=not progress) as bar:
+        for first in range(0, o.steps, o.validate_every):
+            end = min(first + o.validate_every, o.steps)
+            for step in range(first, end, AHEAD):
+                stack.draw(range(step, min(step + AHEAD, end)))
+                for _ in range(step, min(step + AHEAD, end)):
+                    update()
+                bar.update(min(AHEAD, end - step))
+            trained, validated = stack.total / (end - first), stack.validate()
+            stack.total.zero_()
+            values = torch.stack([trained, validated], dim=1).tolist()
+            bar.set_postfix(validation=sum(value[1] for value in values) / len(values))
+            for history, (before, after) in zip(histories, values, strict=True):
+                history.step.append(end)
+                history.seconds.append(time.perf_counter() - began)
+                history.train.append(before)
+                history.validation.append(after)
+                history.bf16.append(False)
+            if bad := [seed for seed, value in zip(seeds, values, strict=True) if not all(map(math.isfinite, value))]:
+                stack.restore(models)
+                raise TrainingStopped(
+                    f"the loss of seed {bad[0]} is not finite at step {end} of {o.steps}; the best weights are kept. "
+                    f"{TrainingHistory.remedy}, or take a smaller lr than {o.lr}"
+                )
+        stack.restore(models)
+    return histories
+
+
+class _Loss(nn.Module):
+    """A loss of a model as a module, which can be called with other weights."""
+
+    def __init__(self, net: nn.Module, loss: str) -> None:
+        super().__init__()
+        self.net, self.loss = net, loss
+
+    def forward(self, window: Window, noise: Any) -> Tensor:
+        return getattr(self.net, self.loss)(window, noise)
+
+
+class _Stack:
+    """Weights, moments, and tables of what the next updates take; all stay in their place, as a CUDA graph needs it."""
+
+    def __init__(
+        self, models: Sequence[nn.Module], loss: str, train: Segment, validation: Trajectories, o: TrainingOptions,
+        seeds: Sequence[int], device: str, compiled: bool,
+    ) -> None:  # fmt: skip
+        self.options, self.seeds, self.copies, self.device = o, seeds, len(models), torch.device(device)
+        self.stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
+        copies: list[nn.Module] = [_Loss(model, loss) for model in models]
+        weights, self.buffers = stack_module_state(copies)
+        self.buffers = {name: buffer.to(self.device) for name, buffer in self.buffers.items()}
+        self.weights = {name: w.detach().to(self.device) for name, w in weights.items()}
+        self.module = _Loss(deepcopy(models[0]).to(self.device), loss)
+        if isinstance(features := getattr(self.module.net, "features", None), Features):
+            features.settle()
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = o.bf16
+        self.gradients = vmap(grad_and_value(self._loss))
+        if compiled:
+            self.gradients = torch.compile(self.gradients, fullgraph=True, dynamic=False)
+        self.train = Segment(*(part.to(self.device) for part in train))
+        held_out = fixed_windows(validation, o.past_len, o.future_len)
+        self.noise, fixed = _shapes(models[0], loss, _sized(held_out, o.batch_size)), _shapes(models[0], loss, held_out)
+        self.held_out = Window(*(segment.to(self.device) for segment in held_out))
+        drawn = [_normal(torch.Generator().manual_seed(seed), fixed) for seed in seeds]
+        self.held_out_noise = [torch.stack(parts).to(self.device) for parts in zip(*drawn, strict=True)]
+        table = AHEAD, self.copies
+        self.episodes, self.starts = (
+            torch.zeros(*table, o.batch_size, dtype=torch.long, device=self.device) for _ in range(2)
+        )
+        self.normal = [torch.zeros(*table, *shape, device=self.device) for shape in self.noise]
+        self.rates = torch.zeros(AHEAD, device=self.device)
+        self.at, self.total = torch.zeros(1, dtype=torch.long, device=self.device), self.rates.new_zeros(self.copies)
+        self.lr, self.muon = self.rates.new_zeros(()), self.rates.new_zeros(())
+        self.optimizers = list(self._optimizers(models[0]))
+        self.best = {name: weight.clone() for name, weight in self.weights.items()}
+        self.best_loss = torch.full_like(self.total, math.inf)
+
+    def _optimizers(self, model: nn.Module) -> list[torch.optim.Optimizer]:
+        """As ``fit`` has them, of stacks of weights."""
+        o, inside = self.options, matrices(model) if self.options.muon or self.options.weight_decay else []
+        ids = {id(weight) for weight in inside}
+        held = [name for name, weight in model.named_parameters() if id(weight) in ids]
+        of = {name: self.weights[f"net.{name}"] for name, _ in model.named_parameters()}
+        groups = [{"params": [w for name, w in of.items() if name not in held], "weight_decay": 0.0}]
+        if not o.muon:
+            groups.append({"params": [of[name] for name in held], "weight_decay": o.weight_decay})
+        groups = [group for group in groups if group["params"]]
+        made: list[torch.optim.Optimizer] = []
+        if groups:
+            made.append(torch.optim.AdamW(groups, lr=self.lr, fused=True, capturable=self.stream is not None))
+        if o.muon and held:
+            made.append(Muon([of[name] for name in held], self.muon, weight_decay=o.weight_decay, copies=True))
+        return made
+
+    def draw(self, steps: range) -> None:
+        """Fill the tables: the same windows and noise for (seed, step) as ``fit`` draws."""
+        o, n, length = self.options, *self.train.actions.shape[1:3]
+        last, generator = length - o.past_len - o.future_len, torch.Generator()
+        rows = []
+        for step in steps:
+            for seed in self.seeds:
+                generator.manual_seed(seed * 1_000_003 + step)
+                episodes = torch.randint(n, (o.batch_size,), generator=generator)
+                starts = torch.randint(last + 1, (o.batch_size,), generator=generator)
+                rows.append([episodes, starts, *_normal(generator, self.noise)])
+        for table, parts in zip([self.episodes, self.starts, *self.normal], zip(*rows, strict=True), strict=True):
+            _upload(torch.stack(parts).unflatten(0, (len(steps), -1)), table)
+        rates = [schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span) for step in steps]
+        _upload(torch.tensor(rates), self.rates)
+        self.at.zero_()
+
+    def update(self) -> None:
+        """One step of the optimisers of all copies, by the next line of the tables."""
+        o, taken = self.options, [table.index_select(0, self.at)[0] for table in (self.episodes, self.starts)]
+        noise = [table.index_select(0, self.at)[0] for table in self.normal]
+        self.lr.copy_(self.rates.index_select(0, self.at)[0])
+        torch.mul(self.lr, o.muon / o.lr, out=self.muon)
+        with as_operations():
+            gradients, losses = self.gradients(self.weights, self.buffers, self._windows(*taken), noise)
+        squares = [gradient.flatten(1).square().sum(1) for gradient in gradients.values()]
+        share = (o.clip / (torch.stack(squares).sum(0).sqrt() + 1e-6)).clamp(max=1.0)
+        for name, gradient in gradients.items():  # laid out as the weight is: fused optimisers look at memory alone
+            shared = gradient * share.view(-1, *[1] * (gradient.ndim - 1))
+            self.weights[name].grad = shared.contiguous()
+        for optimizer in self.optimizers:
+            optimizer.step()
+        self.total += losses
+        self.at += 1
+
+    def recorded(self) -> Callable[[], None]:
+        """``update`` as a CUDA graph, after a few updates that are taken back: a graph needs moments that are there."""
+        first = [weight.clone() for weight in self.weights.values()]
+        self.draw(range(WARM_UP))
+        current = torch.cuda.current_stream(self.device)
+        assert self.stream is not None
+        self.stream.wait_stream(current)
+        with torch.cuda.stream(self.stream):
+            for _ in range(WARM_UP):
+                self.update()
+        self.stream.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=self.stream):
+            self.update()
+        for weight, before in zip(self.weights.values(), first, strict=True):
+            weight.copy_(before)
+        for optimizer in self.optimizers:
+            for state in optimizer.state.values():
+                for value in state.values():
+                    value.zero_()
+        self.total.zero_()
+        torch.cuda.synchronize(self.device)
+        return graph.replay
+
+    @torch.no_grad()
+    def validate(self) -> Tensor:
+        """(S,) losses on fixed windows with fixed noise; keeps the weights that are the best of their copy."""
+        with as_operations():
+            found = vmap(self._loss, in_dims=(0, 0, None, 0))(
+                self.weights, self.buffers, self.held_out, self.held_out_noise
+            )
+        better = found < self.best_loss
+        self.best_loss = torch.where(better, found, self.best_loss)
+        for name, weight in self.weights.items():
+            self.best[name] = torch.where(better.view(-1, *[1] * (weight.ndim - 1)), weight, self.best[name])
+        return found
+
+    def restore(self, models: Sequence[nn.Module]) -> None:
+        """Each copy's best weights, into its model."""
+        for i, model in enumerate(models):
+            own = {name.removeprefix("net."): weight[i].cpu() for name, weight in self.best.items()}
+            model.load_state_dict(own, strict=False)
+
+    def _loss(self, weights: dict[str, Tensor], buffers: dict[str, Tensor], of: Window, noise: list[Tensor]) -> Tensor:
+        """Of one copy."""
+        return functional_call(self.module, {**weights, **buffers}, (of, GivenNoise(list(noise))))
+
+    def _windows(self, episodes: Tensor, starts: Tensor) -> Window:
+        """(S, B) twice -> windows (S, B, ., .)."""
+        n = self.train.states.shape[1]
+        first = torch.arange(self.copies, device=self.device)[:, None] * n
+        flat = Segment(*(part.flatten(0, 1) for part in self.train))
+        o, rows = self.options, (episodes + first).flatten()
+        cut = windows(flat, rows, starts.flatten(), o.past_len, o.future_len)
+        return Window(*(Segment(*(part.unflatten(0, (self.copies, -1)) for part in segment)) for segment in cut))
+
+
+def _shapes(model: nn.Module, loss: str, window: Window) -> list[torch.Size]:
+    """Of the standard normal numbers that a loss draws on a window, in their order."""
+    noise = RecordedNoise()
+    with torch.no_grad():
+        getattr(model, loss)(window, noise)
+    return noise.shapes
+
+
+def _sized(window: Window, rows: int) -> Window:
+    """A window of so many rows."""
+    index = torch.arange(rows) % len(window.past.states)
+    return Window(*(Segment(*(part[index] for part in segment)) for segment in window))
+
+
+def _normal(generator: torch.Generator, shapes: Sequence[torch.Size]) -> list[Tensor]:
+    return [torch.randn(shape, generator=generator) for shape in shapes]
+
+
+def _upload(rows: Tensor, table: Tensor) -> None:
+    """Into the first rows of a table, without waiting for a GPU."""
+    if table.device.type == "cuda":
+        rows = rows.pin_memory()
+    table[: len(rows)].copy_(rows, non_blocking=True)
