@@ -7,6 +7,11 @@ trained with all seeds at once (``tsmlib.stacked_training``), --together models 
 in the order in which they are named; the prior is one of them. Files are those that ``python -m tsmlib run train``
 makes of each seed, in runs/paper/seed<k>/models, and say in their headers that they were trained as copies, and on
 what. --compiled is worth its minute or more where a training takes longer than that.
+
+    python benchmarks/settings/seeds.py --scale paper --seeds 0 1 2 3 4 5 6 7 8 9 --envs tsm/Reacher-v0 --table
+
+writes ``seeds.csv`` beside this script: validation loss and seconds of the models that these seeds have, as their
+headers say.
 """
 
 from __future__ import annotations
@@ -14,14 +19,21 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import product
+from pathlib import Path
+from typing import cast
 
+import pandas as pd
 import torch
 
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.storage import artifacts
 from tsmlib.study import models, parallel, runs, zoo
 from tsmlib.study.data import dataset
 
+HERE = Path(__file__).parent
 ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
 MODELS = ("rtsm", "tsm", "lstm", "multistep", "onestep", "prior")
 SPLITS = ("train", "validation")
@@ -42,6 +54,25 @@ def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
     return f"{env} {word}: {found[0].header['seconds']:.0f} s, {' '.join(f'{value:.4g}' for value in best)}"
 
 
+def table(of: list[runs.Run], envs: Sequence[str], words: Sequence[str]) -> pd.DataFrame:
+    """A line for each model that there is; seconds of one on a CPU by its time, of copies by the clock, all together.
+
+    validation: the least loss of the last stage.
+    """
+    lines = []
+    for env, word, run in product(envs, words, of):
+        path = run.dir / "models" / EnvSpec.parse(env).name / f"{word}.safetensors"
+        if models.trained_on(env, word) != env or not path.exists():
+            continue
+        header = cast(models.Header, artifacts.read_header(path))
+        best = min(list(header["curves"].values())[-1]["validation"])
+        lines.append({
+            "env": env, "model": word, "seed": run.seed, "processor": header.get("processor", "CPU"),
+            "copies": header.get("copies", 1), "seconds": round(header["seconds"]), "validation": f"{best:.4g}",
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
@@ -49,10 +80,16 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.ZOO, metavar="MODEL", help="default six")
     parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
     parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
+    parser.add_argument("--table", action="store_true", help="write seeds.csv, and train nothing")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--device", default="", help="default TSM_DEVICE, else cpu")
     given = parser.parse_args()
     own = [runs.resolve("02_train", scale=given.scale, seed=seed, device=given.device) for seed in given.seeds]
+    if given.table:
+        found = table(own, given.envs, given.models)
+        found.to_csv(HERE / "seeds.csv", index=False, lineterminator="\n")
+        print(found.to_string(index=False))
+        return
     wanted = [(env, word) for env, word in product(given.envs, given.models) if models.trained_on(env, word) == env]
     began, spawn = time.perf_counter(), multiprocessing.get_context("spawn")
     with (
