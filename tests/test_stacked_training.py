@@ -9,11 +9,12 @@ import torch
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import symmetric
+from tsmlib.stacked_training import fit_stacked, stacked
 from tsmlib.study import zoo
 from tsmlib.study.data import random_data
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit
-from tsmlib.stacked_training import fit_stacked, stacked
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 ENVS = ("tsm/ReacherObstacle-v0", "tsm/PymunkPush-v1")
@@ -96,3 +97,20 @@ def test_a_loss_that_is_not_finite_stops_all_with_the_best_weights_so_far() -> N
     with pytest.raises(TrainingStopped, match="the loss of seed 8 is not finite at step 4 of 6"):
         fit_stacked(nets, "loss", train, given[0], options(1), seeds=SEEDS)
     assert all(weight.isfinite().all() for net in nets for weight in net.parameters())
+
+
+@pytest.mark.skipif(not native_bf16(), reason="this processor multiplies no matrices in bfloat16")
+@pytest.mark.parametrize(("word", "loss"), [("onestep", "multi_step_loss"), ("rtsm", "loss"), ("rtsm", "point_loss")])
+def test_products_are_in_bfloat16_where_those_of_a_training_alone_are(word: str, loss: str) -> None:
+    env, histories = ENVS[1], dict[bool, list[float]]()
+    given, held_out = [symmetric(data(env, seed)) for seed in SEEDS], data(env, 99)
+    for bf16 in (False, True):
+        nets = models(word, env, given)
+        o = options(nets[0].past_len, bf16=bf16)
+        found = fit_stacked(nets, loss, stacked(given, o.past_len), held_out, o, seeds=SEEDS)
+        assert found[0].bf16 == [bf16] * 2
+        histories[bf16] = found[0].train
+    alone = models(word, env, given)[0]
+    expected = fit(alone, getattr(alone, loss), given[0], held_out, o, seed=SEEDS[0]).train
+    torch.testing.assert_close(histories[True], expected, rtol=3e-3, atol=0.0)
+    assert histories[True] != histories[False]

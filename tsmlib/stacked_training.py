@@ -26,6 +26,7 @@ from tsmlib.sampling import GivenNoise, RecordedNoise
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fixed_windows, schedule
 from tsmlib.training.muon import Muon, matrices
+from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, windows
 
 AHEAD = 50  # updates whose windows and noise are drawn at a time
@@ -61,8 +62,8 @@ def fit_stacked(
     """Minimise a loss of several models of one configuration at once; leave in each the weights that were best for it.
 
     loss: name of a method of theirs. train: (S, N, L + T, .), see ``stacked``, L being ``options.past_len``. seeds: of
-    each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. On a GPU products are in TF32
-    where ``options.bf16`` has bfloat16 on CPUs. ValueError where there are not as many models, seeds and data.
+    each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. ValueError where there are not
+    as many models, seeds and data.
     TrainingStopped where a loss is not finite at a validation, with the best weights so far in the models. Nothing is
     stored on the way, and ``options.patience`` is not looked at.
     """
@@ -89,7 +90,7 @@ def fit_stacked(
                 history.seconds.append(time.perf_counter() - began)
                 history.train.append(before)
                 history.validation.append(after)
-                history.bf16.append(False)
+                history.bf16.append(stack.bf16)
             if bad := [seed for seed, value in zip(seeds, values, strict=True) if not all(map(math.isfinite, value))]:
                 stack.restore(models)
                 raise TrainingStopped(
@@ -127,7 +128,7 @@ class _Stack:
         self.module = _Loss(deepcopy(models[0]).to(self.device), loss)
         if isinstance(features := getattr(self.module.net, "features", None), Features):
             features.settle()
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = o.bf16
+        self.bf16 = o.bf16 and native_bf16(self.device)
         self.gradients = vmap(grad_and_value(self._loss))
         if compiled:
             self.gradients = torch.compile(self.gradients, fullgraph=True, dynamic=False)
@@ -246,7 +247,8 @@ class _Stack:
 
     def _loss(self, weights: dict[str, Tensor], buffers: dict[str, Tensor], of: Window, noise: list[Tensor]) -> Tensor:
         """Of one copy."""
-        return functional_call(self.module, {**weights, **buffers}, (of, GivenNoise(list(noise))))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+            return functional_call(self.module, {**weights, **buffers}, (of, GivenNoise(list(noise))))
 
     def _windows(self, episodes: Tensor, starts: Tensor) -> Window:
         """(S, B) twice -> windows (S, B, ., .)."""

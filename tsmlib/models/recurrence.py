@@ -139,32 +139,37 @@ class Recurrent:
     def _stepped(self, x: Tensor | None, memory: Memory, given: Tensor, codes: Tensor) -> tuple[Tensor, Memory]:
         """As ``Recurrence``, by one operation after the other; what does not depend on the step before, all at once."""
         h, c = memory
-        n, dz, known = h.shape[1], codes.shape[2], given.shape[2]
-        of_z, of_h, of_s, of_given = self.cell[len(self.cell) - known - n - self._seen(x) - dz :].split(
-            [dz, n, self._seen(x), known]
-        )
-        q_given, recurrent = given @ of_given, torch.cat([of_h, of_s])
-        if dz:
-            q_given = q_given + codes @ of_z
-        if self.hidden is not None and x is not None:
-            u_s, u_given, u_h = self.hidden.split([self._seen(x), known, n])
-            active_given, u_seen = given @ u_given, torch.cat([u_h, u_s])
-        states = []
-        for t, now in enumerate(q_given.unbind(0)):
-            s = h if x is None else torch.cat([h, self._features_of(x)], dim=1)
-            gates, new = torch.addmm(now, s, recurrent).split([3 * n, n], dim=1)
-            forget, write, read = gates.sigmoid().chunk(3, dim=1)
-            c = forget * c + write * new.tanh()
-            h = read * c.tanh()
-            if x is None:
-                continue
-            if self.hidden is None:
-                x = x + torch.addmm(self.out[-n - 1], h, self.out[-n:])
-            else:
-                active = torch.addmm(active_given[t], torch.cat([h, s[:, n:]], dim=1), u_seen)
-                x = x + torch.addmm(self.out[-1], nn.functional.silu(active), self.out[:-1])
-            states.append(x)
-        return torch.stack(states) if states else given[..., :0], (h, c)
+        kind = self._product_type(h)
+        with torch.autocast(h.device.type, enabled=False):
+            n, dz, known = h.shape[1], codes.shape[2], given.shape[2]
+            rows = self.cell[len(self.cell) - known - n - self._seen(x) - dz :].to(kind)
+            of_z, of_h, of_s, of_given = rows.split([dz, n, self._seen(x), known])
+
+            def product(a: Tensor, b: Tensor) -> Tensor:
+                return (a.to(kind) @ b).to(c.dtype)
+
+            q_given, recurrent = product(given, of_given), torch.cat([of_h, of_s])
+            if dz:
+                q_given = q_given + product(codes, of_z)
+            if self.hidden is not None and x is not None:
+                u_s, u_given, u_h = self.hidden.to(kind).split([self._seen(x), known, n])
+                active_given, u_seen = product(given, u_given), torch.cat([u_h, u_s])
+            states = []
+            for t, now in enumerate(q_given.unbind(0)):
+                s = h if x is None else torch.cat([h, self._features_of(x)], dim=1)
+                gates, new = (now + product(s, recurrent)).split([3 * n, n], dim=1)
+                forget, write, read = gates.sigmoid().chunk(3, dim=1)
+                c = forget * c + write * new.tanh()
+                h = read * c.tanh()
+                if x is None:
+                    continue
+                if self.hidden is None:
+                    x = x + torch.addmm(self.out[-n - 1], h, self.out[-n:])
+                else:
+                    active = active_given[t] + product(torch.cat([h, s[:, n:]], dim=1), u_seen)
+                    x = x + torch.addmm(self.out[-1], nn.functional.silu(active), self.out[:-1])
+                states.append(x)
+            return torch.stack(states) if states else given[..., :0], (h, c)
 
     def _seen(self, x: Tensor | None) -> int:
         """Number of features beside what is given."""

@@ -18,13 +18,13 @@ from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
 from tsmlib.models.tsm import TSM
+from tsmlib.stacked_training import fit_stacked, stacked
 from tsmlib.storage import artifacts, manifest
 from tsmlib.storage.files import Json, StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
 from tsmlib.training.fit import fit
-from tsmlib.stacked_training import fit_stacked, stacked
 from tsmlib.trajectory import Segment, Trajectories
 
 if TYPE_CHECKING:
