@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,10 +12,11 @@ import torch
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import symmetric
 from tsmlib.stacked_training import fit_stacked, stacked
-from tsmlib.study import zoo
+from tsmlib.study import models as study_models
+from tsmlib.study import runs, zoo
 from tsmlib.study.data import random_data
 from tsmlib.training.checkpoint import TrainingStopped
-from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
@@ -40,41 +43,48 @@ def models(word: str, env: str, given: list[Trajectories]) -> list[Any]:
     return [made.for_data(d, seed=s, **spec.arguments(EnvSpec.parse(env))) for d, s in zip(given, SEEDS, strict=True)]
 
 
-def both(word: str, loss: str, env: str, **changes: Any) -> tuple[list[Any], list[Any], list[TrainingHistory]]:
-    """Models that were trained alone, the same trained as one, and the records of the latter beside the former's."""
+def trained_as_one(
+    word: str, loss: str, env: str, device: str = "cpu", *, compiled: bool = False, **changes: Any
+) -> Any:
+    """Models trained as one, each of which is what the same became alone."""
     given, held_out = [symmetric(data(env, seed)) for seed in SEEDS], data(env, 99)
     alone, together = models(word, env, given), models(word, env, given)
     o = options(alone[0].past_len, **changes)
     histories = [
         fit(net, getattr(net, loss), d, held_out, o, seed=s) for net, d, s in zip(alone, given, SEEDS, strict=True)
     ]
-    found = fit_stacked(together, loss, stacked(given, o.past_len), held_out, o, seeds=SEEDS)
+    train = stacked(given, o.past_len, device)
+    found = fit_stacked(together, loss, train, held_out, o, seeds=SEEDS, device=device, compiled=compiled)
     for one, other in zip(histories, found, strict=True):
         assert one.step == other.step
         torch.testing.assert_close(other.train, one.train, rtol=3e-4, atol=1e-5)
         torch.testing.assert_close(other.validation, one.validation, rtol=3e-4, atol=1e-5)
-    return alone, together, found
+    for one, other in zip(alone, together, strict=True):
+        for name, weight in one.state_dict().items():
+            torch.testing.assert_close(other.state_dict()[name], weight, rtol=1e-3, atol=2e-5, msg=name)
+    return together
 
 
 @pytest.mark.parametrize("env", ENVS)
 @pytest.mark.parametrize(("word", "loss"), LOSSES)
 def test_each_of_several_copies_is_what_it_is_alone(word: str, loss: str, env: str) -> None:
-    alone, together, _ = both(word, loss, env)
-    for one, other in zip(alone, together, strict=True):
-        for name, weight in one.state_dict().items():
-            torch.testing.assert_close(other.state_dict()[name], weight, rtol=1e-3, atol=2e-5, msg=name)
+    trained_as_one(word, loss, env)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(("word", "loss"), LOSSES)
+def test_a_recorded_update_does_what_one_on_the_processor_does(word: str, loss: str, compiled: bool) -> None:
+    trained_as_one(word, loss, ENVS[1], "cuda", compiled=compiled)
 
 
 @pytest.mark.parametrize("changes", [dict(muon=0.0), dict(muon=0.0, weight_decay=0.1), dict(weight_decay=0.1)])
 def test_optimisers_are_those_of_a_training_alone(changes: dict[str, float]) -> None:
-    alone, together, _ = both("rtsm", "loss", ENVS[0], **changes)
-    for one, other in zip(alone, together, strict=True):
-        for name, weight in one.state_dict().items():
-            torch.testing.assert_close(other.state_dict()[name], weight, rtol=1e-3, atol=2e-5, msg=name)
+    trained_as_one("rtsm", "loss", ENVS[0], **changes)
 
 
 def test_copies_are_not_one_another() -> None:
-    _, (one, other), _ = both("onestep", "loss", ENVS[0])
+    one, other = trained_as_one("onestep", "loss", ENVS[0])
     assert not any(torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
 
 
@@ -84,8 +94,46 @@ def test_copies_of_other_sizes_and_other_counts_are_refused() -> None:
         stacked([data(env, 3), random_data(env, 5, seed=8, horizon=30)], 1)
     given = [data(env, seed) for seed in SEEDS]
     nets = models("onestep", env, given)
-    with pytest.raises(ValueError, match="found 2 models, 1 seeds and data of 2"):
+    with pytest.raises(ValueError, match="found 2 models, 1 seeds and data of 2 copies"):
         fit_stacked(nets, "loss", stacked(given, 1), given[0], options(1), seeds=(3,))
+
+
+def test_what_a_training_alone_refuses_or_treats_otherwise_is_refused() -> None:
+    env = ENVS[0]
+    given = [data(env, seed) for seed in SEEDS]
+    nets, train = models("onestep", env, given), stacked(given, 1)
+    with pytest.raises(ValueError, match="past_len is 2, but OneStep is given 1 steps of past"):
+        fit_stacked(nets, "loss", train, given[0], options(2), seeds=SEEDS)
+    with pytest.raises(TrajectoryError, match="episodes of 30 steps are too short for windows of 31 future steps"):
+        fit_stacked(nets, "loss", train, given[0], replace(options(1), future_len=31), seeds=SEEDS)
+    nets[1].features.step_std[0] = 0
+    with pytest.raises(ValueError, match="other state dimensions change"):
+        fit_stacked(nets, "loss", train, given[0], options(1), seeds=SEEDS)
+    nets[1].features.step_std.zero_()
+    with pytest.raises(ValueError, match="a OneStep has no statistics of its data"):
+        fit_stacked(nets, "loss", train, given[0], options(1), seeds=SEEDS)
+    next(nets[0].parameters()).requires_grad_(False)
+    with pytest.raises(ValueError, match=r"net\.0\.weight requires no gradient"):
+        fit_stacked(nets, "loss", train, given[0], options(1), seeds=SEEDS)
+    with pytest.raises(ValueError, match="draws its noise by other means"):
+        fit_stacked(models("ensemble", env, given), "loss", train, given[0], options(1), seeds=SEEDS)
+
+
+def test_seeds_are_trained_as_one_and_found_by_their_runs(tmp_path: Path) -> None:
+    env = "tsm/Reacher-v0"
+    own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
+    seeds = study_models.SeedsData.of(own, env)
+    for run, made in zip(own, study_models.train_as_one(seeds, "onestep"), strict=True):
+        found, header = study_models.load_or_train(run, env, "onestep")
+        assert (header["seed"], header["copies"], header["processor"]) == (run.seed, 2, "cpu")
+        kept, had = found.state_dict(), made.model.state_dict()
+        assert all(torch.equal(kept[name], had[name]) for name in kept)
+    with pytest.raises(ValueError, match="these data have 10 steps of past"):
+        seeds.with_past(11)
+    with pytest.raises(ValueError, match="found runs of smoke 3, smoke 3; expected different seeds"):
+        study_models.SeedsData.of([own[0]] * 2, env)
+    with pytest.raises(ValueError, match="prior of tsm/ReacherPush-v1 is trained on tsm/ReacherObstacle-v0"):
+        study_models.train_as_one(replace(seeds, env="tsm/ReacherPush-v1"), "prior")
 
 
 def test_a_loss_that_is_not_finite_stops_all_with_the_best_weights_so_far() -> None:

@@ -35,16 +35,17 @@ class NoNoise:
     first: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass
 class GivenNoise:
-    """Numbers that were drawn before, in the order in which they are asked for (``stacked_training``)."""
+    """Numbers that were drawn before, in the order in which they are asked for (``stacked_training``); each is given
+    once, and removed."""
 
     numbers: list[Tensor]
 
 
-@dataclass(frozen=True)
+@dataclass
 class RecordedNoise:
-    """Zeros, of which the shapes are kept: how much noise a call will draw."""
+    """Zeros in place of noise; keeps the shapes that were asked for."""
 
     shapes: list[torch.Size] = field(default_factory=list)
 
@@ -65,7 +66,10 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
     if isinstance(noise, NoNoise):
         return like.new_zeros(tuple(shape))
     if isinstance(noise, GivenNoise):
-        return noise.numbers.pop(0)
+        given = noise.numbers.pop(0)
+        if tuple(given.shape) != tuple(shape):
+            raise ValueError(f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn")
+        return given
     if isinstance(noise, RecordedNoise):
         noise.shapes.append(torch.Size(shape))
         return like.new_zeros(tuple(shape))

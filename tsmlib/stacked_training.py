@@ -1,8 +1,7 @@
 """Trainings of several copies of a model as one: weights with a leading dimension of copies, as of several seeds.
 
 Each copy has data, windows, noise, gradient norm and best weights of its own, and is to float tolerance what ``fit``
-makes of it alone. On a GPU an update of many copies takes about as long as that of one: there it is recorded once, as a
-CUDA graph, and replayed.
+makes of it alone. On a GPU an update is recorded once, as a CUDA graph, and replayed.
 
 Letters in shapes: S copies, B batch, N episodes, L steps of past, T steps of an episode, U updates.
 """
@@ -56,20 +55,23 @@ def fit_stacked(
     *,
     seeds: Sequence[int],
     device: str = "cpu",
-    compiled: bool = False,  # a third to a sixth of the kernels, after a minute or more
+    compiled: bool = False,  # fewer and larger kernels; compiling takes a minute or more
     progress: str = "",  # title of the progress bar; none without
 ) -> list[TrainingHistory]:
     """Minimise a loss of several models of one configuration at once; leave in each the weights that were best for it.
 
     loss: name of a method of theirs. train: (S, N, L + T, .), see ``stacked``, L being ``options.past_len``. seeds: of
-    each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. ValueError where there are not
-    as many models, seeds and data.
-    TrainingStopped where a loss is not finite at a validation, with the best weights so far in the models. Nothing is
-    stored on the way, and ``options.patience`` is not looked at.
+    each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. Seconds of the records are by
+    the clock, of all copies together. On a CPU it is slower than ``fit`` of one after the other.
+
+    ValueError where there are not as many models, seeds and data, for frozen weights, for features without statistics
+    or copies in whose data other dimensions change, for windows with another past than the models', and for a loss that
+    draws its noise by other means than ``tsmlib.sampling.standard_normal``. TrajectoryError for episodes that are too
+    short. TrainingStopped where a loss is not finite at a validation, with the best weights so far in all models.
+    Nothing is stored on the way, and ``options.patience`` is not looked at.
     """
-    if not len(models) == len(seeds) == len(train.states):
-        raise ValueError(f"found {len(models)} models, {len(seeds)} seeds and data of {len(train.states)}")
     o, began = options, time.perf_counter()
+    _require(models, train, o, seeds)
     histories = [TrainingHistory() for _ in models]
     stack = _Stack(models, loss, train, validation, o, seeds, device, compiled)
     update = stack.recorded() if stack.stream is not None else stack.update
@@ -94,11 +96,38 @@ def fit_stacked(
             if bad := [seed for seed, value in zip(seeds, values, strict=True) if not all(map(math.isfinite, value))]:
                 stack.restore(models)
                 raise TrainingStopped(
-                    f"the loss of seed {bad[0]} is not finite at step {end} of {o.steps}; the best weights are kept. "
-                    f"{TrainingHistory.remedy}, or take a smaller lr than {o.lr}"
+                    f"the loss of seed {bad[0]} is not finite at step {end} of {o.steps}; all copies stop, with their "
+                    f"best weights. {TrainingHistory.remedy}, or take a smaller lr than {o.lr}"
                 )
         stack.restore(models)
     return histories
+
+
+def _require(models: Sequence[nn.Module], train: Segment, o: TrainingOptions, seeds: Sequence[int]) -> None:
+    """Errors of ``fit_stacked`` that can be told beforehand."""
+    if not len(models) == len(seeds) == len(train.states):
+        raise ValueError(
+            f"found {len(models)} models, {len(seeds)} seeds and data of {len(train.states)} copies; expected as many "
+            "of each"
+        )
+    for model in models:
+        if (needed := getattr(model, "past_len", o.past_len)) != o.past_len:
+            raise ValueError(
+                f"past_len is {o.past_len}, but {type(model).__name__} is given {needed} steps of past; take "
+                "TrainingOptions(past_len=model.past_len, ...)"
+            )
+        if frozen := [name for name, weight in model.named_parameters() if not weight.requires_grad]:
+            raise ValueError(f"{frozen[0]} requires no gradient; train a model with frozen weights by fit")
+        if isinstance(features := getattr(model, "features", None), Features) and not features.fitted:
+            raise ValueError(f"a {type(model).__name__} has no statistics of its data; make it by for_data")
+    moving = {tuple(f.moving.tolist()) for model in models if isinstance(f := getattr(model, "features", 0), Features)}
+    if len(moving) > 1:
+        raise ValueError("in the data of some copies other state dimensions change than in others'; train them by fit")
+    if (steps := train.actions.shape[2] - o.past_len) < o.future_len:
+        raise TrajectoryError(
+            f"episodes of {steps} steps are too short for windows of {o.future_len} future steps; collect episodes of "
+            f"at least {o.future_len} steps"
+        )
 
 
 class _Loss(nn.Module):
@@ -263,8 +292,14 @@ class _Stack:
 def _shapes(model: nn.Module, loss: str, window: Window) -> list[torch.Size]:
     """Of the standard normal numbers that a loss draws on a window, in their order."""
     noise = RecordedNoise()
-    with torch.no_grad():
-        getattr(model, loss)(window, noise)
+    try:
+        with torch.no_grad():
+            getattr(model, loss)(window, noise)
+    except TypeError as error:
+        raise ValueError(
+            f"{type(model).__name__}.{loss} draws its noise by other means than tsmlib.sampling.standard_normal; train "
+            "such models by fit"
+        ) from error
     return noise.shapes
 
 

@@ -1,12 +1,13 @@
-"""Models of several training seeds, trained as one: for a GPU, on which all seeds take about as long as one of them.
+"""Models of several training seeds, trained as one: for a GPU.
 
     python benchmarks/settings/seeds.py --scale paper --seeds 3 4 5 6 7 8 9 --device cuda --compiled
 
 What is missing of the seeds' data is collected first, by as many processes as there are cores. Then each model is
 trained with all seeds at once (``tsmlib.stacked_training``), --together models side by side in processes of their own,
-in the order in which they are named; the prior is one of them. Files are those that ``python -m tsmlib run train``
-makes of each seed, in runs/paper/seed<k>/models, and say in their headers that they were trained as copies, and on
-what. --compiled is worth its minute or more where a training takes longer than that.
+in the order in which they are named; the prior is one of them. Models that are there are trained again and replaced:
+name the seeds that are missing. Files are those that ``python -m tsmlib run train`` makes of each seed, in
+runs/paper/seed<k>/models, and say in their headers that they were trained as copies, and on what. --compiled is worth
+its minute or more where a training takes longer than that.
 
     python benchmarks/settings/seeds.py --scale paper --seeds 0 1 2 3 4 5 6 7 8 9 --envs tsm/Reacher-v0 --table
 
@@ -30,7 +31,7 @@ import torch
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.storage import artifacts
-from tsmlib.study import models, parallel, runs, zoo
+from tsmlib.study import models, parallel, runs
 from tsmlib.study.data import dataset
 
 HERE = Path(__file__).parent
@@ -40,14 +41,14 @@ SPLITS = ("train", "validation")
 
 
 def collect(run: runs.Run, env: str) -> None:
-    """In a process of its own."""
+    """Training and validation data of a run, where they are missing."""
     torch.set_num_threads(1)
     for split in SPLITS:
         dataset(run, env, split)
 
 
 def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
-    """In a process of its own; what it says when it is done."""
+    """One model of all seeds, trained and stored; a line on it."""
     torch.set_num_threads(1)
     found = models.train_as_one(models.SeedsData.of(of, env), word, compiled=compiled)
     best = [min(list(made.header["curves"].values())[-1]["validation"]) for made in found]
@@ -66,8 +67,9 @@ def table(of: list[runs.Run], envs: Sequence[str], words: Sequence[str]) -> pd.D
             continue
         header = cast(models.Header, artifacts.read_header(path))
         best = min(list(header["curves"].values())[-1]["validation"])
+        made_on = header.get("processor", header.get("device", "cpu"))
         lines.append({
-            "env": env, "model": word, "seed": run.seed, "processor": header.get("processor", "CPU"),
+            "env": env, "model": word, "seed": run.seed, "processor": made_on,
             "copies": header.get("copies", 1), "seconds": round(header["seconds"]), "validation": f"{best:.4g}",
         })  # fmt: skip
     return pd.DataFrame(lines)
@@ -77,7 +79,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--envs", nargs="+", default=ENVS, help=f"default {' '.join(ENVS)}")
-    parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.ZOO, metavar="MODEL", help="default six")
+    parser.add_argument("--models", nargs="+", default=MODELS, choices=MODELS, metavar="MODEL", help=" ".join(MODELS))
     parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
     parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
     parser.add_argument("--table", action="store_true", help="write seeds.csv, and train nothing")

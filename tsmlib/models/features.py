@@ -67,10 +67,11 @@ class Features(nn.Module):
         return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
 
     def settle(self) -> None:
-        """Find out once which columns change, in place of each time: ``torch.func`` and CUDA graphs cannot ask."""
+        """Fix which columns change: within ``torch.func`` and CUDA graphs no value can be looked at. After another
+        ``fit`` call it again."""
         self._settled = tuple(  # type: ignore[assignment]  # of two
             index if isinstance(index := _columns(some.nonzero()[:, 0].tolist()), slice)
-            else torch.tensor(index, device=some.device)
+            else torch.tensor(index, dtype=torch.long, device=some.device)
             for some in (self.moving, self.scored)
         )  # fmt: skip
 

@@ -34,14 +34,13 @@ sigmoid_backward, tanh_backward = (
 )
 
 
-_by_operations = False  # no ContextVar, which torch.compile does not follow
+_by_operations = False  # a global and no ContextVar, which torch.compile does not follow
 
 
 @contextmanager
 def as_operations() -> Iterator[None]:
-    """Within, recurrences of this process are made of torch's own operations, over which ``torch.func`` maps.
-
-    Slower on a CPU.
+    """Within, recurrences run as torch's own operations in place of ``Recurrence``, whose backward pass
+    ``torch.func.vmap`` cannot map. For the whole process; slower on a CPU.
     """
     global _by_operations
     before, _by_operations = _by_operations, True
@@ -141,9 +140,9 @@ class Recurrent:
         h, c = memory
         kind = self._product_type(h)
         with torch.autocast(h.device.type, enabled=False):
-            n, dz, known = h.shape[1], codes.shape[2], given.shape[2]
-            rows = self.cell[len(self.cell) - known - n - self._seen(x) - dz :].to(kind)
-            of_z, of_h, of_s, of_given = rows.split([dz, n, self._seen(x), known])
+            n, dz, known, seen = h.shape[1], codes.shape[2], given.shape[2], 0 if x is None else self.features.dim
+            rows = self.cell[len(self.cell) - known - n - seen - dz :].to(kind)
+            of_z, of_h, of_s, of_given = rows.split([dz, n, seen, known])
 
             def product(a: Tensor, b: Tensor) -> Tensor:
                 return (a.to(kind) @ b).to(c.dtype)
@@ -152,11 +151,11 @@ class Recurrent:
             if dz:
                 q_given = q_given + product(codes, of_z)
             if self.hidden is not None and x is not None:
-                u_s, u_given, u_h = self.hidden.to(kind).split([self._seen(x), known, n])
+                u_s, u_given, u_h = self.hidden.to(kind).split([seen, known, n])
                 active_given, u_seen = product(given, u_given), torch.cat([u_h, u_s])
             states = []
             for t, now in enumerate(q_given.unbind(0)):
-                s = h if x is None else torch.cat([h, self._features_of(x)], dim=1)
+                s = h if x is None else torch.cat([h, _features(self.features, x)], dim=1)
                 gates, new = (now + product(s, recurrent)).split([3 * n, n], dim=1)
                 forget, write, read = gates.sigmoid().chunk(3, dim=1)
                 c = forget * c + write * new.tanh()
@@ -170,15 +169,6 @@ class Recurrent:
                     x = x + torch.addmm(self.out[-1], nn.functional.silu(active), self.out[:-1])
                 states.append(x)
             return torch.stack(states) if states else given[..., :0], (h, c)
-
-    def _seen(self, x: Tensor | None) -> int:
-        """Number of features beside what is given."""
-        return 0 if x is None else self.features.dim
-
-    def _features_of(self, x: Tensor) -> Tensor:
-        """Features of x (B, dx), whose angles come first."""
-        angle, other = x.split([len(self.features.angles), len(self.features.others)], dim=1)
-        return (torch.cat([angle.cos(), angle.sin(), other], dim=1) - self.features.mean) / self.features.std
 
 
 class Recurrence(torch.autograd.Function):
@@ -322,12 +312,18 @@ def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
     return [part.unbind(0) for part in buffer.split([left if size < 0 else size for size in sizes], dim=-1)]
 
 
+def _features(features: Features, x: Tensor) -> Tensor:
+    """Features (B, F) of x (B, dx), whose angles come first."""
+    angle, other = x.split([len(features.angles), len(features.others)], dim=1)
+    return (torch.cat([angle.cos(), angle.sin(), other], dim=1) - features.mean) / features.std
+
+
 def _see(features: Features, x: Tensor, s: Tensor) -> None:
     """Write the features of x (B, dx), whose angles come first, into s (B, F)."""
     angles, others = len(features.angles), len(features.others)
     angle, other = x.split([angles, others], 1)
     if s.dtype != x.dtype:
-        s.copy_(torch.cat([angle.cos(), angle.sin(), other], 1).sub_(features.mean).div_(features.std))
+        s.copy_(_features(features, x))
         return
     cos, sin, rest = s.split([angles, angles, others], 1)
     torch.cos(angle, out=cos)

@@ -149,6 +149,8 @@ def described(trained: Mapping[tuple[str, str], Trained]) -> pd.DataFrame:
         parameters = sum(weights.numel() for weights in cast(torch.nn.Module, net).parameters())
         updates = sum(curve["step"][-1] for curve in header["curves"].values())
         seconds = f"{header['seconds']:.0f}" if "schedule" in header else ""
+        if "copies" in header:
+            seconds += f" ({header['copies']} as one, by the clock, {header['processor']})"
         counts = {"parameters": f"{parameters:,}", "updates": f"{updates:,}"}
         lines.append({"env": env, "model": model, **counts, "CPU seconds": seconds, "scale": header["scale"]})
     return pd.DataFrame(lines)
@@ -172,12 +174,11 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     data, held_out = training_data(run, env, model)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
     stages, curves, checkpoints = schedule(run, env, model), {}, []
-    fewer = {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
     for key, stage in zip(zoo.keys(stages), stages, strict=True):
         checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
         curve = fit(
             cast(torch.nn.Module, net), getattr(net, stage.loss), data, held_out,
-            stage.options(net.past_len, **fewer), seed=run.seed,
+            stage.options(net.past_len, **_fewer(run)), seed=run.seed,
             device=run.device, checkpoint=checkpoints[-1], progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
@@ -187,8 +188,13 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     return Trained(net, cast(Header, artifacts.read_header(path)))
 
 
+def _fewer(run: Run) -> dict[str, float | tuple[float, float]]:
+    """Options of ``fit`` that are smaller at scale smoke."""
+    return {"batch_size": 32, "validate_every": 10} if run.scale == "smoke" else {}
+
+
 def _header(
-    run: Run, env: str, model: str, curves: Mapping[str, Mapping[str, Json]], path: Path, *, copies: int = 1
+    run: Run, env: str, model: str, curves: Mapping[str, Mapping[str, Json]], path: Path, *, copies: int = 0
 ) -> dict[str, Json]:
     """Of the file of a trained model."""
     ends = [cast(TrainedCurve, curve)["seconds"][-1] for curve in curves.values()]
@@ -199,9 +205,9 @@ def _header(
         "torch": torch.__version__, "threads": torch.get_num_threads(), "device": run.device,
         "finished": time.strftime("%Y-%m-%d"), "seconds": sum(ends), "inputs": dict(_inputs(run, env, path)),
     }  # fmt: skip
-    if copies > 1:
+    if copies:
         header["copies"] = copies
-        header["processor"] = torch.cuda.get_device_name(run.device) if run.device != "cpu" else "cpu"
+        header["processor"] = "cpu" if run.device == "cpu" else torch.cuda.get_device_name(run.device)
     return header
 
 
@@ -222,7 +228,11 @@ class SeedsData:
 
     @classmethod
     def of(cls, runs: Sequence[Run], env: str, *, past_len: int = 10) -> SeedsData:
-        """past_len: the longest past of the models that are trained on it."""
+        """past_len: the longest past of the models that are trained on it. ValueError but for runs of several seeds at
+        one scale."""
+        if len({run.seed for run in runs}) < len(runs) or len({run.scale for run in runs}) != 1:
+            found = ", ".join(f"{run.scale} {run.seed}" for run in runs)
+            raise ValueError(f"found runs of {found or 'no seed'}; expected different seeds at one scale")
         parts = [training_data(run, env, "tsm") for run in runs]
         data = [part for part, _ in parts]
         return cls(tuple(runs), env, data, parts[0][1], past_len, stacked(data, past_len, runs[0].device))
@@ -237,20 +247,20 @@ class SeedsData:
 def train_as_one(seeds: SeedsData, model: str, *, compiled: bool = False) -> list[Trained]:
     """Train a model with several seeds as one (``fit_stacked``), and store each where its run finds it.
 
-    For a GPU, on which all seeds take about as long as one; on a CPU it is slower than one after the other. compiled:
-    of ``fit_stacked``. Nothing is kept of a training that is stopped.
+    For a GPU; on a CPU it is slower than one after the other. compiled: of ``fit_stacked``. Nothing is kept of a
+    training that is stopped. ValueError for a model that is trained on the data of another environment.
     """
     runs, env = seeds.runs, seeds.env
-    if trained_on(env, model) != env or _symmetries(env, model) != _symmetries(env, "tsm"):
-        raise ValueError(f"{model} is trained on {trained_on(env, model)}, without symmetric copies; found {env}")
+    if (other := trained_on(env, model)) != env:
+        raise ValueError(f"{model} of {env} is trained on {other}; take SeedsData.of(runs, {other!r})")
     stages, curves = schedule(runs[0], env, model), [dict[str, dict[str, Json]]() for _ in runs]
     nets = [initialise(run, model, data) for run, data in zip(runs, seeds.data, strict=True)]
     past_len, title = nets[0].past_len, f"{EnvSpec.parse(env).name} {model}"
     for key, stage in zip(zoo.keys(stages), stages, strict=True):
         found = fit_stacked(
             [cast(torch.nn.Module, net) for net in nets], stage.loss, seeds.with_past(past_len), seeds.held_out,
-            stage.options(past_len), seeds=[run.seed for run in runs], device=runs[0].device, compiled=compiled,
-            progress=f"{title}: {key}",
+            stage.options(past_len, **_fewer(runs[0])), seeds=[run.seed for run in runs], device=runs[0].device,
+            compiled=compiled, progress=f"{title}: {key}",
         )  # fmt: skip
         for own, curve in zip(curves, found, strict=True):
             own[key] = asdict(curve)

@@ -53,7 +53,9 @@ def orthogonalised(matrix: Tensor, iterations: int = 5) -> Tensor:
 class Muon(torch.optim.Optimizer):
     """Muon for weights (out, in), as of ``nn.Linear``, and stacks (M, in, out), as of ``BatchedLinear``.
 
-    copies: a leading dimension before these. lr may be a tensor, which a CUDA graph reads anew each time.
+    copies: whether weights have a leading dimension of copies, (S, out, in) and (S, M, in, out), each of which is
+    orthogonalised alone; a flag, since (S, out, in) looks like a stack. lr: a number, or a tensor, which a CUDA graph
+    reads at each replay.
 
     M <- momentum M + (1 - momentum) G
     W <- (1 - lr weight_decay) W - lr sqrt(max(1, out / in)) orthogonalised(momentum M + (1 - momentum) G)
@@ -72,18 +74,21 @@ class Muon(torch.optim.Optimizer):
         for group in self.param_groups:
             given = ((weight, weight.grad) for weight in group["params"])
             directions = [(w, self._direction(w, gradient, group)) for w, gradient in given if gradient is not None]
-            if self.copies:
-                directions = [pair for same in _of_one_shape(directions) for pair in _together(same)]
-            for weight, direction in directions:
-                update = direction if self.copies else orthogonalised(direction)
-                outputs, inputs = weight.shape[-2:] if weight.ndim == 2 + self.copies else weight.mT.shape[-2:]
-                scale = max(1.0, outputs / inputs) ** 0.5
-                if group["weight_decay"]:
-                    weight.mul_(1 - group["lr"] * group["weight_decay"])
-                if isinstance(group["lr"], Tensor):
-                    weight.sub_(update * (group["lr"] * scale))
-                else:
-                    weight.add_(update, alpha=-group["lr"] * scale)
+            for same in _of_one_shape(directions) if self.copies else [[pair] for pair in directions]:
+                found = [direction for _, direction in same]
+                updates = orthogonalised(torch.stack(found)) if self.copies else [orthogonalised(found[0])]
+                for (weight, _), update in zip(same, updates, strict=True):
+                    self._move(weight, update, group)
+
+    def _move(self, weight: Tensor, update: Tensor, group: dict[str, Any]) -> None:
+        outputs, inputs = weight.shape[-2:] if weight.ndim == 2 + self.copies else weight.mT.shape[-2:]
+        scale = max(1.0, outputs / inputs) ** 0.5
+        if group["weight_decay"]:
+            weight.mul_(1 - group["lr"] * group["weight_decay"])
+        if isinstance(group["lr"], Tensor):
+            weight.sub_(update * (group["lr"] * scale))
+        else:
+            weight.add_(update, alpha=-group["lr"] * scale)
 
     def _direction(self, weight: Tensor, gradient: Tensor, group: dict[str, Any]) -> Tensor:
         """The momentum, moved on, and the gradient: what is to be orthogonalised."""
@@ -97,9 +102,3 @@ class Muon(torch.optim.Optimizer):
 def _of_one_shape(pairs: list[tuple[Tensor, Tensor]]) -> list[list[tuple[Tensor, Tensor]]]:
     shapes = dict.fromkeys(weight.shape for weight, _ in pairs)
     return [[pair for pair in pairs if pair[0].shape == shape] for shape in shapes]
-
-
-def _together(same: list[tuple[Tensor, Tensor]]) -> list[tuple[Tensor, Tensor]]:
-    """Weights and their orthogonalised directions, which are found as one stack."""
-    found = orthogonalised(torch.stack([direction for _, direction in same]))
-    return [(weight, update) for (weight, _), update in zip(same, found, strict=True)]
