@@ -3,7 +3,7 @@
 Each copy has data, windows, noise, gradient norm and best weights of its own, and is to float tolerance what ``fit``
 makes of it alone. On a GPU an update is recorded once, as a CUDA graph, and replayed.
 
-Letters in shapes: S copies, B batch, N episodes, L steps of past, T steps of an episode, U updates.
+Letters in shapes: S copies, B batch, N episodes, L steps of past, T steps of an episode.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from tsmlib.models.features import Features
 from tsmlib.models.recurrence import as_operations
 from tsmlib.sampling import GivenNoise, RecordedNoise
 from tsmlib.training.checkpoint import TrainingStopped
-from tsmlib.training.fit import TrainingHistory, TrainingOptions, fixed_windows, schedule
-from tsmlib.training.muon import Muon, matrices
+from tsmlib.training.fit import TrainingHistory, TrainingOptions, fixed_windows, optimizers, schedule
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Segment, Trajectories, TrajectoryError, Window, windows
 
@@ -175,26 +174,11 @@ class _Stack:
         self.rates = torch.zeros(AHEAD, device=self.device)
         self.at, self.total = torch.zeros(1, dtype=torch.long, device=self.device), self.rates.new_zeros(self.copies)
         self.lr, self.muon = self.rates.new_zeros(()), self.rates.new_zeros(())
-        self.optimizers = list(self._optimizers(models[0]))
+        own = {name.removeprefix("net."): weight for name, weight in self.weights.items()}
+        made = optimizers(models[0], o, weights=own, lr=self.lr, muon=self.muon, capturable=self.stream is not None)
+        self.optimizers = list(made.values())
         self.best = {name: weight.clone() for name, weight in self.weights.items()}
         self.best_loss = torch.full_like(self.total, math.inf)
-
-    def _optimizers(self, model: nn.Module) -> list[torch.optim.Optimizer]:
-        """As ``fit`` has them, of stacks of weights."""
-        o, inside = self.options, matrices(model) if self.options.muon or self.options.weight_decay else []
-        ids = {id(weight) for weight in inside}
-        held = [name for name, weight in model.named_parameters() if id(weight) in ids]
-        of = {name: self.weights[f"net.{name}"] for name, _ in model.named_parameters()}
-        groups = [{"params": [w for name, w in of.items() if name not in held], "weight_decay": 0.0}]
-        if not o.muon:
-            groups.append({"params": [of[name] for name in held], "weight_decay": o.weight_decay})
-        groups = [group for group in groups if group["params"]]
-        made: list[torch.optim.Optimizer] = []
-        if groups:
-            made.append(torch.optim.AdamW(groups, lr=self.lr, fused=True, capturable=self.stream is not None))
-        if o.muon and held:
-            made.append(Muon([of[name] for name in held], self.muon, weight_decay=o.weight_decay, copies=True))
-        return made
 
     def draw(self, steps: range) -> None:
         """Fill the tables: the same windows and noise for (seed, step) as ``fit`` draws."""

@@ -3,7 +3,7 @@
 import ctypes
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -167,19 +167,29 @@ def keep_freed_memory() -> None:
         mallopt(trim_threshold, 2**31 - 1)
 
 
-def optimizers(model: nn.Module, o: TrainingOptions) -> dict[str, torch.optim.Optimizer]:
-    """Adam, and Muon where it has a learning rate and the model a matrix."""
-    inside = matrices(model) if o.muon or o.weight_decay else []
-    known = {id(weight) for weight in inside}
-    others = [weight for weight in model.parameters() if id(weight) not in known]
+def optimizers(
+    model: nn.Module, o: TrainingOptions, *, weights: Mapping[str, Tensor] | None = None,
+    lr: float | Tensor | None = None, muon: float | Tensor | None = None, capturable: bool = False,
+) -> dict[str, torch.optim.Optimizer]:  # fmt: skip
+    """Adam, and Muon where it has a learning rate and the model a matrix.
+
+    weights: in place of the model's, by name, with a leading dimension of copies. lr, muon: rates in place of those of
+    the options, as tensors for a CUDA graph, which ``capturable`` is for.
+    """
+    named = dict(model.named_parameters())
+    of: Mapping[str, Tensor] = named if weights is None else weights
+    known = {id(weight) for weight in (matrices(model) if o.muon or o.weight_decay else [])}
+    inside = [of[name] for name, weight in named.items() if id(weight) in known]
+    others = [of[name] for name, weight in named.items() if id(weight) not in known]
     held = [{"params": others, "weight_decay": 0.0}]
     if not o.muon:
         held.append({"params": inside, "weight_decay": o.weight_decay})
     made: dict[str, torch.optim.Optimizer] = {}
     if held := [group for group in held if group["params"]]:
-        made["adam"] = torch.optim.AdamW(held, lr=o.lr, fused=True)
+        made["adam"] = torch.optim.AdamW(held, lr=o.lr if lr is None else lr, fused=True, capturable=capturable)
     if o.muon and inside:
-        made["muon"] = Muon(inside, lr=o.muon, weight_decay=o.weight_decay)
+        rate, copies = o.muon if muon is None else muon, weights is not None
+        made["muon"] = Muon(inside, lr=rate, weight_decay=o.weight_decay, copies=copies)
     return made
 
 
