@@ -23,7 +23,8 @@ from tsmlib.trajectory import Trajectories, TrajectoryError
 ENVS = ("tsm/ReacherObstacle-v0", "tsm/PymunkPush-v1")
 LOSSES = [
     ("tsm", "teacher_forced_loss"), ("tsm", "loss"), ("tsm", "energy_loss"), ("rtsm", "point_loss"), ("rtsm", "loss"),
-    ("onestep", "loss"), ("onestep", "multi_step_loss"), ("lstm", "loss"), ("prior", "loss"),
+    ("onestep", "loss"), ("onestep", "multi_step_loss"), ("lstm", "loss"), ("prior", "loss"), ("ensemble", "loss"),
+    ("ensemble+mse", "loss"),
 ]  # fmt: skip
 SEEDS = (3, 8)
 
@@ -115,8 +116,11 @@ def test_what_a_training_alone_refuses_or_treats_otherwise_is_refused() -> None:
     next(nets[0].parameters()).requires_grad_(False)
     with pytest.raises(ValueError, match=r"net\.0\.weight requires no gradient"):
         fit_stacked(nets, "loss", train, given[0], options(1), seeds=SEEDS)
+    others = models("onestep", env, given)
+    for net in others:
+        net.loss = lambda window, generator: torch.rand(2, generator=generator).sum()
     with pytest.raises(ValueError, match="draws its noise by other means"):
-        fit_stacked(models("ensemble", env, given), "loss", train, given[0], options(1), seeds=SEEDS)
+        fit_stacked(others, "loss", train, given[0], options(1), seeds=SEEDS)
 
 
 def test_seeds_are_trained_as_one_and_found_by_their_runs(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
-"""Sources of standard normal noise: one generator, common random numbers, separate generators, none."""
+"""Sources of random numbers: one generator, common random numbers, separate generators, numbers given, none."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,12 +43,32 @@ class GivenNoise:
 
     numbers: list[Tensor]
 
+    def next(self, shape: Sequence[int]) -> Tensor:
+        """ValueError for another shape than that which was drawn."""
+        given = self.numbers.pop(0)
+        if tuple(given.shape) != tuple(shape):
+            raise ValueError(f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn")
+        return given
+
+
+class Draw(NamedTuple):
+    """Numbers that are asked for: standard normal ones, or whole ones from 0 to ``below`` - 1."""
+
+    shape: torch.Size
+    below: int = 0
+
+    def made(self, generator: torch.Generator) -> Tensor:
+        """The numbers, on the processor."""
+        if self.below:
+            return torch.randint(self.below, self.shape, generator=generator)
+        return torch.randn(self.shape, generator=generator)
+
 
 @dataclass
 class RecordedNoise:
-    """Zeros in place of noise; keeps the shapes that were asked for."""
+    """Zeros in place of noise; keeps what was asked for."""
 
-    shapes: list[torch.Size] = field(default_factory=list)
+    draws: list[Draw] = field(default_factory=list)
 
 
 Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
@@ -66,12 +87,9 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
     if isinstance(noise, NoNoise):
         return like.new_zeros(tuple(shape))
     if isinstance(noise, GivenNoise):
-        given = noise.numbers.pop(0)
-        if tuple(given.shape) != tuple(shape):
-            raise ValueError(f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn")
-        return given
+        return noise.next(shape)
     if isinstance(noise, RecordedNoise):
-        noise.shapes.append(torch.Size(shape))
+        noise.draws.append(Draw(torch.Size(shape)))
         return like.new_zeros(tuple(shape))
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])
@@ -80,6 +98,19 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
     return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(like.device)
+
+
+def random_indices(
+    below: int, shape: Sequence[int], noise: torch.Generator | GivenNoise | RecordedNoise, device: torch.device
+) -> Tensor:
+    """Whole numbers from 0 to ``below`` - 1, all equally likely: the same on any device."""
+    if isinstance(noise, GivenNoise):
+        return noise.next(shape)
+    draw = Draw(torch.Size(shape), below)
+    if isinstance(noise, RecordedNoise):
+        noise.draws.append(draw)
+        return torch.zeros(draw.shape, dtype=torch.long, device=device)
+    return draw.made(noise).to(device)
 
 
 def by_generator(

@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 
 from tsmlib.models.features import Features
 from tsmlib.models.recurrence import as_operations
-from tsmlib.sampling import GivenNoise, RecordedNoise
+from tsmlib.sampling import Draw, GivenNoise, RecordedNoise
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import TrainingHistory, TrainingOptions, fixed_windows, optimizers, schedule
 from tsmlib.training.precision import native_bf16
@@ -65,7 +65,7 @@ def fit_stacked(
 
     ValueError where there are not as many models, seeds and data, for frozen weights, for features without statistics
     or copies in whose data other dimensions change, for windows with another past than the models', and for a loss that
-    draws its noise by other means than ``tsmlib.sampling.standard_normal``. TrajectoryError for episodes that are too
+    draws its noise by other means than ``tsmlib.sampling``. TrajectoryError for episodes that are too
     short. TrainingStopped where a loss is not finite at a validation, with the best weights so far in all models.
     Nothing is stored on the way, and ``options.patience`` is not looked at.
     """
@@ -162,15 +162,18 @@ class _Stack:
             self.gradients = torch.compile(self.gradients, fullgraph=True, dynamic=False)
         self.train = Segment(*(part.to(self.device) for part in train))
         held_out = fixed_windows(validation, o.past_len, o.future_len)
-        self.noise, fixed = _shapes(models[0], loss, _sized(held_out, o.batch_size)), _shapes(models[0], loss, held_out)
+        self.asked, fixed = (_draws(models[0], loss, of) for of in (_sized(held_out, o.batch_size), held_out))
         self.held_out = Window(*(segment.to(self.device) for segment in held_out))
-        drawn = [_normal(torch.Generator().manual_seed(seed), fixed) for seed in seeds]
+        drawn = [_made(fixed, torch.Generator().manual_seed(seed)) for seed in seeds]
         self.held_out_noise = [torch.stack(parts).to(self.device) for parts in zip(*drawn, strict=True)]
         table = AHEAD, self.copies
         self.episodes, self.starts = (
             torch.zeros(*table, o.batch_size, dtype=torch.long, device=self.device) for _ in range(2)
         )
-        self.normal = [torch.zeros(*table, *shape, device=self.device) for shape in self.noise]
+        self.drawn = [
+            torch.zeros(*table, *draw.shape, dtype=torch.long if draw.below else None, device=self.device)
+            for draw in self.asked
+        ]
         self.rates = torch.zeros(AHEAD, device=self.device)
         self.at, self.total = torch.zeros(1, dtype=torch.long, device=self.device), self.rates.new_zeros(self.copies)
         self.lr, self.muon = self.rates.new_zeros(()), self.rates.new_zeros(())
@@ -190,8 +193,8 @@ class _Stack:
                 generator.manual_seed(seed * 1_000_003 + step)
                 episodes = torch.randint(n, (o.batch_size,), generator=generator)
                 starts = torch.randint(last + 1, (o.batch_size,), generator=generator)
-                rows.append([episodes, starts, *_normal(generator, self.noise)])
-        for table, parts in zip([self.episodes, self.starts, *self.normal], zip(*rows, strict=True), strict=True):
+                rows.append([episodes, starts, *_made(self.asked, generator)])
+        for table, parts in zip([self.episodes, self.starts, *self.drawn], zip(*rows, strict=True), strict=True):
             _upload(torch.stack(parts).unflatten(0, (len(steps), -1)), table)
         rates = [schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span) for step in steps]
         _upload(torch.tensor(rates), self.rates)
@@ -200,7 +203,7 @@ class _Stack:
     def update(self) -> None:
         """One step of the optimisers of all copies, by the next line of the tables."""
         o, taken = self.options, [table.index_select(0, self.at)[0] for table in (self.episodes, self.starts)]
-        noise = [table.index_select(0, self.at)[0] for table in self.normal]
+        noise = [table.index_select(0, self.at)[0] for table in self.drawn]
         self.lr.copy_(self.rates.index_select(0, self.at)[0])
         torch.mul(self.lr, o.muon / o.lr, out=self.muon)
         with as_operations():
@@ -273,18 +276,18 @@ class _Stack:
         return Window(*(Segment(*(part.unflatten(0, (self.copies, -1)) for part in segment)) for segment in cut))
 
 
-def _shapes(model: nn.Module, loss: str, window: Window) -> list[torch.Size]:
-    """Of the standard normal numbers that a loss draws on a window, in their order."""
+def _draws(model: nn.Module, loss: str, window: Window) -> list[Draw]:
+    """What a loss draws on a window, in its order."""
     noise = RecordedNoise()
     try:
         with torch.no_grad():
             getattr(model, loss)(window, noise)
     except TypeError as error:
         raise ValueError(
-            f"{type(model).__name__}.{loss} draws its noise by other means than tsmlib.sampling.standard_normal; train "
+            f"{type(model).__name__}.{loss} draws its noise by other means than those of tsmlib.sampling; train "
             "such models by fit"
         ) from error
-    return noise.shapes
+    return noise.draws
 
 
 def _sized(window: Window, rows: int) -> Window:
@@ -293,8 +296,8 @@ def _sized(window: Window, rows: int) -> Window:
     return Window(*(Segment(*(part[index] for part in segment)) for segment in window))
 
 
-def _normal(generator: torch.Generator, shapes: Sequence[torch.Size]) -> list[Tensor]:
-    return [torch.randn(shape, generator=generator) for shape in shapes]
+def _made(draws: Sequence[Draw], generator: torch.Generator) -> list[Tensor]:
+    return [draw.made(generator) for draw in draws]
 
 
 def _upload(rows: Tensor, table: Tensor) -> None:

@@ -31,7 +31,7 @@ import torch
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.storage import artifacts
-from tsmlib.study import models, parallel, runs
+from tsmlib.study import models, parallel, runs, zoo
 from tsmlib.study.data import dataset
 
 HERE = Path(__file__).parent
@@ -79,7 +79,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
     parser.add_argument("--envs", nargs="+", default=ENVS, help=f"default {' '.join(ENVS)}")
-    parser.add_argument("--models", nargs="+", default=MODELS, choices=MODELS, metavar="MODEL", help=" ".join(MODELS))
+    parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.words(), metavar="MODEL",
+                        help=f"some of {' '.join(zoo.words())}; default {' '.join(MODELS)}")  # fmt: skip
     parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
     parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
     parser.add_argument("--table", action="store_true", help="write seeds.csv, and train nothing")

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from tsmlib.models.base import EnsembleModel, Step
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Featured, Features
-from tsmlib.sampling import Noise, draw_members, standard_normal
+from tsmlib.sampling import Noise, draw_members, random_indices, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
@@ -117,16 +117,15 @@ class Ensemble(Featured, Configured, EnsembleModel):
 
         The tuples of the batch are dealt out to the members at random.
         """
-        future, scale = window.future, self.features.step_std
+        future = window.future
         tuples = [part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)]
         share = -(-len(tuples[0]) // self.members)
-        index = torch.randint(len(tuples[0]), (self.members, share), generator=generator)
+        index = random_indices(len(tuples[0]), (self.members, share), generator, tuples[0].device)
         x, u, after = (part[index] for part in tuples)
         mean, log_variance = self.increments(x, u)
-        moving = self.features.moving
-        error = ((after - x)[..., moving] / scale[moving] - mean[..., moving]).square()
+        error = (self.features.increments(after, x) - self.features.moving_part(mean)).square()
         if log_variance is None:
             return error.sum(-1).mean()
-        log_variance = log_variance[..., moving]
+        log_variance = self.features.moving_part(log_variance)
         likelihood = 0.5 * (error * (-log_variance).exp() + log_variance).sum(-1).mean()
-        return likelihood + 0.01 * (self.log_variance_max - self.log_variance_min)[moving].sum()
+        return likelihood + 0.01 * self.features.moving_part(self.log_variance_max - self.log_variance_min).sum()

@@ -89,12 +89,14 @@ class Features(nn.Module):
 
     def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
+        return self.moving_part(predicted - true) / self.moving_part(self.step_std)
+
+    def moving_part(self, values: Tensor) -> Tensor:
+        """(..., dx) -> those of the dimensions that change."""
         if self._settled:
-            moving = self._settled[0]
-            return (predicted - true)[..., moving] / self.step_std[moving]
-        if self.moving.all():
-            return (predicted - true) / self.step_std
-        return (predicted - true)[..., self.moving] / self.step_std[self.moving]
+            return values[..., self._settled[0]]
+        moving = self.moving
+        return values if moving.all() else values[..., moving]
 
     def _raw(self, states: Tensor) -> Tensor:
         angles = states[..., _columns(self.angles)]
