@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from reliability import cluster
 
 from tsmlib.__main__ import main
-from tsmlib.storage import files, manifest
+from tsmlib.storage import artifacts, files, manifest
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import parameters, runs, workflow, zoo
 from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
@@ -32,8 +33,10 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def table(scale: str = "smoke", seeds: tuple[int, ...] = (0, 2), **given: str) -> dict[str, workflow.Step]:
-    prepared = workflow.prepare(NOTEBOOKS, seeds, scale=scale, device="", given=given)
+def table(
+    scale: str = "smoke", seeds: tuple[int, ...] = (0, 2), *, device: str = "", **given: str
+) -> dict[str, workflow.Step]:
+    prepared = workflow.prepare(NOTEBOOKS, seeds, scale=scale, device=device, given=given)
     return workflow.steps(prepared, given)
 
 
@@ -69,9 +72,18 @@ def test_seeds_of_held_out_episodes_and_targets_are_refused(
 # Steps ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that says that it has one."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+
+
+@pytest.mark.usefixtures("gpu")
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("scale", ["smoke", "laptop", "paper"])
-def test_a_step_comes_after_those_that_it_needs(scale: str) -> None:
-    done, steps = set[str](), table(scale)
+def test_a_step_comes_after_those_that_it_needs(scale: str, device: str) -> None:
+    done, steps = set[str](), table(scale, device=device)
     for name, step in steps.items():
         assert set(step.needs) <= done, name
         done.add(name)
@@ -110,6 +122,19 @@ def test_what_ships_is_there_and_no_step_that_is_to_be_done_again(place: Path) -
     assert {f"seed{seed}/plans/ReacherPush-oracle-latent-cem" for seed in (0, 2)} <= there
     assert not {name for name in there if "seed2/models" in name or "data/" in name or name.endswith("05_control")}
     assert not any(step.ships for scale in ("smoke", "paper") for step in table(scale).values())
+
+
+@pytest.mark.usefixtures("gpu")
+def test_on_a_gpu_a_model_that_several_seeds_need_is_one_step_of_all_of_them() -> None:
+    steps = table("paper", device="cuda")
+    step = steps["seeds/models/Reacher/lstm"]
+    assert step.makes == [f"seed{seed}/models/Reacher/lstm.safetensors" for seed in (0, 2)]
+    assert set(step.needs) == {f"seed{seed}/data/Reacher/{part}" for seed in (0, 2) for part in ("train", "validation")}
+    assert "seeds/models/Reacher/lstm" in steps["seed2/scores/Reacher/lstm"].needs
+    assert "seed0/models/Reacher-noise0.1/lstm" in steps  # which seed 0 alone needs
+    assert not any(name.startswith("seeds/") for name in table("paper", (2,), device="cuda"))
+    assert not any(name.startswith("seeds/") for name in table("paper"))
+    assert "seed2/models/Reacher/lstm" in table("laptop", device="cuda")  # of seed 0 it ships
 
 
 # Refusals ------------------------------------------------------------------------------------------------------------
@@ -172,13 +197,30 @@ def test_a_step_of_another_version_than_its_workflow_is_refused(place: Path) -> 
     manifest.write_json(place / "runs" / "smoke" / "workflow" / "code.json", {"codes": ["0.1.0+aaa"]})
     (execution, *_) = workflow.prepare(NOTEBOOKS[1:2], [0], scale="smoke", device="", given={})
     with pytest.raises(RunError, match=r"this step runs tsmlib .*, its workflow 0\.1\.0\+aaa"):
-        workflow.step(execution, "data/Reacher/test")
+        workflow.step([execution], "data/Reacher/test")
 
 
 def test_a_step_makes_a_job_by_its_name_and_no_other(place: Path) -> None:
     assert main(["step", "collect", "--job", "data/Reacher/test", "--scale", "smoke", "--seed", "2"]) == 0
     assert (place / "runs" / "smoke" / "seed2" / "data" / "Reacher" / "test.safetensors").exists()
     assert main(["step", "collect", "--job", "models/Reacher/tsm", "--scale", "smoke"]) == 2
+
+
+def test_a_step_of_several_seeds_trains_a_model_with_those_that_lack_it_as_one(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["step", "train", "--scale", "smoke", "--device", "cpu", "-p", "env=tsm/Reacher-v0", "-p", "models=prior"]
+    headers = {}
+    assert main([*words, "--job", "models/Reacher/prior", "--seed", "2"]) == 0
+    for _ in range(2):  # the second time all are there
+        assert main([*words, "--job", "models/Reacher/prior", "--seed", "2,0,3"]) == 0
+        for seed in (0, 2, 3):
+            path = place / "runs" / "smoke" / f"seed{seed}" / "models" / "Reacher" / "prior.safetensors"
+            header = artifacts.read_header(path)
+            assert headers.setdefault(seed, header) == header
+    assert [headers[seed].get("copies") for seed in (0, 2, 3)] == [2, None, 2]
+    assert main([*words, "--job", "data/Reacher/train", "--seed", "2,0"]) == 2
+    assert "data/Reacher/train is made with one seed at a time" in capsys.readouterr().err
 
 
 # Whole workflows -----------------------------------------------------------------------------------------------------

@@ -174,11 +174,9 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
 def _step(arguments: argparse.Namespace) -> int:
     from tsmlib.study import workflow
 
-    (notebook,), given = _chosen(arguments.notebook), _given(arguments)
-    scale, seed = arguments.scale, parameters.convert("seed", arguments.seed)
-    workflow.step(
-        notebooks.prepare(notebook, scale=scale, seed=seed, device=arguments.device, given=given), arguments.job
-    )
+    chosen, given, seeds = _chosen(arguments.notebook), _given(arguments), parameters.parse_seeds(arguments.seed)
+    prepared = workflow.prepare(chosen, seeds, scale=arguments.scale, device=arguments.device, given=given)
+    workflow.step(prepared, arguments.job)
     return 0
 
 

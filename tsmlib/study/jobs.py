@@ -80,7 +80,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Model:
-    """A model of the zoo, by its word. A training of several seeds at once would be a job like this one."""
+    """A model of the zoo, by its word."""
 
     env: str
     word: str
@@ -97,6 +97,10 @@ class Model:
 
     def make(self, run: Run) -> object:
         return models.load_or_train(run, self.env, self.word)
+
+    def make_as_one(self, runs: Sequence[Run]) -> object:
+        """With the seeds of several runs; those that are missing are trained as one."""
+        return models.load_or_train_as_one(runs, self.env, self.word)
 
     def settings(self, run: Run) -> Json:
         env = models.trained_on(self.env, self.word)

@@ -94,10 +94,28 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now. Raises
     StoreError for a file of another environment, word, class or schedule.
     """
-    env = trained_on(env, model)
-    folder, file = EnvSpec.parse(env).name, f"{zoo.find(model).word}.safetensors"
-    own = run.folder(f"models/{folder}") / file
-    for path in [own, run.shipped / folder / file] if run.scale == "laptop" and run.seed == 0 else [own]:
+    return _kept(run, env, model) or train(run, trained_on(env, model), model, _path(run, env, model))
+
+
+def load_or_train_as_one(runs: Sequence[Run], env: str, model: str) -> list[Trained]:
+    """``load_or_train`` of runs with several seeds; those that lack the model are trained as one, for a GPU."""
+    missing = [run for run in runs if _kept(run, env, model) is None]
+    if len(missing) > 1:
+        train_as_one(SeedsData.of(missing, trained_on(env, model)), model)
+    return [load_or_train(run, env, model) for run in runs]
+
+
+def _path(run: Run, env: str, model: str) -> Path:
+    """Where a run keeps a model."""
+    folder = run.folder(f"models/{EnvSpec.parse(trained_on(env, model)).name}")
+    return folder / f"{zoo.find(model).word}.safetensors"
+
+
+def _kept(run: Run, env: str, model: str) -> Trained | None:
+    """A model that is there; see ``load_or_train``."""
+    env, own = trained_on(env, model), _path(run, env, model)
+    shipped = run.shipped / own.parent.name / own.name
+    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
         if path.exists():
             header = cast(Header, artifacts.read_header(path))
             trained_at = replace(run, scale=header.get("scale", run.scale))
@@ -114,7 +132,7 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
                     f"{path} was trained on {turned} symmetric copies of its data, expected {wanted}. Restore it"
                 )
             return Trained(net, header)
-    return train(run, env, model, own)
+    return None
 
 
 def load_prior(run: Run, env: str) -> ActionPrior:
@@ -266,7 +284,7 @@ def train_as_one(seeds: SeedsData, model: str, *, compiled: bool = False) -> lis
             own[key] = asdict(curve)
     made = []
     for run, net, own in zip(runs, nets, curves, strict=True):
-        path = run.folder(f"models/{EnvSpec.parse(env).name}") / f"{zoo.find(model).word}.safetensors"
+        path = _path(run, env, model)
         artifacts.save_model(path, net, _header(run, env, model, own, path, copies=len(runs)))
         made.append(Trained(net, cast(Header, artifacts.read_header(path))))
     return made

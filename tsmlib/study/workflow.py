@@ -19,8 +19,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import psutil
@@ -30,7 +30,7 @@ from tsmlib.storage.files import writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import notebooks
 from tsmlib.study.data import require_other_seed
-from tsmlib.study.jobs import complete
+from tsmlib.study.jobs import Job, Model, complete
 from tsmlib.study.needed import needs
 from tsmlib.study.notebooks import Execution, terminable
 from tsmlib.study.parallel import cores
@@ -42,15 +42,17 @@ POOL = "pool"  # in place of an executor: no Snakemake
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
+SEEDS = "seeds"  # in place of a seed in the name of a step of several
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
 
 @dataclass(frozen=True)
 class Step:
-    """One process: a job, or a notebook. A job for several seeds at once would be one step, which all of them need.
+    """One process: a job, of one seed or of several at once, or a notebook.
 
-    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. ships: whether
-    something that comes with the package is taken in place of what it would make.
+    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. makes: the files
+    of a job, relative to the seeds' folders. ships: whether something that comes with the package is taken in place of
+    what it would make.
     """
 
     kind: str
@@ -60,6 +62,7 @@ class Step:
     command: str
     minutes: int
     mem_mb: int
+    makes: list[str] = field(default_factory=list)
     ships: bool = False
 
 
@@ -67,35 +70,69 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
     """Name -> step, of notebooks and all that they need. given: parameters of the notebooks, as typed.
 
     A job that two notebooks need with other settings, plans for more targets for instance, is made for the first; the
-    other makes its own when it comes to it, once the first is done.
+    other makes its own when it comes to it, once the first is done. A model that is trained with several seeds as one
+    (``trained_as_one``) is a step of all of them.
     """
     found: dict[str, Step] = {}
     first: dict[str, str] = {}  # step of a job -> step of the notebook that it is made for
+    as_one = trained_as_one(executions)
+
+    options = [word for name, text in given.items() for word in ("-p", f"{name}={text}")]
+
+    def named(run: Run, job: Job) -> str:
+        """The step that makes a job."""
+        return f"{SEEDS if job.name in as_one else f'seed{run.seed}'}/{job.name}"
+
+    def command(each: Execution, *words: str) -> list[str]:
+        run = each.run
+        return [_word(each.notebook), *words, "--scale", run.scale, "--device", run.device, *options]
+
+    def add(each: Execution, job: Job) -> str:
+        """That step, after those that it needs."""
+        run, name = each.run, named(each.run, job)
+        if name not in found:
+            of = as_one[job.name][1] if job.name in as_one else [each]
+            before, settings = [add(one, other) for one in of for other in job.needs(one.run)], _settings(run, job)
+            words = command(each, "--job", job.name, "--seed", ",".join(str(one.run.seed) for one in of))
+            made = _step(run, job.kind, name, before, settings, words, job.seconds(run))
+            makes = [f"seed{one.run.seed}/{job.name}.safetensors" for one in of]
+            found[name] = replace(made, makes=makes, ships=job.ships(run))
+            first[name] = f"seed{run.seed}/{run.notebook}"
+        return name
+
     for each in executions:
         run = each.run
-        mine, seed, word = f"seed{run.seed}/{run.notebook}", f"seed{run.seed}", _word(each.notebook)
-        options = ["--scale", run.scale, "--seed", str(run.seed), "--device", run.device]
-        options += [word for name, text in given.items() for word in ("-p", f"{name}={text}")]
+        mine, seed = f"seed{run.seed}/{run.notebook}", f"seed{run.seed}"
         inputs: dict[str, None] = {}
         for job in (wanted := needs(run)):
-            name, settings = f"{seed}/{job.name}", json.dumps(job.settings(run), sort_keys=True)
-            if name not in found:
-                before = [f"{seed}/{other.name}" for other in job.needs(run)]
-                command = [word, "--job", job.name, *options]
-                made = _step(run, job.kind, name, before, settings, command, job.seconds(run))
-                found[name], first[name] = replace(made, ships=job.ships(run)), mine
-            inputs[name] = None
-            if found[name].settings != settings:
+            inputs[name := add(each, job)] = None
+            if found[name].settings != _settings(run, job):
                 inputs[first[name]] = None
         for job in wanted:  # what others wait for, the notebook need not
             for other in job.needs(run):
-                inputs.pop(f"{seed}/{other.name}", None)
+                inputs.pop(named(run, other), None)
         reads = [f"{seed}/{stem}" for stem in READS.get(run.notebook, ())]
         if run.notebook == CLAIMS:
             reads = [name for name in found if found[name].kind == "notebook" and not name.endswith(CLAIMS)]
         inputs |= dict.fromkeys(name for name in reads if name in found)
-        found[mine] = _step(run, "notebook", mine, list(inputs), "", [word, *options], 1800.0)
+        words = command(each, "--seed", str(run.seed))
+        found[mine] = _step(run, "notebook", mine, list(inputs), "", words, 1800.0)
     return found
+
+
+def trained_as_one(executions: Sequence[Execution]) -> dict[str, tuple[Model, list[Execution]]]:
+    """Models that several seeds need on a GPU, where they are trained as one: by the names of their jobs, with a
+    notebook of each seed that needs them."""
+    found: dict[str, tuple[Model, dict[int, Execution]]] = {}
+    for each in executions:
+        for job in needs(each.run) if each.run.device != "cpu" else ():
+            if isinstance(job, Model) and not job.ships(each.run):
+                found.setdefault(job.name, (job, {}))[1].setdefault(each.run.seed, each)
+    return {name: (job, list(of.values())) for name, (job, of) in found.items() if len(of) > 1}
+
+
+def _settings(run: Run, job: Job) -> str:
+    return json.dumps(job.settings(run), sort_keys=True)
 
 
 def _word(notebook: Notebook) -> str:
@@ -156,33 +193,45 @@ def run_all(
         manifest.write_json(folder / "code.json", {"codes": codes})
         if executor == POOL:
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
+            for model, of in trained_as_one(executions).values():
+                model.make_as_one([each.run for each in of])
             for execution in executions:
                 print(notebooks.execute(execution))
             return 0
         return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
 
 
-def step(execution: Execution, job: str) -> None:
-    """One step of a workflow: a job that the notebook needs, by its name, or the notebook itself where that is ''.
+def step(executions: Sequence[Execution], job: str) -> None:
+    """One step of a workflow: a job that a notebook needs, by its name, or the notebook itself where that is ''.
 
-    Waits for whoever makes the same, an orphan of a workflow that was killed for instance; then it is there, or goes
-    on from its checkpoint. RunError where this is not the code of the workflow.
+    executions: of one notebook; with several seeds where a model is trained with them as one. Waits for whoever makes
+    the same, an orphan of a workflow that was killed for instance; then it is there, or goes on from its checkpoint.
+    RunError where this is not the code of the workflow, ParameterError for a job that the notebook does not need, or
+    that is no model, with several seeds.
     """
-    run = execution.run
+    execution, runs = executions[0], [each.run for each in executions]
+    run = runs[0]
     codes, now = _codes(run.dir.parent / "workflow"), str(provenance()["code"])
     if codes and codes[-1] != now:
         raise RunError(
             f"this step runs tsmlib {now}, its workflow {codes[-1]}: the code was changed meanwhile, or this machine "
             "has another. Stop the workflow, bring that version back or start it again with --any-code."
         )
-    if not job:
+    if not job and len(runs) == 1:
         notebooks.execute(execution, progress=False, wait=True)
         return
     known = complete(run, needs(run))
     if job not in known:
         raise ParameterError(f"{run.notebook} needs no {job!r:.80}; it needs {', '.join(known) or 'nothing'}.")
-    with terminable(), writer_lock(run.dir / ".locks", job, name=job.replace("/", "."), wait=True):
-        known[job].make(run)
+    with terminable(), ExitStack() as held:
+        for one in sorted(runs, key=lambda one: one.seed):
+            held.enter_context(writer_lock(one.dir / ".locks", job, name=job.replace("/", "."), wait=True))
+        if len(runs) == 1:
+            known[job].make(run)
+        elif isinstance(model := known[job], Model):
+            model.make_as_one(runs)
+        else:
+            raise ParameterError(f"{job} is made with one seed at a time; only models are trained with several as one.")
 
 
 @contextmanager
@@ -247,11 +296,11 @@ def _list(table: Mapping[str, Step], folder: Path) -> None:
 
 def _made(name: str, step: Step, folder: Path) -> bool:
     """Whether what a step makes is there, or ships; if it still holds, only the step can tell."""
-    seed, _, rest = name.partition("/")
     if step.kind == "notebook":
+        seed, _, rest = name.partition("/")
         entry = manifest.statuses(folder.parent / seed).get(rest, {})
         return isinstance(entry, dict) and entry.get("state") == "complete"
-    return step.ships or (folder.parent / name).with_name(f"{Path(name).name}.safetensors").exists()
+    return step.ships or all((folder.parent / file).exists() for file in step.makes)
 
 
 def _snakemake(
