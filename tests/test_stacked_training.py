@@ -26,6 +26,7 @@ LOSSES = [
     ("onestep", "loss"), ("onestep", "multi_step_loss"), ("lstm", "loss"), ("prior", "loss"), ("ensemble", "loss"),
     ("ensemble+mse", "loss"),
 ]  # fmt: skip
+OTHERS = sorted({(word, stage.loss) for word, spec in zoo.ZOO.items() for stage in spec.stages} - set(LOSSES))
 SEEDS = (3, 8)
 
 
@@ -70,6 +71,11 @@ def trained_as_one(
 @pytest.mark.parametrize(("word", "loss"), LOSSES)
 def test_each_of_several_copies_is_what_it_is_alone(word: str, loss: str, env: str) -> None:
     trained_as_one(word, loss, env)
+
+
+@pytest.mark.parametrize(("word", "loss"), OTHERS)
+def test_and_so_is_each_of_the_other_models(word: str, loss: str) -> None:
+    trained_as_one(word, loss, ENVS[0])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -126,18 +132,34 @@ def test_what_a_training_alone_refuses_or_treats_otherwise_is_refused() -> None:
 def test_seeds_are_trained_as_one_and_found_by_their_runs(tmp_path: Path) -> None:
     env = "tsm/Reacher-v0"
     own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
-    seeds = study_models.SeedsData.of(own, env)
-    for run, made in zip(own, study_models.train_as_one(seeds, "onestep"), strict=True):
+    for run, made in zip(own, study_models.train_as_one(own, env, "onestep"), strict=True):
         found, header = study_models.load_or_train(run, env, "onestep")
         assert (header["seed"], header["copies"], header["processor"]) == (run.seed, 2, "cpu")
         kept, had = found.state_dict(), made.model.state_dict()
         assert all(torch.equal(kept[name], had[name]) for name in kept)
-    with pytest.raises(ValueError, match="these data have 10 steps of past"):
-        seeds.with_past(11)
     with pytest.raises(ValueError, match="found runs of smoke 3, smoke 3; expected different seeds"):
-        study_models.SeedsData.of([own[0]] * 2, env)
+        study_models.train_as_one([own[0]] * 2, env, "onestep")
     with pytest.raises(ValueError, match="prior of tsm/ReacherPush-v1 is trained on tsm/ReacherObstacle-v0"):
-        study_models.train_as_one(replace(seeds, env="tsm/ReacherPush-v1"), "prior")
+        study_models.train_as_one(own, "tsm/ReacherPush-v1", "prior")
+
+
+def test_where_a_seed_cannot_be_trained_with_the_others_they_are_trained_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise TrainingStopped("the loss of seed 8 is not finite")
+
+    monkeypatch.setattr(study_models, "fit_stacked", stopped)
+    own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
+    found = study_models.load_or_train_as_one(own, "tsm/Reacher-v0", "onestep")
+    assert [(made.header["seed"], made.header.get("copies")) for made in found] == [(3, None), (8, None)]
+    assert "one by one: the loss of seed 8 is not finite" in capsys.readouterr().out
+
+
+def test_models_of_every_past_are_trained_as_one(tmp_path: Path) -> None:
+    own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
+    found = study_models.train_as_one(own, "tsm/Reacher-v0", "tsm+h20")
+    assert [made.header["copies"] for made in found] == [2, 2]
 
 
 def test_a_loss_that_is_not_finite_stops_all_with_the_best_weights_so_far() -> None:

@@ -126,15 +126,43 @@ def test_what_ships_is_there_and_no_step_that_is_to_be_done_again(place: Path) -
 
 @pytest.mark.usefixtures("gpu")
 def test_on_a_gpu_a_model_that_several_seeds_need_is_one_step_of_all_of_them() -> None:
-    steps = table("paper", device="cuda")
-    step = steps["seeds/models/Reacher/lstm"]
-    assert step.makes == [f"seed{seed}/models/Reacher/lstm.safetensors" for seed in (0, 2)]
-    assert set(step.needs) == {f"seed{seed}/data/Reacher/{part}" for seed in (0, 2) for part in ("train", "validation")}
-    assert "seeds/models/Reacher/lstm" in steps["seed2/scores/Reacher/lstm"].needs
+    steps = table("paper", (4, 0, 2), device="cuda")
+    step = steps["seeds0-4/models/Reacher/lstm"]
+    assert step.files == [f"seed{seed}/models/Reacher/lstm.safetensors" for seed in (0, 2, 4)]
+    assert set(step.needs) == {
+        f"seed{seed}/data/Reacher/{part}" for seed in (0, 2, 4) for part in ("train", "validation")
+    }
+    assert "--seeds 0,2,4" in step.command
+    assert "seeds0-4/models/Reacher/lstm" in steps["seed2/scores/Reacher/lstm"].needs
     assert "seed0/models/Reacher-noise0.1/lstm" in steps  # which seed 0 alone needs
-    assert not any(name.startswith("seeds/") for name in table("paper", (2,), device="cuda"))
-    assert not any(name.startswith("seeds/") for name in table("paper"))
-    assert "seed2/models/Reacher/lstm" in table("laptop", device="cuda")  # of seed 0 it ships
+    for others in (table("paper", (2,), device="cuda"), table("paper")):
+        assert not any(name.startswith("seeds") for name in others)
+
+
+@pytest.mark.usefixtures("gpu")
+def test_a_seed_whose_model_ships_is_none_of_those_that_are_trained(place: Path) -> None:
+    steps = table("laptop", (0, 1, 2), device="cuda")
+    assert steps["seeds1-2/models/Reacher/lstm"].files == [
+        f"seed{seed}/models/Reacher/lstm.safetensors" for seed in (1, 2)
+    ]
+    assert steps["seed0/scores/Reacher/lstm"].needs[0] == "seed0/models/Reacher/lstm"
+    folder = place / "runs" / "laptop" / "workflow"
+    assert workflow._made("seed0/models/Reacher/lstm", steps["seed0/models/Reacher/lstm"], folder)
+    for seed in (1, 2):
+        assert not workflow._made("", steps["seeds1-2/models/Reacher/lstm"], folder)
+        files.write_bytes(folder.parent / f"seed{seed}/models/Reacher/lstm.safetensors", b"")
+    assert workflow._made("", steps["seeds1-2/models/Reacher/lstm"], folder)
+
+
+@pytest.mark.usefixtures("gpu")
+def test_not_more_than_ten_seeds_are_trained_as_one_and_they_ask_for_more_memory() -> None:
+    steps = table("smoke", tuple(range(13)), device="cuda")
+    found = {name: step for name, step in steps.items() if name.endswith("models/Reacher/lstm")}
+    assert {name.partition("/")[0]: len(step.files) for name, step in found.items()} == {
+        "seeds0-9": 10,
+        "seeds10-12": 3,
+    }
+    assert len({step.mem_mb for step in found.values()}) == 2
 
 
 # Refusals ------------------------------------------------------------------------------------------------------------
@@ -213,14 +241,29 @@ def test_a_step_of_several_seeds_trains_a_model_with_those_that_lack_it_as_one(
     headers = {}
     assert main([*words, "--job", "models/Reacher/prior", "--seed", "2"]) == 0
     for _ in range(2):  # the second time all are there
-        assert main([*words, "--job", "models/Reacher/prior", "--seed", "2,0,3"]) == 0
+        assert main([*words, "--job", "models/Reacher/prior", "--seeds", "2,0,3"]) == 0
         for seed in (0, 2, 3):
             path = place / "runs" / "smoke" / f"seed{seed}" / "models" / "Reacher" / "prior.safetensors"
             header = artifacts.read_header(path)
             assert headers.setdefault(seed, header) == header
     assert [headers[seed].get("copies") for seed in (0, 2, 3)] == [2, None, 2]
-    assert main([*words, "--job", "data/Reacher/train", "--seed", "2,0"]) == 2
-    assert "data/Reacher/train is made with one seed at a time" in capsys.readouterr().err
+    for job in ("data/Reacher/train", ""):
+        assert main([*words, "--job", job, "--seeds", "2,0"]) == 2
+        assert f"{job or '02_train'} is made with one seed at a time" in capsys.readouterr().err
+    assert main(["step", "all", "--job", "data/Reacher/train"]) == 2
+    assert "a step is of one notebook" in capsys.readouterr().err
+
+
+def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebooks(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given, job = {"env": "tsm/Reacher-v0", "models": "prior"}, "models/Reacher/prior"
+    prepared = workflow.prepare([runs.notebooks()["train"]], (0, 2), scale="smoke", device="", given=given)
+    group = {(execution.run.seed, job): prepared for execution in prepared}
+    monkeypatch.setattr(workflow, "trained_as_one", lambda _: group)  # as on a GPU
+    workflow._train_ahead(prepared)
+    for execution in prepared:
+        assert artifacts.read_header(execution.run.dir / f"{job}.safetensors")["copies"] == 2
 
 
 # Whole workflows -----------------------------------------------------------------------------------------------------

@@ -40,7 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     flow = run.add_argument_group(
         "several seeds, as a workflow (docs/howto/cluster.md); options of Snakemake follow --"
     )
-    flow.add_argument("--seeds", default="", help="such as 0-9 or 0,2,5: a job for each model, score, plan, notebook")
+    flow.add_argument(
+        "--seeds",
+        default="",
+        help="such as 0-9 or 0,2,5: a job for each model (on a GPU one for all seeds), score, plan, notebook",
+    )
     flow.add_argument("--executor", default="", help="local, slurm or another plugin of Snakemake's; pool: without it")
     flow.add_argument("--jobs", type=int, default=0, help="at a time (default: one for each core; elsewhere 100)")
     flow.add_argument("--dry-run", action="store_true", help="list the jobs, and do nothing")
@@ -52,6 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     step.add_argument("--job", default="", help="what the notebook needs, by its name; default: the notebook itself")
     for option in ("--scale", "--seed", "--device"):
         step.add_argument(option, default="0" if option == "--seed" else "")
+    step.add_argument("--seeds", default="", help="of a model that is trained with several as one")
     step.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[])
     copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
     copy.add_argument("folder", type=Path)
@@ -174,7 +179,12 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
 def _step(arguments: argparse.Namespace) -> int:
     from tsmlib.study import workflow
 
-    chosen, given, seeds = _chosen(arguments.notebook), _given(arguments), parameters.parse_seeds(arguments.seed)
+    chosen, given = _chosen(arguments.notebook), _given(arguments)
+    if len(chosen) > 1:
+        raise parameters.ParameterError("a step is of one notebook; name it in place of all.")
+    if arguments.seeds and arguments.seed != "0":
+        raise parameters.ParameterError("--seed and --seeds are both given; name the seeds once.")
+    seeds = parameters.parse_seeds(arguments.seeds or arguments.seed)
     prepared = workflow.prepare(chosen, seeds, scale=arguments.scale, device=arguments.device, given=given)
     workflow.step(prepared, arguments.job)
     return 0

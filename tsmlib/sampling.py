@@ -52,16 +52,16 @@ class GivenNoise:
 
 
 class Draw(NamedTuple):
-    """Numbers that are asked for: standard normal ones, or whole ones from 0 to ``below`` - 1."""
+    """Numbers that are asked for: standard normal ones, or indices from 0 to ``below`` - 1."""
 
     shape: torch.Size
-    below: int = 0
+    below: int | None = None
 
-    def made(self, generator: torch.Generator) -> Tensor:
-        """The numbers, on the processor."""
-        if self.below:
-            return torch.randint(self.below, self.shape, generator=generator)
-        return torch.randn(self.shape, generator=generator)
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """The numbers, on the generator's device."""
+        if self.below is None:
+            return torch.randn(self.shape, generator=generator, device=generator.device)
+        return torch.randint(self.below, self.shape, generator=generator, device=generator.device)
 
 
 @dataclass
@@ -103,14 +103,15 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
 def random_indices(
     below: int, shape: Sequence[int], noise: torch.Generator | GivenNoise | RecordedNoise, device: torch.device
 ) -> Tensor:
-    """Whole numbers from 0 to ``below`` - 1, all equally likely: the same on any device."""
+    """Indices from 0 to ``below`` - 1, all equally likely, on ``device``: for losses, to which planners' noise is
+    unknown."""
     if isinstance(noise, GivenNoise):
         return noise.next(shape)
     draw = Draw(torch.Size(shape), below)
     if isinstance(noise, RecordedNoise):
         noise.draws.append(draw)
         return torch.zeros(draw.shape, dtype=torch.long, device=device)
-    return draw.made(noise).to(device)
+    return draw.sample(noise).to(device)
 
 
 def by_generator(

@@ -41,8 +41,12 @@ def stacked(train: Sequence[Trajectories], past_len: int, device: str = "cpu") -
     if len(shapes := {data.states.shape for data in train}) > 1:
         found = " and ".join(str(shape) for shape in sorted(shapes))
         raise TrajectoryError(f"copies would be trained on states of shapes {found}; expected one shape")
-    parts = zip(*(data.padded(past_len) for data in train), strict=True)
-    return Segment(*(torch.stack(part).to(device) for part in parts))
+    first = train[0].padded(past_len)
+    stack = Segment(*(torch.empty(len(train), *part.shape, dtype=part.dtype, device=device) for part in first))
+    for copy, data in enumerate(train):
+        for whole, part in zip(stack, data.padded(past_len), strict=True):
+            whole[copy] = part
+    return stack
 
 
 def fit_stacked(
@@ -164,14 +168,14 @@ class _Stack:
         held_out = fixed_windows(validation, o.past_len, o.future_len)
         self.asked, fixed = (_draws(models[0], loss, of) for of in (_sized(held_out, o.batch_size), held_out))
         self.held_out = Window(*(segment.to(self.device) for segment in held_out))
-        drawn = [_made(fixed, torch.Generator().manual_seed(seed)) for seed in seeds]
+        drawn = [_drawn(fixed, torch.Generator().manual_seed(seed)) for seed in seeds]
         self.held_out_noise = [torch.stack(parts).to(self.device) for parts in zip(*drawn, strict=True)]
         table = AHEAD, self.copies
         self.episodes, self.starts = (
             torch.zeros(*table, o.batch_size, dtype=torch.long, device=self.device) for _ in range(2)
         )
         self.drawn = [
-            torch.zeros(*table, *draw.shape, dtype=torch.long if draw.below else None, device=self.device)
+            torch.zeros(*table, *draw.shape, dtype=None if draw.below is None else torch.long, device=self.device)
             for draw in self.asked
         ]
         self.rates = torch.zeros(AHEAD, device=self.device)
@@ -193,7 +197,7 @@ class _Stack:
                 generator.manual_seed(seed * 1_000_003 + step)
                 episodes = torch.randint(n, (o.batch_size,), generator=generator)
                 starts = torch.randint(last + 1, (o.batch_size,), generator=generator)
-                rows.append([episodes, starts, *_made(self.asked, generator)])
+                rows.append([episodes, starts, *_drawn(self.asked, generator)])
         for table, parts in zip([self.episodes, self.starts, *self.drawn], zip(*rows, strict=True), strict=True):
             _upload(torch.stack(parts).unflatten(0, (len(steps), -1)), table)
         rates = [schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span) for step in steps]
@@ -296,8 +300,8 @@ def _sized(window: Window, rows: int) -> Window:
     return Window(*(Segment(*(part[index] for part in segment)) for segment in window))
 
 
-def _made(draws: Sequence[Draw], generator: torch.Generator) -> list[Tensor]:
-    return [draw.made(generator) for draw in draws]
+def _drawn(draws: Sequence[Draw], generator: torch.Generator) -> list[Tensor]:
+    return [draw.sample(generator) for draw in draws]
 
 
 def _upload(rows: Tensor, table: Tensor) -> None:

@@ -50,7 +50,7 @@ def collect(run: runs.Run, env: str) -> None:
 def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
     """One model of all seeds, trained and stored; a line on it."""
     torch.set_num_threads(1)
-    found = models.train_as_one(models.SeedsData.of(of, env), word, compiled=compiled)
+    found = models.train_as_one(of, env, word, compiled=compiled)
     best = [min(list(made.header["curves"].values())[-1]["validation"]) for made in found]
     return f"{env} {word}: {found[0].header['seconds']:.0f} s, {' '.join(f'{value:.4g}' for value in best)}"
 

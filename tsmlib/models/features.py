@@ -89,14 +89,18 @@ class Features(nn.Module):
 
     def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
         """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
-        return self.moving_part(predicted - true) / self.moving_part(self.step_std)
+        moving = self._moving_columns()
+        return (predicted - true)[..., moving] / self.step_std[moving]
 
     def moving_part(self, values: Tensor) -> Tensor:
         """(..., dx) -> those of the dimensions that change."""
+        return values[..., self._moving_columns()]
+
+    def _moving_columns(self) -> slice | Tensor:
         if self._settled:
-            return values[..., self._settled[0]]
+            return self._settled[0]
         moving = self.moving
-        return values if moving.all() else values[..., moving]
+        return slice(None) if moving.all() else moving
 
     def _raw(self, states: Tensor) -> Tensor:
         angles = states[..., _columns(self.angles)]

@@ -99,7 +99,7 @@ class Model:
         return models.load_or_train(run, self.env, self.word)
 
     def make_as_one(self, runs: Sequence[Run]) -> object:
-        """With the seeds of several runs; those that are missing are trained as one."""
+        """The model of several runs; missing ones are trained as one."""
         return models.load_or_train_as_one(runs, self.env, self.word)
 
     def settings(self, run: Run) -> Json:

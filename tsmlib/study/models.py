@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, TypedDict, cast
 
@@ -24,8 +24,9 @@ from tsmlib.storage.files import Json, StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
+from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import fit
-from tsmlib.trajectory import Segment, Trajectories
+from tsmlib.trajectory import Trajectories, TrajectoryError
 
 if TYPE_CHECKING:
     import pandas as pd  # of the extra "study", which a pretrained model does not need
@@ -98,10 +99,17 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
 
 
 def load_or_train_as_one(runs: Sequence[Run], env: str, model: str) -> list[Trained]:
-    """``load_or_train`` of runs with several seeds; those that lack the model are trained as one, for a GPU."""
-    missing = [run for run in runs if _kept(run, env, model) is None]
+    """``load_or_train`` of runs with several seeds; those that lack the model are trained as one, for a GPU.
+
+    Where that is not possible, with one seed whose loss is not finite for instance, it is said, and they are trained
+    one after another.
+    """
+    missing = [run for run in runs if not any(path.exists() for path in _places(run, env, model))]
     if len(missing) > 1:
-        train_as_one(SeedsData.of(missing, trained_on(env, model)), model)
+        try:
+            train_as_one(missing, trained_on(env, model), model)
+        except (TrainingStopped, TrajectoryError, ValueError) as error:
+            print(f"{env}: {model} of {len(missing)} seeds is not trained as one, but one by one: {error}")
     return [load_or_train(run, env, model) for run in runs]
 
 
@@ -111,11 +119,17 @@ def _path(run: Run, env: str, model: str) -> Path:
     return folder / f"{zoo.find(model).word}.safetensors"
 
 
+def _places(run: Run, env: str, model: str) -> list[Path]:
+    """Where a model may be: the run's own, and the shipped one."""
+    own = _path(run, env, model)
+    shipped = run.shipped / own.parent.name / own.name
+    return [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]
+
+
 def _kept(run: Run, env: str, model: str) -> Trained | None:
     """A model that is there; see ``load_or_train``."""
-    env, own = trained_on(env, model), _path(run, env, model)
-    shipped = run.shipped / own.parent.name / own.name
-    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
+    env = trained_on(env, model)
+    for path in _places(run, env, model):
         if path.exists():
             header = cast(Header, artifacts.read_header(path))
             trained_at = replace(run, scale=header.get("scale", run.scale))
@@ -191,19 +205,24 @@ def train(run: Run, env: str, model: str, path: Path) -> Trained:
     print(f"{env}: no trained {model} at scale {run.scale}; training it now, {_duration(run, env, model)}")
     data, held_out = training_data(run, env, model)
     net, name = initialise(run, model, data), EnvSpec.parse(env).name
-    stages, curves, checkpoints = schedule(run, env, model), {}, []
-    for key, stage in zip(zoo.keys(stages), stages, strict=True):
-        checkpoints.append(path.with_name(f"{model}-{key}.checkpoint"))
+    stages, curves = schedule(run, env, model), {}
+    checkpoints = _checkpoints(path, stages)
+    for key, stage, checkpoint in zip(zoo.keys(stages), stages, checkpoints, strict=True):
         curve = fit(
             cast(torch.nn.Module, net), getattr(net, stage.loss), data, held_out,
             stage.options(net.past_len, **_fewer(run)), seed=run.seed,
-            device=run.device, checkpoint=checkpoints[-1], progress=f"{name} {model}: {key}",
+            device=run.device, checkpoint=checkpoint, progress=f"{name} {model}: {key}",
         )  # fmt: skip
         curves[key] = asdict(curve)
     artifacts.save_model(path, net, _header(run, env, model, curves, path))
     for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)
     return Trained(net, cast(Header, artifacts.read_header(path)))
+
+
+def _checkpoints(path: Path, stages: Sequence[zoo.Updates]) -> list[Path]:
+    """Of each stage of a training whose model is stored at ``path``."""
+    return [path.with_name(f"{path.stem}-{key}.checkpoint") for key in zoo.keys(stages)]
 
 
 def _fewer(run: Run) -> dict[str, float | tuple[float, float]]:
@@ -229,56 +248,28 @@ def _header(
     return header
 
 
-@dataclass(frozen=True)
-class SeedsData:
-    """What a model is trained on with the seeds of several runs at once: the same environment, data of each seed.
-
-    data, held_out: as of ``training_data``. stack: all of ``data``, with ``past_len`` steps of past, on the device of
-    the first run.
-    """
-
-    runs: tuple[Run, ...]
-    env: str
-    data: list[Trajectories]
-    held_out: Trajectories
-    past_len: int
-    stack: Segment
-
-    @classmethod
-    def of(cls, runs: Sequence[Run], env: str, *, past_len: int = 10) -> SeedsData:
-        """past_len: the longest past of the models that are trained on it. ValueError but for runs of several seeds at
-        one scale."""
-        if len({run.seed for run in runs}) < len(runs) or len({run.scale for run in runs}) != 1:
-            found = ", ".join(f"{run.scale} {run.seed}" for run in runs)
-            raise ValueError(f"found runs of {found or 'no seed'}; expected different seeds at one scale")
-        parts = [training_data(run, env, "tsm") for run in runs]
-        data = [part for part, _ in parts]
-        return cls(tuple(runs), env, data, parts[0][1], past_len, stacked(data, past_len, runs[0].device))
-
-    def with_past(self, past_len: int) -> Segment:
-        """The stack with fewer steps of past."""
-        if past_len > self.past_len:
-            raise ValueError(f"past_len {past_len}: these data have {self.past_len} steps of past")
-        return Segment(*(part[:, :, self.past_len - past_len :] for part in self.stack))
-
-
-def train_as_one(seeds: SeedsData, model: str, *, compiled: bool = False) -> list[Trained]:
-    """Train a model with several seeds as one (``fit_stacked``), and store each where its run finds it.
+def train_as_one(runs: Sequence[Run], env: str, model: str, *, compiled: bool = False) -> list[Trained]:
+    """Train a model with the seeds of several runs as one (``fit_stacked``), and store each where its run finds it.
 
     For a GPU; on a CPU it is slower than one after the other. compiled: of ``fit_stacked``. Nothing is kept of a
-    training that is stopped. ValueError for a model that is trained on the data of another environment.
+    training that is stopped. ValueError for runs of one seed or of several scales, for a model that is trained on the
+    data of another environment, and where ``fit_stacked`` raises one.
     """
-    runs, env = seeds.runs, seeds.env
+    if len({run.seed for run in runs}) < len(runs) or len({run.scale for run in runs}) != 1:
+        given = ", ".join(f"{run.scale} {run.seed}" for run in runs)
+        raise ValueError(f"found runs of {given or 'no seed'}; expected different seeds at one scale")
     if (other := trained_on(env, model)) != env:
-        raise ValueError(f"{model} of {env} is trained on {other}; take SeedsData.of(runs, {other!r})")
+        raise ValueError(f"{model} of {env} is trained on {other}; name that environment")
+    parts = [training_data(run, env, model) for run in runs]
+    nets = [initialise(run, model, data) for run, (data, _) in zip(runs, parts, strict=True)]
+    train, held_out = stacked([data for data, _ in parts], nets[0].past_len, runs[0].device), parts[0][1]
     stages, curves = schedule(runs[0], env, model), [dict[str, dict[str, Json]]() for _ in runs]
-    nets = [initialise(run, model, data) for run, data in zip(runs, seeds.data, strict=True)]
-    past_len, title = nets[0].past_len, f"{EnvSpec.parse(env).name} {model}"
+    title = f"{EnvSpec.parse(env).name} {model}, {len(runs)} seeds"
     for key, stage in zip(zoo.keys(stages), stages, strict=True):
         found = fit_stacked(
-            [cast(torch.nn.Module, net) for net in nets], stage.loss, seeds.with_past(past_len), seeds.held_out,
-            stage.options(past_len, **_fewer(runs[0])), seeds=[run.seed for run in runs], device=runs[0].device,
-            compiled=compiled, progress=f"{title}: {key}",
+            [cast(torch.nn.Module, net) for net in nets], stage.loss, train, held_out,
+            stage.options(nets[0].past_len, **_fewer(runs[0])), seeds=[run.seed for run in runs],
+            device=runs[0].device, compiled=compiled, progress=f"{title}: {key}",
         )  # fmt: skip
         for own, curve in zip(curves, found, strict=True):
             own[key] = asdict(curve)
@@ -286,6 +277,8 @@ def train_as_one(seeds: SeedsData, model: str, *, compiled: bool = False) -> lis
     for run, net, own in zip(runs, nets, curves, strict=True):
         path = _path(run, env, model)
         artifacts.save_model(path, net, _header(run, env, model, own, path, copies=len(runs)))
+        for checkpoint in _checkpoints(path, stages):  # of a training alone, which was stopped
+            shutil.rmtree(checkpoint, ignore_errors=True)
         made.append(Trained(net, cast(Header, artifacts.read_header(path))))
     return made
 

@@ -33,7 +33,7 @@ from tsmlib.study.data import require_other_seed
 from tsmlib.study.jobs import Job, Model, complete
 from tsmlib.study.needed import needs
 from tsmlib.study.notebooks import Execution, terminable
-from tsmlib.study.parallel import cores
+from tsmlib.study.parallel import cores, precompute
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import NOTEBOOKS, Notebook, Run, RunError
 
@@ -41,8 +41,9 @@ SNAKEFILE = Path(__file__).with_name("Snakefile")
 POOL = "pool"  # in place of an executor: no Snakemake
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
+COPY = 500  # MB more for each further seed of a training of several: its data
+AT_ONCE = 10  # seeds of a training of several
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
-SEEDS = "seeds"  # in place of a seed in the name of a step of several
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
 
@@ -50,9 +51,9 @@ CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 class Step:
     """One process: a job, of one seed or of several at once, or a notebook.
 
-    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. makes: the files
-    of a job, relative to the seeds' folders. ships: whether something that comes with the package is taken in place of
-    what it would make.
+    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. files: what
+    a job makes, relative to the folder of the scale. ships: whether something that comes with the package is taken in
+    place of that.
     """
 
     kind: str
@@ -62,7 +63,7 @@ class Step:
     command: str
     minutes: int
     mem_mb: int
-    makes: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
     ships: bool = False
 
 
@@ -74,61 +75,71 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
     (``trained_as_one``) is a step of all of them.
     """
     found: dict[str, Step] = {}
-    first: dict[str, str] = {}  # step of a job -> step of the notebook that it is made for
-    as_one = trained_as_one(executions)
-
+    made_for: dict[str, str] = {}  # step of a job -> step of the notebook that it is made for
+    groups = trained_as_one(executions)
     options = [word for name, text in given.items() for word in ("-p", f"{name}={text}")]
 
-    def named(run: Run, job: Job) -> str:
-        """The step that makes a job."""
-        return f"{SEEDS if job.name in as_one else f'seed{run.seed}'}/{job.name}"
+    def name_of(execution: Execution, job: Job) -> str:
+        """Of the step that makes a job."""
+        seeds = sorted(each.run.seed for each in groups.get((execution.run.seed, job.name), [execution]))
+        return f"{f'seeds{seeds[0]}-{seeds[-1]}' if len(seeds) > 1 else f'seed{seeds[0]}'}/{job.name}"
 
-    def command(each: Execution, *words: str) -> list[str]:
-        run = each.run
-        return [_word(each.notebook), *words, "--scale", run.scale, "--device", run.device, *options]
-
-    def add(each: Execution, job: Job) -> str:
-        """That step, after those that it needs."""
-        run, name = each.run, named(each.run, job)
+    def add(execution: Execution, job: Job) -> str:
+        """Add the step of a job, and before it those that it needs. Returns its name."""
+        name, group = name_of(execution, job), groups.get((execution.run.seed, job.name), [execution])
         if name not in found:
-            of = as_one[job.name][1] if job.name in as_one else [each]
-            before, settings = [add(one, other) for one in of for other in job.needs(one.run)], _settings(run, job)
-            words = command(each, "--job", job.name, "--seed", ",".join(str(one.run.seed) for one in of))
-            made = _step(run, job.kind, name, before, settings, words, job.seconds(run))
-            makes = [f"seed{one.run.seed}/{job.name}.safetensors" for one in of]
-            found[name] = replace(made, makes=makes, ships=job.ships(run))
-            first[name] = f"seed{run.seed}/{run.notebook}"
+            run, seeds = execution.run, [str(each.run.seed) for each in group]
+            before = [add(each, other) for each in group for other in job.needs(each.run)]
+            which = ["--seed", seeds[0]] if len(seeds) == 1 else ["--seeds", ",".join(seeds)]
+            command = [
+                _word(execution.notebook), "--job", job.name, "--scale", run.scale, *which, "--device", run.device,
+                *options,
+            ]  # fmt: skip
+            step = _step(run, job.kind, name, before, _settings(run, job), command, job.seconds(run), len(group))
+            written = [f"seed{seed}/{job.name}.safetensors" for seed in seeds]
+            found[name] = replace(step, files=written, ships=job.ships(run))
+            made_for[name] = f"seed{run.seed}/{run.notebook}"
         return name
 
-    for each in executions:
-        run = each.run
-        mine, seed = f"seed{run.seed}/{run.notebook}", f"seed{run.seed}"
+    for execution in executions:
+        run = execution.run
+        notebook, seed = f"seed{run.seed}/{run.notebook}", f"seed{run.seed}"
         inputs: dict[str, None] = {}
         for job in (wanted := needs(run)):
-            inputs[name := add(each, job)] = None
+            inputs[name := add(execution, job)] = None
             if found[name].settings != _settings(run, job):
-                inputs[first[name]] = None
+                inputs[made_for[name]] = None
         for job in wanted:  # what others wait for, the notebook need not
             for other in job.needs(run):
-                inputs.pop(named(run, other), None)
+                inputs.pop(name_of(execution, other), None)
         reads = [f"{seed}/{stem}" for stem in READS.get(run.notebook, ())]
         if run.notebook == CLAIMS:
             reads = [name for name in found if found[name].kind == "notebook" and not name.endswith(CLAIMS)]
         inputs |= dict.fromkeys(name for name in reads if name in found)
-        words = command(each, "--seed", str(run.seed))
-        found[mine] = _step(run, "notebook", mine, list(inputs), "", words, 1800.0)
+        command = [
+            _word(execution.notebook), "--scale", run.scale, "--seed", str(run.seed), "--device", run.device, *options
+        ]  # fmt: skip
+        found[notebook] = _step(run, "notebook", notebook, list(inputs), "", command, 1800.0)
     return found
 
 
-def trained_as_one(executions: Sequence[Execution]) -> dict[str, tuple[Model, list[Execution]]]:
-    """Models that several seeds need on a GPU, where they are trained as one: by the names of their jobs, with a
-    notebook of each seed that needs them."""
-    found: dict[str, tuple[Model, dict[int, Execution]]] = {}
-    for each in executions:
-        for job in needs(each.run) if each.run.device != "cpu" else ():
-            if isinstance(job, Model) and not job.ships(each.run):
-                found.setdefault(job.name, (job, {}))[1].setdefault(each.run.seed, each)
-    return {name: (job, list(of.values())) for name, (job, of) in found.items() if len(of) > 1}
+def trained_as_one(executions: Sequence[Execution]) -> dict[tuple[int, str], list[Execution]]:
+    """Models that several seeds need on a GPU, where at most ``AT_ONCE`` of them are trained as one.
+
+    (Seed, name of the job) -> a notebook of each seed of its group that needs the model; the groups by their seeds.
+    """
+    need: dict[str, dict[int, Execution]] = {}
+    for execution in executions:
+        for job in needs(execution.run) if execution.run.device != "cpu" else ():
+            if isinstance(job, Model) and not job.ships(execution.run):
+                need.setdefault(job.name, {}).setdefault(execution.run.seed, execution)
+    found: dict[tuple[int, str], list[Execution]] = {}
+    for name, of in need.items():
+        in_order = [of[seed] for seed in sorted(of)]
+        for first in range(0, len(in_order), AT_ONCE):
+            if len(group := in_order[first : first + AT_ONCE]) > 1:
+                found |= {(each.run.seed, name): group for each in group}
+    return found
 
 
 def _settings(run: Run, job: Job) -> str:
@@ -140,8 +151,11 @@ def _word(notebook: Notebook) -> str:
     return notebook.name if notebook.path.parent == NOTEBOOKS else str(notebook.path)
 
 
-def _step(run: Run, kind: str, name: str, needs: list[str], settings: str, command: list[str], seconds: float) -> Step:
-    minutes, memory = 10 + round(seconds / 15), MEMORY[kind]  # four times what it should take
+def _step(
+    run: Run, kind: str, name: str, needs: list[str], settings: str, command: list[str], seconds: float,
+    copies: int = 1,
+) -> Step:  # fmt: skip
+    minutes, memory = 10 + round(seconds / 15), MEMORY[kind] + (copies - 1) * COPY  # four times what it should take
     if run.scale == "smoke":
         minutes, memory = 10, memory // 2
     return Step(kind, f"done/{kind}/{name}", needs, settings, shlex.join(command), minutes, memory)
@@ -193,45 +207,68 @@ def run_all(
         manifest.write_json(folder / "code.json", {"codes": codes})
         if executor == POOL:
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
-            for model, of in trained_as_one(executions).values():
-                model.make_as_one([each.run for each in of])
+            _train_ahead(executions)
             for execution in executions:
                 print(notebooks.execute(execution))
             return 0
         return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
 
 
+def _train_ahead(executions: Sequence[Execution]) -> None:
+    """Models that are trained with several seeds as one, before the notebooks that need them."""
+    for (seed, name), group in trained_as_one(executions).items():
+        runs = [each.run for each in group]
+        if seed != runs[0].seed:  # of the same group
+            continue
+        job = complete(runs[0], needs(runs[0]))[name]
+        assert isinstance(job, Model)
+        for run in runs:
+            precompute(run, job.needs(run), progress=f"data of seed {run.seed}")
+        _train_as_one(job, runs)
+
+
 def step(executions: Sequence[Execution], job: str) -> None:
     """One step of a workflow: a job that a notebook needs, by its name, or the notebook itself where that is ''.
 
-    executions: of one notebook; with several seeds where a model is trained with them as one. Waits for whoever makes
-    the same, an orphan of a workflow that was killed for instance; then it is there, or goes on from its checkpoint.
-    RunError where this is not the code of the workflow, ParameterError for a job that the notebook does not need, or
-    that is no model, with several seeds.
+    executions: a notebook with one seed; with several where a model is trained with them as one. Waits for whoever
+    makes the same, an orphan of a workflow that was killed for instance; then it is there, or goes on from its
+    checkpoint (trainings of several seeds have none). RunError where this is not the code of the workflow,
+    ParameterError for a job that the notebook does not need, and for several seeds of anything but a model.
     """
-    execution, runs = executions[0], [each.run for each in executions]
-    run = runs[0]
+    run = executions[0].run
     codes, now = _codes(run.dir.parent / "workflow"), str(provenance()["code"])
     if codes and codes[-1] != now:
         raise RunError(
             f"this step runs tsmlib {now}, its workflow {codes[-1]}: the code was changed meanwhile, or this machine "
             "has another. Stop the workflow, bring that version back or start it again with --any-code."
         )
-    if not job and len(runs) == 1:
-        notebooks.execute(execution, progress=False, wait=True)
-        return
     known = complete(run, needs(run))
-    if job not in known:
+    if job and job not in known:
         raise ParameterError(f"{run.notebook} needs no {job!r:.80}; it needs {', '.join(known) or 'nothing'}.")
-    with terminable(), ExitStack() as held:
-        for one in sorted(runs, key=lambda one: one.seed):
-            held.enter_context(writer_lock(one.dir / ".locks", job, name=job.replace("/", "."), wait=True))
-        if len(runs) == 1:
+    if len(executions) == 1:
+        if not job:
+            notebooks.execute(executions[0], progress=False, wait=True)
+            return
+        with terminable(), _locked([run], job):
             known[job].make(run)
-        elif isinstance(model := known[job], Model):
-            model.make_as_one(runs)
-        else:
-            raise ParameterError(f"{job} is made with one seed at a time; only models are trained with several as one.")
+    elif isinstance(model := known.get(job), Model):
+        _train_as_one(model, [each.run for each in executions])
+    else:
+        raise ParameterError(f"{job or run.notebook} is made with one seed at a time; only models are with several.")
+
+
+def _train_as_one(model: Model, runs: Sequence[Run]) -> None:
+    with terminable(), _locked(runs, model.name):
+        model.make_as_one(runs)
+
+
+@contextmanager
+def _locked(runs: Sequence[Run], job: str) -> Iterator[None]:
+    """Where no other process makes the job of these runs."""
+    with ExitStack() as held:
+        for run in sorted(runs, key=lambda run: run.seed):
+            held.enter_context(writer_lock(run.dir / ".locks", job, name=job.replace("/", "."), wait=True))
+        yield
 
 
 @contextmanager
@@ -300,7 +337,7 @@ def _made(name: str, step: Step, folder: Path) -> bool:
         seed, _, rest = name.partition("/")
         entry = manifest.statuses(folder.parent / seed).get(rest, {})
         return isinstance(entry, dict) and entry.get("state") == "complete"
-    return step.ships or all((folder.parent / file).exists() for file in step.makes)
+    return step.ships or all((folder.parent / file).exists() for file in step.files)
 
 
 def _snakemake(
