@@ -137,7 +137,7 @@ def test_seeds_are_trained_as_one_and_found_by_their_runs(tmp_path: Path) -> Non
         assert (header["seed"], header["copies"], header["processor"]) == (run.seed, 2, "cpu")
         kept, had = found.state_dict(), made.model.state_dict()
         assert all(torch.equal(kept[name], had[name]) for name in kept)
-    with pytest.raises(ValueError, match="found runs of smoke 3, smoke 3; expected different seeds"):
+    with pytest.raises(ValueError, match="found runs of smoke 3 on cpu, smoke 3 on cpu; expected different seeds"):
         study_models.train_as_one([own[0]] * 2, env, "onestep")
     with pytest.raises(ValueError, match="prior of tsm/ReacherPush-v1 is trained on tsm/ReacherObstacle-v0"):
         study_models.train_as_one(own, "tsm/ReacherPush-v1", "prior")
@@ -146,14 +146,23 @@ def test_seeds_are_trained_as_one_and_found_by_their_runs(tmp_path: Path) -> Non
 def test_where_a_seed_cannot_be_trained_with_the_others_they_are_trained_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stopped(*_: object, **__: object) -> None:
-        raise TrainingStopped("the loss of seed 8 is not finite")
+    own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
+    alone = fit
+
+    def stopped(*_: object, seed: int = 3, **given: Any) -> Any:
+        if seed == 3:
+            raise TrainingStopped("the loss of seed 3 is not finite")
+        return alone(*_, seed=seed, **given)
 
     monkeypatch.setattr(study_models, "fit_stacked", stopped)
-    own = [runs.resolve("02_train", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in SEEDS]
+    monkeypatch.setattr(study_models, "fit", stopped)
+    with pytest.raises(TrainingStopped, match="the loss of seed 3"):
+        study_models.load_or_train_as_one(own, "tsm/Reacher-v0", "onestep")
+    assert "one by one: the loss of seed 3 is not finite" in capsys.readouterr().out
+    assert [(run.dir / "models" / "Reacher" / "onestep.safetensors").exists() for run in own] == [False, True]
+    monkeypatch.setattr(study_models, "fit", alone)
     found = study_models.load_or_train_as_one(own, "tsm/Reacher-v0", "onestep")
     assert [(made.header["seed"], made.header.get("copies")) for made in found] == [(3, None), (8, None)]
-    assert "one by one: the loss of seed 8 is not finite" in capsys.readouterr().out
 
 
 def test_models_of_every_past_are_trained_as_one(tmp_path: Path) -> None:
@@ -176,15 +185,16 @@ def test_a_loss_that_is_not_finite_stops_all_with_the_best_weights_so_far() -> N
 @pytest.mark.skipif(not native_bf16(), reason="this processor multiplies no matrices in bfloat16")
 @pytest.mark.parametrize(("word", "loss"), [("onestep", "multi_step_loss"), ("rtsm", "loss"), ("rtsm", "point_loss")])
 def test_products_are_in_bfloat16_where_those_of_a_training_alone_are(word: str, loss: str) -> None:
-    env, histories = ENVS[1], dict[bool, list[float]]()
+    env, histories, validated = ENVS[1], dict[bool, list[float]](), dict[bool, list[float]]()
     given, held_out = [symmetric(data(env, seed)) for seed in SEEDS], data(env, 99)
     for bf16 in (False, True):
         nets = models(word, env, given)
         o = options(nets[0].past_len, bf16=bf16)
         found = fit_stacked(nets, loss, stacked(given, o.past_len), held_out, o, seeds=SEEDS)
         assert found[0].bf16 == [bf16] * 2
-        histories[bf16] = found[0].train
+        histories[bf16], validated[bf16] = found[0].train, found[0].validation
     alone = models(word, env, given)[0]
-    expected = fit(alone, getattr(alone, loss), given[0], held_out, o, seed=SEEDS[0]).train
-    torch.testing.assert_close(histories[True], expected, rtol=3e-3, atol=0.0)
+    expected = fit(alone, getattr(alone, loss), given[0], held_out, o, seed=SEEDS[0])
+    torch.testing.assert_close(histories[True], expected.train, rtol=3e-3, atol=0.0)
+    torch.testing.assert_close(validated[True], expected.validation, rtol=3e-3, atol=0.0)
     assert histories[True] != histories[False]

@@ -103,8 +103,8 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
 def random_indices(
     below: int, shape: Sequence[int], noise: torch.Generator | GivenNoise | RecordedNoise, device: torch.device
 ) -> Tensor:
-    """Indices from 0 to ``below`` - 1, all equally likely, on ``device``: for losses, to which planners' noise is
-    unknown."""
+    """Indices from 0 to ``below`` - 1, all equally likely, on ``device``. Only losses draw them: the noise of planners
+    (``SharedNoise``, ...) is not accepted."""
     if isinstance(noise, GivenNoise):
         return noise.next(shape)
     draw = Draw(torch.Size(shape), below)

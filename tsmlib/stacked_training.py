@@ -161,7 +161,7 @@ class _Stack:
         if isinstance(features := getattr(self.module.net, "features", None), Features):
             features.settle()
         self.bf16 = o.bf16 and native_bf16(self.device)
-        self.gradients = vmap(grad_and_value(self._loss))
+        self.gradients = vmap(grad_and_value(self._training_loss))
         if compiled:
             self.gradients = torch.compile(self.gradients, fullgraph=True, dynamic=False)
         self.train = Segment(*(part.to(self.device) for part in train))
@@ -266,9 +266,14 @@ class _Stack:
             model.load_state_dict(own, strict=False)
 
     def _loss(self, weights: dict[str, Tensor], buffers: dict[str, Tensor], of: Window, noise: list[Tensor]) -> Tensor:
-        """Of one copy."""
+        """Of one copy, in float32."""
+        return functional_call(self.module, {**weights, **buffers}, (of, GivenNoise(list(noise))))
+
+    def _training_loss(
+        self, weights: dict[str, Tensor], buffers: dict[str, Tensor], of: Window, noise: list[Tensor]
+    ) -> Tensor:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
-            return functional_call(self.module, {**weights, **buffers}, (of, GivenNoise(list(noise))))
+            return self._loss(weights, buffers, of, noise)
 
     def _windows(self, episodes: Tensor, starts: Tensor) -> Window:
         """(S, B) twice -> windows (S, B, ., .)."""

@@ -155,7 +155,7 @@ def _step(
     run: Run, kind: str, name: str, needs: list[str], settings: str, command: list[str], seconds: float,
     copies: int = 1,
 ) -> Step:  # fmt: skip
-    minutes, memory = 10 + round(seconds / 15), MEMORY[kind] + (copies - 1) * COPY  # four times what it should take
+    minutes, memory = 10 + round(copies * seconds / 15), MEMORY[kind] + (copies - 1) * COPY  # four times it, one by one
     if run.scale == "smoke":
         minutes, memory = 10, memory // 2
     return Step(kind, f"done/{kind}/{name}", needs, settings, shlex.join(command), minutes, memory)
