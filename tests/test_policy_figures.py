@@ -102,6 +102,10 @@ def test_a_line_is_the_mean_and_its_end_stands_beside_the_axis_with_its_interval
 def test_the_legend_says_what_an_interval_is_over() -> None:
     figure = figure7({"reach": {RIVAL: learned(), PPO: model_free(k=4)}})
     assert "95 % interval over 3 copies of a policy, 4 seeds without a model" in legend(figure)
+    seeds = {**learned(k=5), "seeds": np.array(5)}
+    figure = figure7({"reach": {LATENT: seeds, RIVAL: learned(), PPO: model_free(k=4)}})
+    said = "95 % interval over 5 training seeds, 3 copies of a policy, 4 seeds without a model"
+    assert said in legend(figure)
 
 
 def test_tasks_stand_side_by_side_and_share_the_scale_of_their_column() -> None:

@@ -37,7 +37,8 @@ def figure7(
 
     curves: task -> method -> {"return_true": (k, R)}, mean undiscounted return over the task's targets in m, of k
     copies of a policy or, without a model, of k training seeds, and of {"steps", "samples", "seconds": (R,)} what is
-    known of it, "return_predicted": (k, R) of the model. steps: in the model that a policy learns in, or else in the
+    known of it, "return_predicted": (k, R) of the model, "seeds": of how many training seeds (1 without): of more than
+    one the k are these. steps: in the model that a policy learns in, or else in the
     environment; samples: in the environment, those of the model's data included. A method is drawn in the rows that it
     has numbers for. references: task -> oracle, zero or random torques -> return, drawn as lines.
 
@@ -59,8 +60,8 @@ def figure8(
     """Learning curves of policies with noise and with delay beside the clean arm (paper, figure 8), one scale for all.
 
     curves: condition -> method -> {"return_true": (k, R), "steps": (R,)}, steps in the model; references: zero or
-    random torques -> return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals over the k
-    copies of a policy. yours: as curves, drawn over them as hollow diamonds.
+    random torques -> return, drawn as lines in every panel. Lines are means, bands their 95 % t intervals over the k,
+    which "seeds" says as for ``figure7``. yours: as curves, drawn over them as hollow diamonds.
     """
     every = dict.fromkeys({**curves, **(yours or {})}, references or {})
     return _draw(curves, every, ("steps",), sharey=True, yours=yours)
@@ -155,13 +156,14 @@ def _fixed(row: Curves) -> bool:
 
 
 def _over(checked: Mapping[str, Mapping[Method, Curves]]) -> str:
-    """What intervals are over, in words: copies of a policy, and of one learned without a model training seeds."""
-    every = [(method, len(row["return_true"])) for rows in checked.values() for method, row in rows.items()]
-    said = []
-    for word, free in (("copies of a policy", False), ("seeds without a model", True)):
-        counts = sorted({k for method, k in every if bool(method.search_space) is not free and k > 1})
-        said += [f"{' to '.join(map(str, counts))} {word}"] * bool(counts)
-    return ", ".join(said)
+    """What intervals are over, in words: training seeds, copies of a policy in a model of one, or seeds without a
+    model."""
+    counts: dict[str, set[int]] = {"training seeds": set(), "copies of a policy": set(), "seeds without a model": set()}
+    for method, row in ((method, row) for rows in checked.values() for method, row in rows.items()):
+        learned = "training seeds" if row["seeds"] > 1 else "copies of a policy"
+        counts[learned if method.search_space else "seeds without a model"].add(len(row["return_true"]))
+    some = {word: sorted(found - {1}) for word, found in counts.items()}
+    return ", ".join(f"{' to '.join(map(str, found))} {word}" for word, found in some.items() if found)
 
 
 def _panel(
@@ -235,7 +237,7 @@ def _checked(field: str, given: Mapping[str, np.ndarray]) -> Curves:
     for word in AXES.keys() & row.keys():
         if (np.diff(row[word]) < 0).any():
             raise ValueError(f"{field}: {word} go backwards; records must be in the order of learning")
-    return {"return_true": true, **row}
+    return {"return_true": true, "seeds": np.asarray(given.get("seeds", 1)), **row}
 
 
 def _look(method: Method, look: Props) -> Props:

@@ -184,7 +184,8 @@ def learning_curves(found: pd.DataFrame, last: int = LAST) -> dict[str, dict[Met
     for (arm, method), own in table.groups(_policies(found, last, "return_true"), ["world", "method"]):
         wide = seed_means(own.pivot(index=["seed", "copy"], columns="iteration", values="value"))
         steps = wide.columns.to_numpy(dtype=float) * model_steps(*own[["task", "scale"]].iloc[0])
-        curves.setdefault(arm, {})[method] = {"steps": steps, "return_true": wide.to_numpy()}
+        seeds = np.array(own["seed"].nunique())
+        curves.setdefault(arm, {})[method] = {"steps": steps, "return_true": wide.to_numpy(), "seeds": seeds}
     return curves
 
 
