@@ -433,7 +433,7 @@ def test_a_claim_rests_on_the_fewest_seeds_of_any_check_and_says_which_have_no_r
     rule = claim(lambda q: iter([q.ll(TSM, REACHER) > 0, q.ll(LSTM, REACHER) > 0, q.ll(ONE_STEP, REACHER) > 0]))
     whole = evaluate.judge(rule, study(tsm=[-3, -3.1, -3.2], lstm=[1], onestep=[1, 1.1, 1.2]))
     assert (whole.word, whole.key.seeds, whole.seeds, whole.without_rows) == (FAILED, 3, 1, 0)
-    assert report.counts([whole]).endswith("1 of the decided ones rest on one training seed")
+    assert report.counts([whole]).endswith("1 of the decided ones rests on one training seed")
     part = evaluate.judge(rule, study(tsm=[-3, -3.1, -3.2], onestep=[1, 1.1, 1.2]))
     assert (part.word, part.seeds, part.without_rows) == (FAILED, 3, 1)
     assert "rest on one" not in report.counts([part])

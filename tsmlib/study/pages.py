@@ -240,7 +240,7 @@ def power_of_ten_seeds(checks: pd.DataFrame) -> str:
     ]  # fmt: skip
     others = f"; the others would be found in fewer: {', '.join(weak)}" * bool(weak)
     return (
-        f"Of {len(checks)} checks with {' to '.join(map(str, seeds))} training seeds and a margin that is not zero "
+        f"Of {len(checks)} checks with {' to '.join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))} training seeds and a margin that is not zero "
         f"(`benchmarks/verdicts/checks.csv`), ten seeds that differ as these do would find {found.sum()} in "
         f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{others}."
     ).replace("95%", "95 %")

@@ -31,7 +31,7 @@ def counts(verdicts: Sequence[Verdict]) -> str:
     words = [verdict.word for verdict in verdicts]
     given = ", ".join(f"{words.count(word)} {word.lower()}" for word in VERDICTS if word != DEFINITIONAL)
     single = sum(verdict.word in DECIDED and verdict.seeds == 1 for verdict in verdicts)
-    by_one = f"; {single} of the decided ones rest on one training seed" if single else ""
+    by_one = f"; {single} of the decided ones rest{'s' * (single == 1)} on one training seed" if single else ""
     return f"of {len(words) - words.count(DEFINITIONAL)} claims {given}{by_one}"
 
 
