@@ -239,8 +239,9 @@ def power_of_ten_seeds(checks: pd.DataFrame) -> str:
         for claim, each in checks[~found].groupby("claim")
     ]  # fmt: skip
     others = f"; the others would be found in fewer: {', '.join(weak)}" * bool(weak)
+    which = " to ".join(str(count) for count in sorted({seeds[0], seeds[-1]}))
     return (
-        f"Of {len(checks)} checks with {' to '.join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))} training seeds and a margin that is not zero "
+        f"Of {len(checks)} checks with {which} training seeds and a margin that is not zero "
         f"(`benchmarks/verdicts/checks.csv`), ten seeds that differ as these do would find {found.sum()} in "
         f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{others}."
     ).replace("95%", "95 %")
