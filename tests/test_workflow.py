@@ -260,7 +260,7 @@ def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebo
     given, job = {"env": "tsm/Reacher-v0", "models": "prior"}, "models/Reacher/prior"
     prepared = workflow.prepare([runs.notebooks()["train"]], (0, 2, 3, 4), scale="smoke", device="", given=given)
     groups = {(each.run.seed, job): group for group in (prepared[:2], prepared[2:]) for each in group}
-    monkeypatch.setattr(workflow, "trained_as_one", lambda _: groups)  # as on a GPU
+    monkeypatch.setattr(workflow, "seed_groups", lambda _: groups)  # as on a GPU
     workflow._train_ahead(prepared)
     for execution in prepared:
         assert artifacts.read_header(execution.run.dir / f"{job}.safetensors")["copies"] == 2

@@ -72,12 +72,15 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
 
     A job that two notebooks need with other settings, plans for more targets for instance, is made for the first; the
     other makes its own when it comes to it, once the first is done. A model that is trained with several seeds as one
-    (``trained_as_one``) is a step of all of them.
+    (``seed_groups``) is a step of all of them.
     """
     found: dict[str, Step] = {}
     made_for: dict[str, str] = {}  # step of a job -> step of the notebook that it is made for
-    groups = trained_as_one(executions)
+    groups = seed_groups(executions)
     options = [word for name, text in given.items() for word in ("-p", f"{name}={text}")]
+
+    def at(run: Run, *seeds: str) -> list[str]:
+        return ["--scale", run.scale, *seeds, "--device", run.device, *options]
 
     def name_of(execution: Execution, job: Job) -> str:
         """Of the step that makes a job."""
@@ -91,10 +94,7 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
             run, seeds = execution.run, [str(each.run.seed) for each in group]
             before = [add(each, other) for each in group for other in job.needs(each.run)]
             which = ["--seed", seeds[0]] if len(seeds) == 1 else ["--seeds", ",".join(seeds)]
-            command = [
-                _word(execution.notebook), "--job", job.name, "--scale", run.scale, *which, "--device", run.device,
-                *options,
-            ]  # fmt: skip
+            command = [_word(execution.notebook), "--job", job.name, *at(run, *which)]
             step = _step(run, job.kind, name, before, _settings(run, job), command, job.seconds(run), len(group))
             written = [f"seed{seed}/{job.name}.safetensors" for seed in seeds]
             found[name] = replace(step, files=written, ships=job.ships(run))
@@ -116,14 +116,12 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
         if run.notebook == CLAIMS:
             reads = [name for name in found if found[name].kind == "notebook" and not name.endswith(CLAIMS)]
         inputs |= dict.fromkeys(name for name in reads if name in found)
-        command = [
-            _word(execution.notebook), "--scale", run.scale, "--seed", str(run.seed), "--device", run.device, *options
-        ]  # fmt: skip
+        command = [_word(execution.notebook), *at(run, "--seed", str(run.seed))]
         found[notebook] = _step(run, "notebook", notebook, list(inputs), "", command, 1800.0)
     return found
 
 
-def trained_as_one(executions: Sequence[Execution]) -> dict[tuple[int, str], list[Execution]]:
+def seed_groups(executions: Sequence[Execution]) -> dict[tuple[int, str], list[Execution]]:
     """Models that several seeds need on a GPU, where at most ``AT_ONCE`` of them are trained as one.
 
     (Seed, name of the job) -> a notebook of each seed of its group that needs the model; the groups by their seeds.
@@ -155,7 +153,8 @@ def _step(
     run: Run, kind: str, name: str, needs: list[str], settings: str, command: list[str], seconds: float,
     copies: int = 1,
 ) -> Step:  # fmt: skip
-    minutes, memory = 10 + round(copies * seconds / 15), MEMORY[kind] + (copies - 1) * COPY  # four times it, one by one
+    minutes = 10 + round(copies * seconds / 15)  # four times what it should take, of copies one after another
+    memory = MEMORY[kind] + (copies - 1) * COPY
     if run.scale == "smoke":
         minutes, memory = 10, memory // 2
     return Step(kind, f"done/{kind}/{name}", needs, settings, shlex.join(command), minutes, memory)
@@ -216,7 +215,7 @@ def run_all(
 
 def _train_ahead(executions: Sequence[Execution]) -> None:
     """Models that are trained with several seeds as one, before the notebooks that need them."""
-    for (seed, name), group in trained_as_one(executions).items():
+    for (seed, name), group in seed_groups(executions).items():
         runs = [each.run for each in group]
         if seed != runs[0].seed:  # of the same group
             continue
