@@ -1,4 +1,4 @@
-"""Several trainings of one model as one, with stacked weights, against one alone: what a gradient takes.
+"""Several trainings of one model as one, with stacked weights, against one alone: what a gradient takes; and policies.
 
 A gradient of a training loss, at the batch and the future of the study's schedule, of one model and of --copies with
 weights, windows and noise of their own, put through ``torch.func.vmap`` as one call. Windows are drawn beforehand, and
@@ -6,6 +6,9 @@ the optimiser's step is left out, which costs as much per weight either way. CPU
 Models that step through a backward pass of their own (LSTM, rtsm) have no such form. Of rtsm it is one step of the
 recurrence instead, with its backward pass by autograd and rows as in each stage: of one model by ``addmm``, and of all
 copies by ``baddbmm`` over stacked weights.
+
+Of policies it is an update of ``learn_policy``, with the episodes and copies of the study, of one policy in one model,
+and of --copies in as many models by ``learn_stacked``; latent where the model has codes. Weights are new ones.
 
     python benchmarks/copies.py        or        python -m tsmlib bench copies
 """
@@ -23,11 +26,15 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from tsmlib import study
 from tsmlib.models.recurrent import SAMPLES
-from tsmlib.study import runs
+from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
+from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy
+from tsmlib.policies.stacked import learn_stacked
+from tsmlib.study import runs, zoo
 from tsmlib.study.zoo import Updates
 from tsmlib.trajectory import Segment, Window, batches
 
 ENV = "tsm/ReacherPush-v1"
+UPDATES = 2  # of a policy, in each round
 
 
 class Loss(nn.Module):
@@ -110,9 +117,34 @@ def step(net: Any, copies: int, rows: int, device: str) -> Callable[[], float]:
     return timed(device, call)
 
 
+def policies(word: str, copies: int, device: str) -> dict[str, Callable[[], float]]:
+    """Seconds of an update of one policy, and of ``copies`` in as many models."""
+    run, data = runs.resolve("bench", scale="laptop"), study.random_data(ENV, 50, seed=0)
+    task, draw = study.load_task(ENV), episodes_from(torch.from_numpy(data.states[:, 0]))
+    o = LearningOptions(horizon=task.horizon, iterations=UPDATES, record_every=UPDATES)
+    (dx, du), latent = (data.states.shape[2], data.actions.shape[2]), word in zoo.words(cls=zoo.CODED)
+    nets: list[Any] = [study.initialise(run, word, data).to(device) for _ in range(copies)]
+    made: list[Policy] = []
+    for _ in nets:
+        prior: Any = study.initialise(run, "prior", data)
+        policy = SegmentPolicy(dx, prior, copies=3) if latent else OneStepPolicy(dx, du, copies=3)
+        policy.features.fit(torch.from_numpy(data.states))
+        made.append(policy.to(device))
+
+    def one() -> float:
+        return learn_policy(made[0], nets[0], task.reward_for, draw, o).seconds[-1] / UPDATES
+
+    def many() -> float:
+        curves = learn_stacked(made, nets, task.reward_for, [draw] * copies, o, seeds=range(copies))
+        return curves[0].seconds[-1] / UPDATES
+
+    return {"one": one, "many": many}
+
+
 def main() -> None:
     options = parser(__doc__, rounds=7)
     options.add_argument("--models", default="tsm,onestep,multistep,rtsm")
+    options.add_argument("--policies", default="tsm,onestep,lstm,rtsm", help="models of the policies")
     options.add_argument("--copies", type=int, default=10)
     options.add_argument("--device", default="cpu")
     arguments = parsed(options)
@@ -133,6 +165,12 @@ def main() -> None:
                 "one training", seconds["one"], unit="s", env=ENV, sim="mujoco", task="push", model=word,
                 configuration=stage.loss, metric="seconds",
             ))  # fmt: skip
+    for word in arguments.policies.split(","):
+        seconds = interleaved(policies(word, copies, arguments.device), arguments.rounds)
+        rows.append(Row.of(
+            f"{copies} policies in {word} as one, an update: seconds", seconds["many"], "one policy", seconds["one"],
+            unit="s", env=ENV, sim="mujoco", task="push", model=word, configuration="policy", metric="seconds",
+        ))  # fmt: skip
     print(f"{ENV}, {arguments.rounds} rounds, {arguments.threads} threads, {arguments.device}")
     save("copies", rows)
 

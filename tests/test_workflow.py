@@ -140,6 +140,16 @@ def test_on_a_gpu_a_model_that_several_seeds_need_is_one_step_of_all_of_them() -
 
 
 @pytest.mark.usefixtures("gpu")
+def test_a_policy_is_one_step_of_all_seeds_too_after_the_models_that_it_learns_in() -> None:
+    steps = table("paper", (0, 2), device="cuda")
+    step = steps["seeds0-2/models/ReacherPush/policy-rtsm-latent"]
+    assert step.kind == "policy"
+    assert {"seeds0-2/models/ReacherPush/rtsm", "seed0/data/ReacherPush/train"} <= set(step.needs)
+    assert step.files == [f"seed{seed}/models/ReacherPush/policy-rtsm-latent.safetensors" for seed in (0, 2)]
+    assert not any("seeds" in name and ("plans" in name or "scores" in name) for name in steps)
+
+
+@pytest.mark.usefixtures("gpu")
 def test_a_seed_whose_model_ships_is_none_of_those_that_are_trained(place: Path) -> None:
     steps = table("laptop", (0, 1, 2), device="cuda")
     assert steps["seeds1-2/models/Reacher/lstm"].files == [
@@ -261,7 +271,7 @@ def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebo
     prepared = workflow.prepare([runs.notebooks()["train"]], (0, 2, 3, 4), scale="smoke", device="", given=given)
     groups = {(each.run.seed, job): group for group in (prepared[:2], prepared[2:]) for each in group}
     monkeypatch.setattr(workflow, "seed_groups", lambda _: groups)  # as on a GPU
-    workflow._train_ahead(prepared)
+    workflow._make_ahead(prepared)
     for execution in prepared:
         assert artifacts.read_header(execution.run.dir / f"{job}.safetensors")["copies"] == 2
 

@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     flow.add_argument(
         "--seeds",
         default="",
-        help="such as 0-9 or 0,2,5: a job for each model (on a GPU one for all seeds), score, plan, notebook",
+        help="such as 0-9 or 0,2,5: a job for each model, policy (on a GPU one for all seeds), score, plan, notebook",
     )
     flow.add_argument("--executor", default="", help="local, slurm or another plugin of Snakemake's; pool: without it")
     flow.add_argument("--jobs", type=int, default=0, help="at a time (default: one for each core; elsewhere 100)")
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     step.add_argument("--job", default="", help="what the notebook needs, by its name; default: the notebook itself")
     for option in ("--scale", "--seed", "--device"):
         step.add_argument(option, default="0" if option == "--seed" else "")
-    step.add_argument("--seeds", default="", help="of a model that is trained with several as one")
+    step.add_argument("--seeds", default="", help="of a model or policy that is made with several as one")
     step.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[])
     copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
     copy.add_argument("folder", type=Path)

@@ -52,8 +52,8 @@ class Features(nn.Module):
 
     @property
     def fitted(self) -> bool:
-        """Whether there are statistics: data in which nothing moves have none."""
-        return bool(self.step_std.any())
+        """Whether there are statistics: data in which nothing moves have none. What is settled has them."""
+        return self._settled is not None or bool(self.step_std.any())
 
     @property
     def moving(self) -> Tensor:

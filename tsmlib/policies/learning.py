@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +36,7 @@ from tsmlib.trajectory import Segment, initial_past
 
 Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]  # n -> starting states (n, dx), targets (n, dg)
 Measure = Callable[[Policy], Mapping[str, Tensor]]  # named numbers, one per copy (M,)
+NOT_FINITE = "the gradient of the return is not finite"
 
 
 def imagine(
@@ -135,18 +136,12 @@ def learn_policy(
     FloatingPointError for one that is not finite where states are; TrainingStopped, with the weights of the last record
     in ``policy``, where states or gradients are not finite; StoreError for a checkpoint of another run or in use.
     """
-    o = options or LearningOptions()
-    _take_statistics(policy, model)
-    trained = [p for p in policy.parameters() if p.requires_grad]
-    optimizer = torch.optim.Adam(trained, lr=o.lr)
-    identity = asdict(o) | dict(
-        policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
-        reward=getattr(reward, "__name__", "reward"), seed=seed,
+    learner = Learner.of(
+        policy, model, reward, draw, options or LearningOptions(), seed,
+        measure=measure, callback=callback, checkpoint=checkpoint,
     )  # fmt: skip
-    if checkpoint is not None:
-        identity["drawn"] = summary(draw)
-    state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), o.iterations, identity, checkpoint)
-    learner = _Learner(policy, model, reward, draw, measure, callback, o, seed, state)
+    o, state, trained = learner.options, learner.state, learner.trained
+    optimizer = state.optimizers["adam"]
     purpose = f"learning a policy, seed {seed}"
     with resumable(state, purpose=purpose, progress=progress) as bar, _frozen(model):
         if not state.step:
@@ -158,8 +153,8 @@ def learn_policy(
             value = discounted(learner.rewards(iteration, o.episodes), o.gamma).mean(1)  # Eq. 4, (M,)
             optimizer.zero_grad(set_to_none=True)
             (-value.sum()).backward()
-            if not torch.isfinite(_clip(trained, o.clip)).all():
-                raise state.stopped("the gradient of the return is not finite", iteration)
+            if not torch.isfinite(clip([p.grad for p in trained if p.grad is not None], o.clip)).all():
+                raise state.stopped(NOT_FINITE, iteration)
             optimizer.step()
             state.step, state.seconds = iteration + 1, state.seconds + time.process_time() - began
             bar.update()
@@ -171,28 +166,59 @@ def learn_policy(
 
 
 @dataclass(frozen=True)
-class _Learner:
+class Learner:
     """Imagined episodes of a policy, functions of (seed, iteration), and what is recorded of them."""
 
     policy: Policy
     model: Model
     reward: Callable[[Tensor], Reward]
     draw: Draw
-    measure: Measure | None
-    callback: Callback | None
     options: LearningOptions
     seed: int
     state: TrainingState[LearningCurve]
+    measure: Measure | None = None
+    callback: Callback | None = None
 
-    def rewards(self, iteration: int, n: int) -> Tensor:
-        """Rewards of each step of n episodes of each copy: (M, n, T)."""
+    @classmethod
+    def of(
+        cls, policy: Policy, model: Model, reward: Callable[[Tensor], Reward], draw: Draw, options: LearningOptions,
+        seed: int, *, measure: Measure | None = None, callback: Callback | None = None, checkpoint: Path | None = None,
+    ) -> Self:  # fmt: skip
+        """As learning starts: with statistics, a new optimiser and what tells it from other runs."""
+        _take_statistics(policy, model)
+        optimizer = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], lr=options.lr)
+        identity = asdict(options) | dict(
+            policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
+            reward=getattr(reward, "__name__", "reward"), seed=seed,
+        )  # fmt: skip
+        if checkpoint is not None:
+            identity["drawn"] = summary(draw)
+        state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), options.iterations, identity, checkpoint)
+        return cls(policy, model, reward, draw, options, seed, state, measure, callback)
+
+    @property
+    def trained(self) -> list[nn.Parameter]:
+        """The weights that are learned."""
+        return [p for p in self.policy.parameters() if p.requires_grad]
+
+    def episodes(self, iteration: int, n: int) -> tuple[Tensor, Tensor, SeparateNoise]:
+        """Starts and targets (M n, .) of n episodes of each copy, and what draws their noise."""
         seeds = [(self.seed + m) * 1_000_003 + iteration for m in range(self.policy.copies)]
         generators = tuple(torch.Generator().manual_seed(seed) for seed in seeds)
         start, target = (torch.cat(part) for part in zip(*(self.draw(n, g) for g in generators), strict=True))
+        return start, target, SeparateNoise(generators)
+
+    def rewards(self, iteration: int, n: int) -> Tensor:
+        """Rewards of each step of n episodes of each copy: (M, n, T)."""
+        start, target, noise = self.episodes(iteration, n)
         seen = imagine(
             self.policy, self.model, start, target, horizon=self.options.horizon, noise=self.options.noise,
-            generator=SeparateNoise(generators),
+            generator=noise,
         )  # fmt: skip
+        return self.rewarded(target, seen, iteration)
+
+    def rewarded(self, target: Tensor, seen: Segment, iteration: int) -> Tensor:
+        """Rewards (M, n, T) of what was imagined, checked."""
         if not torch.isfinite(seen.states).all():
             raise self.state.stopped("the model predicts states that are not finite", iteration)
         rewards = rewarded(self.reward(target), *seen)
@@ -205,7 +231,7 @@ class _Learner:
                 "the reward has no gradient: write it with differentiable torch operations on the states or actions "
                 "(no comparisons, rounding, .detach(), .item() or numpy)"
             )
-        return rewards.unflatten(0, (self.policy.copies, n))
+        return rewards.unflatten(0, (self.policy.copies, -1))
 
     def record(self) -> None:
         """A point of the curve; the present weights are those to go back to."""
@@ -259,9 +285,8 @@ def summary(draw: Draw, n: int = 1000) -> dict[str, list[list[float]]]:
     }
 
 
-def _clip(parameters: Sequence[Tensor], norm: float) -> Tensor:
-    """Shorten each copy's gradient to ``norm``; the norms before (M,)."""
-    gradients = [p.grad for p in parameters if p.grad is not None]
+def clip(gradients: Sequence[Tensor], norm: float) -> Tensor:
+    """Shorten each copy's gradients (M, ...) to ``norm``, in place, unless that is 0; the norms before (M,)."""
     found = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
     if norm:
         for g in gradients:
@@ -280,7 +305,7 @@ def _take_statistics(policy: Policy, model: Model) -> None:
         warnings.warn(
             f"the policy has the angles {own.angles}, the model {known.angles}, so that it learns on states in raw "
             f"units. Make it with angles={tuple(known.angles)}, or call policy.features.fit(torch.from_numpy(states))",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

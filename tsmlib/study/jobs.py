@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation import prediction
@@ -48,6 +48,14 @@ class Job(Protocol):
 
     def ships(self, run: Run) -> bool:
         """Whether one comes with the package that a run may take in place of its own."""
+
+
+@runtime_checkable
+class SeedsJob(Job, Protocol):
+    """A job that several seeds may do as one."""
+
+    def make_as_one(self, runs: Sequence[Run]) -> object:
+        """Find it in runs of several seeds; for those that lack it, make it as one."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +107,6 @@ class Model:
         return models.load_or_train(run, self.env, self.word)
 
     def make_as_one(self, runs: Sequence[Run]) -> object:
-        """The model of several runs; missing ones are trained as one."""
         return models.load_or_train_as_one(runs, self.env, self.word)
 
     def settings(self, run: Run) -> Json:
@@ -201,6 +208,9 @@ class Policy:
 
     def make(self, run: Run) -> object:
         return policies.learn(run, load_task(self.env).take(self.n), self.method, self.budget)
+
+    def make_as_one(self, runs: Sequence[Run]) -> object:
+        return policies.learn_as_one(runs, load_task(self.env).take(self.n), self.method, self.budget)
 
     def settings(self, run: Run) -> Json:
         return {**asdict(policies.complete(run, self.budget)), "episodes": EPISODES[run.scale]}

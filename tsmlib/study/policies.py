@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple, Self, cast
 
 import pandas as pd
 import torch
@@ -18,17 +18,18 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.learning import LearningOptions, episodes_from, imagine, learn_policy
+from tsmlib.policies.learning import Draw, LearningCurve, LearningOptions, episodes_from, imagine, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
+from tsmlib.policies.stacked import learn_stacked
 from tsmlib.storage import artifacts, tables
-from tsmlib.storage.files import Json
+from tsmlib.storage.files import Json, StoreError
 from tsmlib.study.comparison import table
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
 from tsmlib.study.results.policies import EPISODES, GRADIENTS, finished, learning_curves, learning_rows, plateau_rows
 from tsmlib.study.results.table import PolicyHeader, Row, of_task, select
 from tsmlib.study.runs import Run
-from tsmlib.trajectory import Trajectories
+from tsmlib.training.checkpoint import TrainingStopped
 
 
 @dataclass(frozen=True)
@@ -61,37 +62,34 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
     From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its budget; else learned now,
     going on from its checkpoint if it was stopped.
     """
-    if method.search_space not in SEARCH_SPACES or budget.iterations < 0 or budget.copies < 1:
-        raise ValueError(
-            f"search space is {method.search_space!r}, iterations {budget.iterations}, copies {budget.copies}; "
-            f"expected {' or '.join(SEARCH_SPACES)}, 0 (the scale's default) or more iterations, and at least one copy"
-        )
-    if not task.is_standard:  # a file of a policy is known by the name of its task
-        raise ValueError(
-            f"task {task.name!r} has a reward of its own; expected the paper's. Learn for it with tsmlib.learn_policy"
-        )
-    net = load_or_train(run, task.env, method.model).model
-    prior = load_prior(run, task.env) if method.search_space == "latent" else None
-    weights = {"model": artifacts.digest(net.state_dict())}
-    if prior is not None:
-        weights["prior"] = artifacts.digest(prior.state_dict())
-    made_from: dict[str, Json] = {"task": task.name, "horizon": task.horizon, "seed": run.seed, "weights": weights}
-    budget = complete(run, budget)
-    own = _path(run, task.env, method)
-    shipped = run.shipped / own.parent.name / own.name
-    cls: type[Policy] = OneStepPolicy if prior is None else SegmentPolicy
-    for path in [own, shipped] if run.scale == "laptop" and run.seed == 0 else [own]:
-        if path.exists():
-            header = cast(PolicyHeader, artifacts.read_header(path))
-            if header.get("made_from") == made_from and (path == shipped or header.get("budget") == asdict(budget)):
-                return Learned(artifacts.load_model(path, cls, expect=fingerprint(task.env)), header)
-    print(
-        f"{task.env}: no {method.search_space} policy learned in {method.model} at scale {run.scale}; learning it now, "
-        f"{budget.iterations} iterations of 0.1 to 1 s. Stopped, it goes on from there the next time"
-    )
-    about: PolicyHeader = {"made_from": made_from, "budget": asdict(budget), "model": method.model,
-             "search_space": method.search_space, "targets": len(task)}  # fmt: skip
-    return _learn(run, task, net, prior, budget, own, about)
+    lesson = _Lesson.of(run, task, method, budget)
+    return lesson.kept() or lesson.learned()
+
+
+def learn_as_one(runs: Sequence[Run], task: Task, method: Method, budget: Budget = USUAL) -> list[Learned]:
+    """``learn`` of runs with several seeds; those that lack the policy learn it as one (``learn_stacked``).
+
+    Where that is not possible, in an ensemble or with one seed whose model diverges for instance, it is said, and they
+    learn one after another; TrainingStopped for the first that could not, when the others are there.
+    """
+    lessons = [_Lesson.of(run, task, method, budget) for run in runs]
+    missing = [lesson for lesson in lessons if not lesson.kept()]
+    if len(missing) > 1:
+        try:
+            _learn_as_one(missing)
+        except StoreError:
+            raise
+        except (TrainingStopped, torch.OutOfMemoryError, ValueError) as error:
+            print(f"{task.env}: policies of {len(missing)} seeds are not learned as one, but one by one: {error}")
+    found, stopped = list[Learned](), list[TrainingStopped]()
+    for lesson in lessons:
+        try:
+            found.append(lesson.kept() or lesson.learned())
+        except TrainingStopped as error:
+            stopped.append(error)
+    if stopped:
+        raise stopped[0]
+    return found
 
 
 def complete(run: Run, budget: Budget) -> Budget:
@@ -99,55 +97,150 @@ def complete(run: Run, budget: Budget) -> Budget:
     return replace(budget, iterations=budget.iterations or run.pick(smoke=4, laptop=300, paper=2200))
 
 
-def _learn(
-    run: Run, task: Task, net: TrainedModel, prior: ActionPrior | None, budget: Budget, path: Path, about: PolicyHeader
-) -> Learned:
-    """Learn a policy and store it at ``path``. Resumes from the checkpoint beside it."""
-    data = dataset(run, task.env, "train")
-    policy, checkpoint = _initialise(run, data, prior, budget), path.with_suffix(".checkpoint")
-    curve = learn_policy(
-        policy.to(run.device), net.to(run.device), task.reward_for,
-        episodes_from(torch.from_numpy(data.states[:, 0])),
-        LearningOptions(
-            horizon=task.horizon, iterations=budget.iterations, episodes=EPISODES[run.scale],
-            record_every=max(1, budget.iterations // 10),
-        ),
-        seed=1000 * run.seed, measure=lambda p: assess(p, net, task, seed=run.seed + 1), checkpoint=checkpoint,
-        progress=f"{path.parent.name}: {path.stem}",
+@dataclass(frozen=True)
+class _Lesson:
+    """A policy that a run asks for: what it is learned in, and where its file is."""
+
+    run: Run
+    task: Task
+    method: Method
+    net: TrainedModel
+    prior: ActionPrior | None
+    budget: Budget
+    path: Path
+
+    @classmethod
+    def of(cls, run: Run, task: Task, method: Method, budget: Budget) -> Self:
+        """With its models, trained where they are missing."""
+        if method.search_space not in SEARCH_SPACES or budget.iterations < 0 or budget.copies < 1:
+            raise ValueError(
+                f"search space is {method.search_space!r}, iterations {budget.iterations}, copies {budget.copies}; "
+                f"expected {' or '.join(SEARCH_SPACES)}, 0 (the scale's default) or more iterations, and at least one "
+                "copy"
+            )
+        if not task.is_standard:  # a file of a policy is known by the name of its task
+            raise ValueError(
+                f"task {task.name!r} has a reward of its own; expected the paper's. Learn for it with "
+                "tsmlib.learn_policy"
+            )
+        net = load_or_train(run, task.env, method.model).model
+        prior = load_prior(run, task.env) if method.search_space == "latent" else None
+        return cls(run, task, method, net, prior, complete(run, budget), _path(run, task.env, method))
+
+    @property
+    def made_from(self) -> dict[str, Json]:
+        weights: dict[str, Json] = {"model": artifacts.digest(self.net.state_dict())}
+        if self.prior is not None:
+            weights["prior"] = artifacts.digest(self.prior.state_dict())
+        return {"task": self.task.name, "horizon": self.task.horizon, "seed": self.run.seed, "weights": weights}
+
+    def kept(self) -> Learned | None:
+        """The policy that is there."""
+        run, shipped = self.run, self.run.shipped / self.path.parent.name / self.path.name
+        cls: type[Policy] = OneStepPolicy if self.prior is None else SegmentPolicy
+        for path in [self.path, shipped] if run.scale == "laptop" and run.seed == 0 else [self.path]:
+            if path.exists():
+                header = cast(PolicyHeader, artifacts.read_header(path))
+                asked = path == shipped or header.get("budget") == asdict(self.budget)
+                if header.get("made_from") == self.made_from and asked:
+                    return Learned(artifacts.load_model(path, cls, expect=fingerprint(self.task.env)), header)
+        return None
+
+    def learned(self) -> Learned:
+        """Learned now, going on from the checkpoint beside its file, and stored."""
+        self.say()
+        policy, title = self.policy().to(self.run.device), f"{self.path.parent.name}: {self.path.stem}"
+        curve = learn_policy(
+            policy, self.net.to(self.run.device), self.task.reward_for, self.episodes(), self.options(),
+            seed=self.seed, measure=self.measure, checkpoint=self.checkpoint, progress=title,
+        )  # fmt: skip
+        return self.store(policy, curve)
+
+    def say(self) -> None:
+        print(
+            f"{self.task.env}: no {self.method.search_space} policy learned in {self.method.model} at scale "
+            f"{self.run.scale}; learning it now, {self.budget.iterations} iterations of 0.1 to 1 s. Stopped, it goes "
+            "on from there the next time"
+        )
+
+    @property
+    def seed(self) -> int:
+        """Of the first copy."""
+        return 1000 * self.run.seed
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.path.with_suffix(".checkpoint")
+
+    def policy(self) -> Policy:
+        """The policy as learning starts."""
+        data, (copies, seed) = dataset(self.run, self.task.env, "train"), (self.budget.copies, self.seed)
+        dx, du = data.states.shape[2], data.actions.shape[2]
+        policy: Policy
+        if self.prior is None:
+            policy = OneStepPolicy(dx, du, angles=data.angles, copies=copies, seed=seed)
+        else:
+            policy = SegmentPolicy(dx, self.prior, angles=data.angles, copies=copies, seed=seed)
+        policy.features.fit(torch.from_numpy(data.states), data.lengths)
+        return policy
+
+    def episodes(self) -> Draw:
+        return episodes_from(torch.from_numpy(dataset(self.run, self.task.env, "train").states[:, 0]))
+
+    def options(self) -> LearningOptions:
+        n = self.budget.iterations
+        return LearningOptions(
+            horizon=self.task.horizon, iterations=n, episodes=EPISODES[self.run.scale], record_every=max(1, n // 10)
+        )
+
+    def measure(self, policy: Policy) -> dict[str, Tensor]:
+        return assess(policy, self.net, self.task, seed=self.run.seed + 1)
+
+    def store(self, policy: Policy, curve: LearningCurve, *, policies: int = 1) -> Learned:
+        """policies: that were learned as one."""
+        header: dict[str, Json] = {
+            "made_from": self.made_from, "budget": asdict(self.budget), "model": self.method.model,
+            "search_space": self.method.search_space, "targets": len(self.task),
+            "fingerprint": fingerprint(self.task.env), "seed": self.run.seed, "scale": self.run.scale,
+            "curve": asdict(curve), "seconds": curve.seconds[-1], "torch": torch.__version__,
+            "threads": torch.get_num_threads(), "device": self.run.device, "finished": time.strftime("%Y-%m-%d"),
+        }  # fmt: skip
+        if policies > 1:
+            header["policies"] = policies
+        artifacts.save_model(self.path, policy.cpu(), header)
+        shutil.rmtree(self.checkpoint)
+        return Learned(policy, cast(PolicyHeader, artifacts.read_header(self.path)))
+
+
+def _learn_as_one(lessons: Sequence[_Lesson]) -> None:
+    """Learn the policies of several seeds as one and store each where its run finds it."""
+    first = lessons[0]
+    first.say()
+    policies = [lesson.policy().to(first.run.device) for lesson in lessons]
+    curves = learn_stacked(
+        policies, [cast(torch.nn.Module, lesson.net.to(first.run.device)) for lesson in lessons],
+        first.task.reward_for, [lesson.episodes() for lesson in lessons], first.options(),
+        seeds=[lesson.seed for lesson in lessons], measures=[lesson.measure for lesson in lessons],
+        checkpoints=[lesson.checkpoint for lesson in lessons],
+        progress=f"{first.path.parent.name}: {first.path.stem}, {len(lessons)} seeds",
     )  # fmt: skip
-    header: dict[str, Json] = {
-        **cast("dict[str, Json]", about), "fingerprint": fingerprint(task.env), "seed": run.seed, "scale": run.scale,
-        "curve": asdict(curve), "seconds": curve.seconds[-1], "torch": torch.__version__,
-        "threads": torch.get_num_threads(), "device": run.device, "finished": time.strftime("%Y-%m-%d"),
-    }  # fmt: skip
-    artifacts.save_model(path, policy.cpu(), header)
-    shutil.rmtree(checkpoint)
-    return Learned(policy, cast(PolicyHeader, artifacts.read_header(path)))
-
-
-def _initialise(run: Run, data: Trajectories, prior: ActionPrior | None, budget: Budget) -> Policy:
-    """The policy as learning starts."""
-    (dx, du), seed = (data.states.shape[2], data.actions.shape[2]), 1000 * run.seed
-    policy: Policy
-    if prior is None:
-        policy = OneStepPolicy(dx, du, angles=data.angles, copies=budget.copies, seed=seed)
-    else:
-        policy = SegmentPolicy(dx, prior, angles=data.angles, copies=budget.copies, seed=seed)
-    policy.features.fit(torch.from_numpy(data.states), data.lengths)
-    return policy
+    for lesson, policy, curve in zip(lessons, policies, curves, strict=True):
+        lesson.store(policy, curve, policies=len(lessons))
 
 
 def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[Row]:
     """Rows of policies: how each was learned and what its model and prior have cost, its steps within the data's
     torques, and when those with a prior and the model-free ones came to their common plateau (``plateau_rows``), to
-    which those of scale laptop never come.
+    which those of scale laptop never come. No seconds of what was trained or learned as one of several: they are of
+    all together.
 
     Learned where they are missing.
     """
     rows: list[Row] = []
     for task, method, budget in wanted:
         found, words = learn(run, task, method, budget), [method.model] + ["prior"] * (method.search_space == "latent")
-        seconds = sum(load_or_train(run, task.env, word).header["seconds"] for word in words)
+        trained = [load_or_train(run, task.env, word).header for word in words]
+        seconds = None if any("copies" in each for each in trained) else sum(each["seconds"] for each in trained)
         rows += learning_rows(
             found.header, samples=100 * sizes(run, task.env)["train"], train_seconds=seconds,
             n=found.header.get("targets", 100),  # those that it was measured on as it was learned

@@ -30,7 +30,7 @@ from tsmlib.storage.files import writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import notebooks
 from tsmlib.study.data import require_other_seed
-from tsmlib.study.jobs import Job, Model, complete
+from tsmlib.study.jobs import Job, SeedsJob, complete
 from tsmlib.study.needed import needs
 from tsmlib.study.notebooks import Execution, terminable
 from tsmlib.study.parallel import cores, precompute
@@ -42,7 +42,7 @@ POOL = "pool"  # in place of an executor: no Snakemake
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 COPY = 500  # MB more for each further seed of a training of several: its data
-AT_ONCE = 10  # seeds of a training of several
+AT_ONCE = 10  # seeds of what several make as one
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
@@ -71,7 +71,7 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
     """Name -> step, of notebooks and all that they need. given: parameters of the notebooks, as typed.
 
     A job that two notebooks need with other settings, plans for more targets for instance, is made for the first; the
-    other makes its own when it comes to it, once the first is done. A model that is trained with several seeds as one
+    other makes its own when it comes to it, once the first is done. What several seeds make as one
     (``seed_groups``) is a step of all of them.
     """
     found: dict[str, Step] = {}
@@ -122,14 +122,14 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
 
 
 def seed_groups(executions: Sequence[Execution]) -> dict[tuple[int, str], list[Execution]]:
-    """Models that several seeds need on a GPU, where at most ``AT_ONCE`` of them are trained as one.
+    """Models and policies that several seeds need on a GPU, where at most ``AT_ONCE`` of them are made as one.
 
-    (Seed, name of the job) -> a notebook of each seed of its group that needs the model; the groups by their seeds.
+    (Seed, name of the job) -> a notebook of each seed of its group that needs it; the groups by their seeds.
     """
     need: dict[str, dict[int, Execution]] = {}
     for execution in executions:
         for job in needs(execution.run) if execution.run.device != "cpu" else ():
-            if isinstance(job, Model) and not job.ships(execution.run):
+            if isinstance(job, SeedsJob) and not job.ships(execution.run):
                 need.setdefault(job.name, {}).setdefault(execution.run.seed, execution)
     found: dict[tuple[int, str], list[Execution]] = {}
     for name, of in need.items():
@@ -206,33 +206,33 @@ def run_all(
         manifest.write_json(folder / "code.json", {"codes": codes})
         if executor == POOL:
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
-            _train_ahead(executions)
+            _make_ahead(executions)
             for execution in executions:
                 print(notebooks.execute(execution))
             return 0
         return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
 
 
-def _train_ahead(executions: Sequence[Execution]) -> None:
-    """Models that are trained with several seeds as one, before the notebooks that need them."""
+def _make_ahead(executions: Sequence[Execution]) -> None:
+    """What several seeds make as one, before the notebooks that need it."""
     for (seed, name), group in seed_groups(executions).items():
         runs = [each.run for each in group]
         if seed != runs[0].seed:  # of the same group
             continue
         job = complete(runs[0], needs(runs[0]))[name]
-        assert isinstance(job, Model)
+        assert isinstance(job, SeedsJob)
         for run in runs:
-            precompute(run, job.needs(run), progress=f"data of seed {run.seed}")
-        _train_as_one(job, runs)
+            precompute(run, job.needs(run), progress=f"before {job.name}, seed {run.seed}")
+        _make_as_one(job, runs)
 
 
 def step(executions: Sequence[Execution], job: str) -> None:
     """One step of a workflow: a job that a notebook needs, by its name, or the notebook itself where that is ''.
 
-    executions: a notebook with one seed; with several where a model is trained with them as one. Waits for whoever
-    makes the same, an orphan of a workflow that was killed for instance; then it is there, or goes on from its
-    checkpoint (trainings of several seeds have none). RunError where this is not the code of the workflow,
-    ParameterError for a job that the notebook does not need, and for several seeds of anything but a model.
+    executions: a notebook with one seed; with several where a model or policy is made with them as one. Waits for
+    whoever makes the same, an orphan of a workflow that was killed for instance; then it is there, or goes on from its
+    checkpoint (models of several seeds have none). RunError where this is not the code of the workflow, ParameterError
+    for a job that the notebook does not need, and for several seeds of anything else.
     """
     run = executions[0].run
     codes, now = _codes(run.dir.parent / "workflow"), str(provenance()["code"])
@@ -250,15 +250,17 @@ def step(executions: Sequence[Execution], job: str) -> None:
             return
         with terminable(), _locked([run], job):
             known[job].make(run)
-    elif isinstance(model := known.get(job), Model):
-        _train_as_one(model, [each.run for each in executions])
+    elif isinstance(found := known.get(job), SeedsJob):
+        _make_as_one(found, [each.run for each in executions])
     else:
-        raise ParameterError(f"{job or run.notebook} is made with one seed at a time; only models are with several.")
+        raise ParameterError(
+            f"{job or run.notebook} is made with one seed at a time; only models and policies are with several."
+        )
 
 
-def _train_as_one(model: Model, runs: Sequence[Run]) -> None:
-    with terminable(), _locked(runs, model.name):
-        model.make_as_one(runs)
+def _make_as_one(job: SeedsJob, runs: Sequence[Run]) -> None:
+    with terminable(), _locked(runs, job.name):
+        job.make_as_one(runs)
 
 
 @contextmanager

@@ -31,13 +31,14 @@ Curves = dict[str, np.ndarray]
 
 
 def learning_rows(
-    header: PolicyHeader, *, samples: int, train_seconds: float, n: int = 100, within_data: Iterable[float] = ()
+    header: PolicyHeader, *, samples: int, train_seconds: float | None, n: int = 100, within_data: Iterable[float] = ()
 ) -> list[Row]:
     """Rows of a learned policy, one per record, copy and metric; header: as ``study.learn`` returns it.
 
-    samples: environment steps in the data set of its model; train_seconds: of the model and the prior; n: the targets
-    it is measured on. Both are rows too, so that the table says what a policy has cost in all. within_data: of the
-    learned policy, one per copy (``study.within_data``).
+    samples: environment steps in the data set of its model; train_seconds: of the model and the prior, None where that
+    is not known of one alone; n: the targets it is measured on. Both are rows too, so that the table says what a policy
+    has cost in all; of a policy that was learned with others as one no seconds are. within_data: of the learned policy,
+    one per copy (``study.within_data``).
     """
     common, curve = table.policy(header), header["curve"]
     measured = {metric: np.asarray(values) for metric, values in curve["measured"].items()}  # (records, copies) each
@@ -51,10 +52,12 @@ def learning_rows(
     rows += [
         dict(common, iteration=iteration, metric="seconds", value=seconds, unit="s")
         for iteration, seconds in zip(curve["iteration"], curve["seconds"], strict=True)
+        if "policies" not in header
     ]
     common["iteration"] = curve["iteration"][-1]
     for metric, value, unit in (("samples", samples, "steps"), ("train_seconds", train_seconds, "s")):
-        rows.append(dict(common, metric=metric, value=value, unit=unit))
+        if value is not None:
+            rows.append(dict(common, metric=metric, value=value, unit=unit))
     return rows + [
         dict(common, metric="within_data", value=float(value), unit="share", n=n, copy=copy)
         for copy, value in enumerate(within_data)
@@ -84,6 +87,8 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
         for metric, against in ways.items():
+            if np.isnan(own[against]).any():  # seconds that are not known
+                continue
             spent = reached(own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
             rows.append(dict(
@@ -153,7 +158,7 @@ def _curves(own: pd.DataFrame) -> Curves:
     at, wide = wide.columns.to_numpy(dtype=int), seed_means(wide)
     curves: Curves = {"seeds": np.array(own["seed"].nunique())}
     curves |= {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
-    curves["seconds"] = curves.pop(clock).mean(0)
+    curves["seconds"] = curves.pop(clock).mean(0) if clock in curves else np.full(len(at), np.nan)
     if not own["search_space"].iloc[0]:
         return curves | {"steps": at, "samples": at}
     samples, before = (own[own["metric"] == metric]["value"].mean() for metric in ("samples", "train_seconds"))

@@ -51,7 +51,10 @@ class LearnedCurve(TypedDict):
 
 
 class PolicyHeader(TypedDict, total=False):
-    """What the file of a learned policy says of itself; targets: that it was measured on as it was learned."""
+    """What the file of a learned policy says of itself; targets: that it was measured on as it was learned.
+
+    seconds: of the CPU; of ``policies`` that were learned as one, of all together.
+    """
 
     fingerprint: dict[str, Json]
     made_from: dict[str, Json]
@@ -67,6 +70,7 @@ class PolicyHeader(TypedDict, total=False):
     threads: int
     device: str
     finished: str
+    policies: int
 
 
 # Places and methods --------------------------------------------------------------------------------------------------

@@ -1,0 +1,202 @@
+"""Policies of several seeds, learned as one, are each what ``learn_policy`` makes of it alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from untrained import in_units
+
+from tsmlib import study
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.baselines import LSTM, OneStep
+from tsmlib.models.ensemble import Ensemble
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.models.tsm import TSM
+from tsmlib.policies.learning import Draw, LearningCurve, LearningOptions, episodes_from, learn_policy
+from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy
+from tsmlib.policies.stacked import learn_stacked
+from tsmlib.rewards import Reward
+from tsmlib.sampling import Noise
+from tsmlib.study import policies as study_policies
+from tsmlib.study import runs
+from tsmlib.training.checkpoint import TrainingStopped
+from tsmlib.trajectory import Segment
+
+DX, DU, H = 5, 2, 4
+SEEDS = (10, 20)
+OPTIONS = LearningOptions(horizon=9, episodes=3, iterations=6, record_every=2, lr=1e-2)
+SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
+MODELS: dict[str, Any] = {
+    "tsm": lambda: TSM(DX, DU, angles=(1,), **SMALL),
+    "onestep": lambda: OneStep(DX, DU, angles=(1,), hidden=8, layers=1),
+    "lstm": lambda: LSTM(DX, DU, angles=(1,), hidden=8, past_len=H, segment_len=8),
+    "rtsm": lambda: RecurrentTSM(DX, DU, angles=(1,), hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=8),
+}
+KINDS = ("onestep", "segment")
+
+
+def arrive(target: Tensor) -> Reward:
+    return lambda states, actions: -(states[..., 2:4] - target[:, None]).square().sum(-1)
+
+
+def models(word: str) -> list[Any]:
+    """Of other weights and other statistics."""
+    made = []
+    for seed in SEEDS:
+        torch.manual_seed(seed)
+        net = in_units(MODELS[word]())
+        net.features.step_std.fill_(0.1 + seed / 1000)
+        made.append(net)
+    return made
+
+
+def policies(kind: str) -> list[Any]:
+    made: list[Policy] = []
+    for seed in SEEDS:
+        options: dict[str, Any] = dict(angles=(1,), copies=2, seed=seed)
+        torch.manual_seed(seed)
+        if kind == "onestep":
+            made.append(OneStepPolicy(DX, DU, hidden=8, **options))
+        else:
+            prior = ActionPrior(DU, latent_dim=3, **SMALL)
+            made.append(SegmentPolicy(DX, prior, channels=8, dilations=(1, 2), **options))
+    return made
+
+
+def draws() -> list[Draw]:
+    starts = torch.Generator().manual_seed(0)
+    return [episodes_from(torch.randn(20, DX, generator=starts)) for _ in SEEDS]
+
+
+def alone(kind: str, word: str, options: LearningOptions = OPTIONS, **given: Any) -> tuple[list[Any], list[Any]]:
+    learned = policies(kind)
+    curves = [
+        learn_policy(policy, model, arrive, draw, options, seed=seed, **{name: of[k] for name, of in given.items()})
+        for k, (policy, model, draw, seed) in enumerate(zip(learned, models(word), draws(), SEEDS, strict=True))
+    ]
+    return learned, curves
+
+
+def together(kind: str, word: str, options: LearningOptions = OPTIONS, **given: Any) -> tuple[list[Any], list[Any]]:
+    learned = policies(kind)
+    return learned, learn_stacked(learned, models(word), arrive, draws(), options, seeds=SEEDS, **given)
+
+
+def assert_same(one: tuple[list[Any], list[LearningCurve]], other: tuple[list[Any], list[LearningCurve]]) -> None:
+    for a, b in zip(one[1], other[1], strict=True):
+        assert a.iteration == b.iteration
+        torch.testing.assert_close(torch.tensor(b.predicted), torch.tensor(a.predicted), rtol=1e-4, atol=1e-4)
+    for a, b in zip(one[0], other[0], strict=True):
+        for name, weight in a.state_dict().items():
+            torch.testing.assert_close(b.state_dict()[name], weight, rtol=1e-3, atol=1e-4, msg=name)
+
+
+@pytest.mark.parametrize("word", MODELS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_of_several_policies_learns_what_it_learns_alone(kind: str, word: str) -> None:
+    before = policies(kind)
+    found = together(kind, word)
+    assert_same(alone(kind, word), found)
+    assert all(not torch.equal(a.net[0].weight, b.net[0].weight) for a, b in zip(before, found[0], strict=True)
+               if kind == "onestep")  # fmt: skip
+    assert found[1][0].predicted != found[1][1].predicted
+
+
+def test_each_copys_gradient_is_shortened_by_its_own_norm() -> None:
+    options = replace(OPTIONS, clip=1e-3)
+    assert_same(alone("onestep", "rtsm", options), together("onestep", "rtsm", options))
+
+
+@pytest.mark.parametrize("first", [alone, together])
+def test_what_was_stopped_goes_on_together_or_alone(first: Any, tmp_path: Path) -> None:
+    def stop_at_4(policy: Policy) -> dict[str, Tensor]:
+        asked.append(policy)
+        if len(asked) > limit:
+            raise KeyboardInterrupt
+        return {"one": torch.ones(2)}
+
+    places, then = [tmp_path / str(seed) for seed in SEEDS], together if first is alone else alone
+    asked, limit, measures = list[Policy](), 4 if first is together else 2, [stop_at_4, stop_at_4]
+    name = "measures" if first is together else "measure"
+    with pytest.raises(KeyboardInterrupt):
+        first("segment", "lstm", **{name: measures, "checkpoints" if first is together else "checkpoint": places})
+    limit, name = 1000, "measure" if first is together else "measures"
+    found = then("segment", "lstm", **{name: measures, "checkpoint" if first is together else "checkpoints": places})
+    assert_same(alone("segment", "lstm"), found)
+    assert found[1][0].measured["one"] == [[1.0, 1.0]] * 4
+
+
+def test_where_one_fails_all_stop_with_the_weights_of_their_last_record() -> None:
+    broken = models("onestep")
+    with torch.no_grad():
+        next(broken[1].parameters()).fill_(torch.inf)
+    learned, before = policies("onestep"), policies("onestep")
+    with pytest.raises(TrainingStopped, match="the model predicts states that are not finite at iteration 6 of 6"):
+        learn_stacked(learned, broken, arrive, draws(), OPTIONS, seeds=SEEDS)
+    for a, b in zip(learned, before, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+
+
+class Drift(torch.nn.Module):
+    """A model that draws from a generator itself."""
+
+    segment_len = past_len = 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.size = torch.nn.Parameter(torch.ones(()))
+
+    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        assert isinstance(generator, torch.Generator)
+        x = past.states[:, -1:]
+        return x + self.size * torch.randn(x.shape, generator=generator)
+
+
+def test_what_cannot_be_one_of_several_is_refused() -> None:
+    learned, given = policies("onestep"), models("onestep")
+    with pytest.raises(ValueError, match="found 2 policies, 1 models, 2 draws, 2 seeds, 2 measures, 2 checkpoints"):
+        learn_stacked(learned, given[:1], arrive, draws(), OPTIONS, seeds=SEEDS)
+    members: list[Any] = [in_units(Ensemble(DX, DU, members=2, hidden=4, layers=1)) for _ in SEEDS]
+    with pytest.raises(ValueError, match="a Ensemble cannot be one of several models; learn in it by learn_policy"):
+        learn_stacked(learned, members, arrive, draws(), OPTIONS, seeds=SEEDS)
+    with pytest.raises(ValueError, match=r"Drift draws its noise by other means than those of tsmlib\.sampling"):
+        learn_stacked(policies("onestep"), [Drift(), Drift()], arrive, draws(), OPTIONS, seeds=SEEDS)
+    with pytest.raises(ValueError, match="the reward has no gradient"):
+        learn_stacked(learned, given, lambda _: lambda x, u: x[..., 0].sign().detach(), draws(), OPTIONS, seeds=SEEDS)
+
+
+@pytest.mark.parametrize("space", ["latent", "direct"])
+def test_policies_of_several_runs_are_learned_as_one_and_found_by_each(
+    space: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = [runs.resolve("05_control", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in (1, 2)]
+    task, method = study.load_task("tsm/Reacher-v0").take(3), study.method("onestep", space, "policy")
+    made = study_policies.learn_as_one(own, task, method, study.Budget(copies=2))
+    monkeypatch.setattr(study_policies, "learn_policy", None)
+    monkeypatch.setattr(study_policies, "learn_stacked", None)
+    for run, (policy, header) in zip(own, made, strict=True):
+        found = study.learn(run, task, method, study.Budget(copies=2))
+        assert (header["seed"], found.header["seed"], found.header["policies"]) == (run.seed, run.seed, 2)
+        kept, had = found.policy.state_dict(), policy.state_dict()
+        assert all(torch.equal(kept[name], had[name]) for name in kept)
+    again = study_policies.learn_as_one(own, task, method, study.Budget(copies=2))
+    assert [one.header["seed"] for one in again] == [1, 2]
+
+
+def test_policies_that_cannot_learn_as_one_learn_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise ValueError("no such model")
+
+    own = [runs.resolve("05_control", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in (1, 2)]
+    task, method = study.load_task("tsm/Reacher-v0").take(3), study.method("onestep", "direct", "policy")
+    monkeypatch.setattr(study_policies, "learn_stacked", refuse)
+    made = study_policies.learn_as_one(own, task, method)
+    assert "policies of 2 seeds are not learned as one, but one by one: no such model" in capsys.readouterr().out
+    assert [("policies" in one.header, one.header["seed"]) for one in made] == [(False, 1), (False, 2)]
