@@ -7,7 +7,8 @@ Models that step through a backward pass of their own (LSTM, rtsm) have no such 
 recurrence instead, with its backward pass by autograd and rows as in each stage: of one model by ``addmm``, and of all
 copies by ``baddbmm`` over stacked weights.
 
-Of policies it is an update of ``learn_policy``, with the episodes and copies of the study, of one policy in one model,
+Of plans it is what ``cem`` judges candidates by first, a rollout of the mode of --candidates for each of ten targets;
+of policies an update of ``learn_policy``, with the episodes and copies of the study, of one policy in one model,
 and of --copies in as many models by ``learn_stacked``; latent where the model has codes. Weights are new ones.
 
     python benchmarks/copies.py        or        python -m tsmlib bench copies
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -25,6 +27,8 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from tsmlib import study
+from tsmlib.models.base import rollout
+from tsmlib.models.recurrence import as_operations
 from tsmlib.models.recurrent import SAMPLES
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy
@@ -46,6 +50,17 @@ class Loss(nn.Module):
 
     def forward(self, window: Window, generator: torch.Generator) -> Tensor:
         return getattr(self.net, self.loss)(window, generator)
+
+
+class Rollout(nn.Module):
+    """The mode of a model, rolled out, as a module."""
+
+    def __init__(self, net: Any) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, past: Segment, actions: Tensor) -> Tensor:
+        return rollout(self.net, past, actions)
 
 
 def timed(device: str, call: Callable[[], object]) -> Callable[[], float]:
@@ -117,6 +132,30 @@ def step(net: Any, copies: int, rows: int, device: str) -> Callable[[], float]:
     return timed(device, call)
 
 
+def rollouts(word: str, copies: int, candidates: int, device: str) -> dict[str, Callable[[], float]]:
+    """A rollout of candidates for ten targets in one model, and in ``copies`` of them."""
+    run, data = runs.resolve("bench", scale="laptop"), study.random_data(ENV, 50, seed=0)
+    task = study.load_task(ENV).take(10)
+    nets: list[Any] = [study.initialise(run, word, data).to(device) for _ in range(copies)]
+    past, actions = task.past(nets[0].past_len), torch.rand(candidates * len(task), task.horizon, task.action_dim) - 0.5
+    pasts, actions = Segment(*(part.repeat(candidates, 1, 1).to(device) for part in past)), actions.to(device)
+    weights, buffers = stack_module_state(nets)
+    whole = Rollout(deepcopy(nets[0]))
+    whole.net.features.settle()
+    named = {f"net.{name}": part.detach() for name, part in (weights | buffers).items()}
+
+    @torch.no_grad()
+    def many() -> None:
+        with as_operations():
+            vmap(lambda own: functional_call(whole, own, (pasts, actions)))(named)
+
+    @torch.no_grad()
+    def one() -> None:
+        rollout(nets[0], pasts, actions)
+
+    return {"one": timed(device, one), "many": timed(device, many)}
+
+
 def policies(word: str, copies: int, device: str) -> dict[str, Callable[[], float]]:
     """Seconds of an update of one policy, and of ``copies`` in as many models."""
     run, data = runs.resolve("bench", scale="laptop"), study.random_data(ENV, 50, seed=0)
@@ -144,6 +183,8 @@ def policies(word: str, copies: int, device: str) -> dict[str, Callable[[], floa
 def main() -> None:
     options = parser(__doc__, rounds=7)
     options.add_argument("--models", default="tsm,onestep,multistep,rtsm")
+    options.add_argument("--plans", default="tsm,onestep,lstm,rtsm", help="models in which candidates are rolled out")
+    options.add_argument("--candidates", type=int, default=96, help="for each target (default 96)")
     options.add_argument("--policies", default="tsm,onestep,lstm,rtsm", help="models of the policies")
     options.add_argument("--copies", type=int, default=10)
     options.add_argument("--device", default="cpu")
@@ -165,6 +206,12 @@ def main() -> None:
                 "one training", seconds["one"], unit="s", env=ENV, sim="mujoco", task="push", model=word,
                 configuration=stage.loss, metric="seconds",
             ))  # fmt: skip
+    for word in arguments.plans.split(","):
+        seconds = interleaved(rollouts(word, copies, arguments.candidates, arguments.device), arguments.rounds)
+        rows.append(Row.of(
+            f"{copies} rollouts in {word} as one: seconds", seconds["many"], "one rollout", seconds["one"],
+            unit="s", env=ENV, sim="mujoco", task="push", model=word, configuration="plan", metric="seconds",
+        ))  # fmt: skip
     for word in arguments.policies.split(","):
         seconds = interleaved(policies(word, copies, arguments.device), arguments.rounds)
         rows.append(Row.of(
