@@ -1,4 +1,4 @@
-"""Models of several training seeds, trained as one: for a GPU.
+"""Models of several training seeds, trained as one: for a GPU; and policies, for any processor.
 
     python benchmarks/settings/seeds.py --scale paper --seeds 3 4 5 6 7 8 9 --device cuda --compiled
 
@@ -13,6 +13,13 @@ its minute or more where a training takes longer than that.
 
 writes ``seeds.csv`` beside this script: validation loss and seconds of the models that these seeds have, as their
 headers say.
+
+    python benchmarks/settings/seeds.py --scale paper --seeds 3 4 --envs tsm/ReacherPush-v1 --models tsm rtsm lstm \
+        --policies 880 --together 2
+
+learns policies in those models for so many iterations, three copies of each seed and all seeds as one
+(``tsmlib.policies.stacked``): direct ones, and where a model has codes also latent ones. Policies that are there stay;
+those that were stopped go on. ``rows.py policies`` then finds them, with the same --iterations.
 """
 
 from __future__ import annotations
@@ -21,7 +28,7 @@ import argparse
 import multiprocessing
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from itertools import product
 from pathlib import Path
 from typing import cast
@@ -29,15 +36,19 @@ from typing import cast
 import pandas as pd
 import torch
 
+from tsmlib import study
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.figures.method import Method
 from tsmlib.storage import artifacts
-from tsmlib.study import models, parallel, runs, zoo
+from tsmlib.study import models, parallel, policies, runs, zoo
 from tsmlib.study.data import dataset
 
 HERE = Path(__file__).parent
 ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
 MODELS = ("rtsm", "tsm", "lstm", "multistep", "onestep", "prior")
 SPLITS = ("train", "validation")
+CODED = zoo.words(cls=zoo.CODED)
+TARGETS, COPIES = 100, 3  # of policies, as in rows.py
 
 
 def collect(run: runs.Run, env: str) -> None:
@@ -53,6 +64,15 @@ def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
     found = models.train_as_one(of, env, word, compiled=compiled)
     best = [min(list(made.header["curves"].values())[-1]["validation"]) for made in found]
     return f"{env} {word}: {found[0].header['seconds']:.0f} s, {' '.join(f'{value:.4g}' for value in best)}"
+
+
+def learn(of: list[runs.Run], env: str, method: Method, iterations: int) -> str:
+    """One policy of all seeds, learned and stored; a line on it."""
+    torch.set_num_threads(1)
+    task = study.load_task(env).take(TARGETS)
+    found = policies.learn_as_one(of, task, method, policies.Budget(COPIES, iterations))
+    ends = [sum(one.header["curve"]["measured"]["return_true"][-1]) / COPIES for one in found]
+    return f"{env} {method.label}: {found[0].header['seconds']:.0f} s, {' '.join(f'{end:.3f}' for end in ends)}"
 
 
 def table(of: list[runs.Run], envs: Sequence[str], words: Sequence[str]) -> pd.DataFrame:
@@ -81,6 +101,7 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", default=ENVS, help=f"default {' '.join(ENVS)}")
     parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.words(), metavar="MODEL",
                         help=f"some of {' '.join(zoo.words())}; default {' '.join(MODELS)}")  # fmt: skip
+    parser.add_argument("--policies", type=int, default=0, metavar="N", help="learn policies in them, N iterations")
     parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
     parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
     parser.add_argument("--table", action="store_true", help="write seeds.csv, and train nothing")
@@ -93,23 +114,37 @@ def main() -> None:
         found.to_csv(HERE / "seeds.csv", index=False, lineterminator="\n")
         print(found.to_string(index=False))
         return
-    wanted = [(env, word) for env, word in product(given.envs, given.models) if models.trained_on(env, word) == env]
     began, spawn = time.perf_counter(), multiprocessing.get_context("spawn")
+    if given.policies:
+        words = [word for word in given.models if zoo.find(word).group != "prior"]
+        ways = [way for way in zoo.methods(words, "policy") if way.search_space == "direct" or way.model in CODED]
+        with ProcessPoolExecutor(given.together, mp_context=spawn, max_tasks_per_child=1) as learners:
+            finish(began, {
+                learners.submit(learn, own, env, way, given.policies): f"{env} {way.label}"
+                for env, way in product(given.envs, ways)
+            })  # fmt: skip
+        return
+    wanted = [(env, word) for env, word in product(given.envs, given.models) if models.trained_on(env, word) == env]
     with (
         ProcessPoolExecutor(parallel.cores(), mp_context=spawn) as collectors,
         ProcessPoolExecutor(given.together, mp_context=spawn, max_tasks_per_child=1) as trainers,
     ):
         splits = {env: [collectors.submit(collect, run, env) for run in own] for env in given.envs}
-        under_way = {}
+        under_way: dict[Future[str], str] = {}
         for env, word in wanted:
             for split in splits[env]:
                 split.result()
-            under_way[trainers.submit(train, own, env, word, given.compiled)] = (env, word)
-        failed = False
-        for done in as_completed(under_way):
-            failed |= (error := done.exception()) is not None
-            said = f"{' '.join(under_way[done])}: {type(error).__name__}: {error}" if error else done.result()
-            print(f"{time.perf_counter() - began:6.0f} s  {said}", flush=True)
+            under_way[trainers.submit(train, own, env, word, given.compiled)] = f"{env} {word}"
+        finish(began, under_way)
+
+
+def finish(began: float, under_way: dict[Future[str], str]) -> None:
+    """Wait for all and say what came of each; exit status 1 where one failed."""
+    failed = False
+    for done in as_completed(under_way):
+        failed |= (error := done.exception()) is not None
+        said = f"{under_way[done]}: {type(error).__name__}: {error}" if error else done.result()
+        print(f"{time.perf_counter() - began:6.0f} s  {said}", flush=True)
     if failed:
         raise SystemExit(1)
 
