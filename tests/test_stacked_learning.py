@@ -82,9 +82,12 @@ def alone(kind: str, word: str, options: LearningOptions = OPTIONS, **given: Any
     return learned, curves
 
 
-def together(kind: str, word: str, options: LearningOptions = OPTIONS, **given: Any) -> tuple[list[Any], list[Any]]:
-    learned = policies(kind)
-    return learned, learn_stacked(learned, models(word), arrive, draws(), options, seeds=SEEDS, **given)
+def together(
+    kind: str, word: str, options: LearningOptions = OPTIONS, device: str = "cpu", **given: Any
+) -> tuple[list[Any], list[Any]]:
+    learned, nets = [policy.to(device) for policy in policies(kind)], [net.to(device) for net in models(word)]
+    curves = learn_stacked(learned, nets, arrive, draws(), options, seeds=SEEDS, **given)
+    return [policy.cpu() for policy in learned], curves
 
 
 def assert_same(one: tuple[list[Any], list[LearningCurve]], other: tuple[list[Any], list[LearningCurve]]) -> None:
@@ -105,6 +108,13 @@ def test_each_of_several_policies_learns_what_it_learns_alone(kind: str, word: s
     assert all(not torch.equal(a.net[0].weight, b.net[0].weight) for a, b in zip(before, found[0], strict=True)
                if kind == "onestep")  # fmt: skip
     assert found[1][0].predicted != found[1][1].predicted
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("word", MODELS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_on_a_gpu_it_learns_the_same(kind: str, word: str) -> None:
+    assert_same(alone(kind, word), together(kind, word, device="cuda"))
 
 
 def test_each_copys_gradient_is_shortened_by_its_own_norm() -> None:
