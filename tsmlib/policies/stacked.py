@@ -1,8 +1,8 @@
 """Policies of several training seeds, learned as one: each in the model of its seed, weights with a leading dimension.
 
 Each policy has starts, targets, noise, gradient norm, record and checkpoint of its own, and is to float tolerance what
-``learn_policy`` makes of it alone. Small networks leave most of a processor idle, on a CPU too: ten learned as one take
-about as long as five one after another (benchmarks/settings, section 11).
+``learn_policy`` makes of it alone. Ten as one take about as long as five one after another, on a CPU too
+(benchmarks/settings, section 11).
 
 Letters in shapes: S policies, each of M copies, n episodes of each copy, T horizon.
 """
