@@ -8,8 +8,9 @@ recurrence instead, with its backward pass by autograd and rows as in each stage
 copies by ``baddbmm`` over stacked weights.
 
 Of plans it is what ``cem`` judges candidates by first, a rollout of the mode of --candidates for each of ten targets;
-of policies an update of ``learn_policy``, with the episodes and copies of the study, of one policy in one model,
-and of --copies in as many models by ``learn_stacked``; latent where the model has codes. Weights are new ones.
+of policies an update of ``learn_policy``, with the episodes and copies of the study, of one policy in one model, and of
+--copies in as many models by ``learn_stacked``; latent where the model has codes. Weights are new ones. Policies are
+timed on a CPU alone.
 
     python benchmarks/copies.py        or        python -m tsmlib bench copies
 """
@@ -156,19 +157,22 @@ def rollouts(word: str, copies: int, candidates: int, device: str) -> dict[str, 
     return {"one": timed(device, one), "many": timed(device, many)}
 
 
-def policies(word: str, copies: int, device: str) -> dict[str, Callable[[], float]]:
+def policies(word: str, copies: int) -> dict[str, Callable[[], float]]:
     """Seconds of an update of one policy, and of ``copies`` in as many models."""
     run, data = runs.resolve("bench", scale="laptop"), study.random_data(ENV, 50, seed=0)
     task, draw = study.load_task(ENV), episodes_from(torch.from_numpy(data.states[:, 0]))
     o = LearningOptions(horizon=task.horizon, iterations=UPDATES, record_every=UPDATES)
     (dx, du), latent = (data.states.shape[2], data.actions.shape[2]), word in zoo.words(cls=zoo.CODED)
-    nets: list[Any] = [study.initialise(run, word, data).to(device) for _ in range(copies)]
+    nets: list[Any] = [study.initialise(run, word, data) for _ in range(copies)]
     made: list[Policy] = []
     for _ in nets:
         prior: Any = study.initialise(run, "prior", data)
-        policy = SegmentPolicy(dx, prior, copies=3) if latent else OneStepPolicy(dx, du, copies=3)
+        policy = (
+            SegmentPolicy(dx, prior, angles=data.angles, copies=3) if latent
+            else OneStepPolicy(dx, du, angles=data.angles, copies=3)
+        )  # fmt: skip
         policy.features.fit(torch.from_numpy(data.states))
-        made.append(policy.to(device))
+        made.append(policy)
 
     def one() -> float:
         return learn_policy(made[0], nets[0], task.reward_for, draw, o).seconds[-1] / UPDATES
@@ -190,7 +194,7 @@ def main() -> None:
     options.add_argument("--device", default="cpu")
     arguments = parsed(options)
     rows, copies = [], arguments.copies
-    for word in arguments.models.split(","):
+    for word in filter(None, arguments.models.split(",")):
         for stage in study.schedule(runs.resolve("bench", scale="laptop"), ENV, word):
             what = "a gradient"
             if word == "rtsm":
@@ -206,14 +210,14 @@ def main() -> None:
                 "one training", seconds["one"], unit="s", env=ENV, sim="mujoco", task="push", model=word,
                 configuration=stage.loss, metric="seconds",
             ))  # fmt: skip
-    for word in arguments.plans.split(","):
+    for word in filter(None, arguments.plans.split(",")):
         seconds = interleaved(rollouts(word, copies, arguments.candidates, arguments.device), arguments.rounds)
         rows.append(Row.of(
             f"{copies} rollouts in {word} as one: seconds", seconds["many"], "one rollout", seconds["one"],
             unit="s", env=ENV, sim="mujoco", task="push", model=word, configuration="plan", metric="seconds",
         ))  # fmt: skip
-    for word in arguments.policies.split(","):
-        seconds = interleaved(policies(word, copies, arguments.device), arguments.rounds)
+    for word in filter(None, arguments.policies.split(",") if arguments.device == "cpu" else []):
+        seconds = interleaved(policies(word, copies), arguments.rounds)
         rows.append(Row.of(
             f"{copies} policies in {word} as one, an update: seconds", seconds["many"], "one policy", seconds["one"],
             unit="s", env=ENV, sim="mujoco", task="push", model=word, configuration="policy", metric="seconds",

@@ -66,6 +66,32 @@ def test_rows_become_curves_again_with_the_copies_of_one_seed_or_else_seeds_as_l
     figure7({"reach": {TSM: curves}})
 
 
+def learned_as_one(seed: int) -> list[dict[str, Any]]:
+    return rows(seed=seed, curve=header(seed)["curve"] | {"policies": 2})
+
+
+def test_seconds_of_several_are_no_seconds_of_one() -> None:
+    shared = tables.frame([*learned_as_one(0), *learned_as_one(1)])
+    assert "seconds" not in set(shared["metric"])
+    curves = curves_of([*learned_as_one(0), *learned_as_one(1)])
+    assert "seconds" not in curves["reach"][TSM]
+    figure7(curves)
+    line = policies_results.policies_table(curves).splitlines()[-1]
+    assert "nan" not in line
+    untimed = policies_results.learning_rows(header(), samples=50_000, train_seconds=None)  # models trained as one
+    assert "seconds" not in curves_of(untimed)["reach"][TSM]
+    three = curves_of([*rows(), *learned_as_one(1), *untimed_of(2)])["reach"][TSM]
+    assert three["seconds"].tolist() == [100, 150, 200]  # of seed 0, which alone has both
+    assert three["seeds"] == 3
+    own = {TSM: {name: part for name, part in ended(-12, -4, -3).items() if name != "seconds"}}
+    found = policies_results.plateau_rows(own, {}, steps=50)
+    assert {row["metric"] for row in found} == {"samples_to_90", "env_samples_to_90"}
+
+
+def untimed_of(seed: int) -> list[dict[str, Any]]:
+    return policies_results.learning_rows(header(seed), samples=50_000, train_seconds=None)
+
+
 def test_rows_survive_a_table(tmp_path: Path) -> None:
     path = tmp_path / "learning.csv"
     tables.save(path, rows())

@@ -21,7 +21,6 @@ from tsmlib.policies.learning import Draw, LearningCurve, LearningOptions, episo
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy
 from tsmlib.policies.stacked import learn_stacked
 from tsmlib.rewards import Reward
-from tsmlib.sampling import Noise
 from tsmlib.study import policies as study_policies
 from tsmlib.study import runs
 from tsmlib.training.checkpoint import TrainingStopped
@@ -122,49 +121,72 @@ def test_each_copys_gradient_is_shortened_by_its_own_norm() -> None:
     assert_same(alone("onestep", "rtsm", options), together("onestep", "rtsm", options))
 
 
+@pytest.mark.parametrize("then", [alone, together])
 @pytest.mark.parametrize("first", [alone, together])
-def test_what_was_stopped_goes_on_together_or_alone(first: Any, tmp_path: Path) -> None:
+def test_what_was_stopped_goes_on_together_or_alone(first: Any, then: Any, tmp_path: Path) -> None:
     def stop_at_4(policy: Policy) -> dict[str, Tensor]:
         asked.append(policy)
         if len(asked) > limit:
             raise KeyboardInterrupt
         return {"one": torch.ones(2)}
 
-    places, then = [tmp_path / str(seed) for seed in SEEDS], together if first is alone else alone
-    asked, limit, measures = list[Policy](), 4 if first is together else 2, [stop_at_4, stop_at_4]
-    name = "measures" if first is together else "measure"
+    def given(way: Any) -> dict[str, Any]:
+        measures, places = [stop_at_4, stop_at_4], [tmp_path / str(seed) for seed in SEEDS]
+        if way is alone:
+            return {"measure": measures, "checkpoint": places}
+        return {"measures": measures, "checkpoints": places}
+
+    asked, limit = list[Policy](), 4 if first is together else 2
     with pytest.raises(KeyboardInterrupt):
-        first("segment", "lstm", **{name: measures, "checkpoints" if first is together else "checkpoint": places})
-    limit, name = 1000, "measure" if first is together else "measures"
-    found = then("segment", "lstm", **{name: measures, "checkpoint" if first is together else "checkpoints": places})
+        first("segment", "lstm", **given(first))
+    limit = 1000
+    found = then("segment", "lstm", **given(then))
     assert_same(alone("segment", "lstm"), found)
     assert found[1][0].measured["one"] == [[1.0, 1.0]] * 4
+    assert [curve.policies for curve in found[1]] == [1 if first is then is alone else 2] * 2
+
+
+def test_a_policy_that_had_come_less_far_joins_the_others(tmp_path: Path) -> None:
+    places, shorter = [tmp_path / str(seed) for seed in SEEDS], list[int]()
+
+    def stop_at_2(policy: Policy) -> dict[str, Tensor]:
+        shorter.append(1)
+        if len(shorter) > 2:
+            raise KeyboardInterrupt
+        return {}
+
+    with pytest.raises(KeyboardInterrupt):
+        learn_policy(
+            policies("onestep")[0], models("rtsm")[0], arrive, draws()[0], OPTIONS, seed=SEEDS[0], measure=stop_at_2,
+            checkpoint=places[0],
+        )  # fmt: skip
+    assert_same(alone("onestep", "rtsm"), together("onestep", "rtsm", checkpoints=places))
 
 
 def test_where_one_fails_all_stop_with_the_weights_of_their_last_record() -> None:
-    broken = models("onestep")
-    with torch.no_grad():
-        next(broken[1].parameters()).fill_(torch.inf)
-    learned, before = policies("onestep"), policies("onestep")
-    with pytest.raises(TrainingStopped, match="the model predicts states that are not finite at iteration 6 of 6"):
-        learn_stacked(learned, broken, arrive, draws(), OPTIONS, seeds=SEEDS)
-    for a, b in zip(learned, before, strict=True):
-        assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    usual, calls = draws(), list[int]()
+
+    def far_away(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        calls.append(n)
+        start, target = usual[1](n, generator)
+        return (start + torch.inf if len(calls) > 10 else start), target  # from iteration 3 on, of two copies
+
+    learned = policies("onestep")
+    with pytest.raises(TrainingStopped, match="seed 20: the model predicts states that are not finite at iteration 3"):
+        learn_stacked(learned, models("rtsm"), arrive, [usual[0], far_away], OPTIONS, seeds=SEEDS)
+    after_2 = alone("onestep", "rtsm", replace(OPTIONS, iterations=2))[0]
+    for a, b in zip(learned, after_2, strict=True):
+        for name, weight in b.state_dict().items():
+            torch.testing.assert_close(a.state_dict()[name], weight, rtol=1e-3, atol=1e-4)
 
 
-class Drift(torch.nn.Module):
-    """A model that draws from a generator itself."""
+class Whole(torch.nn.Module):
+    """A model of whole segments."""
 
     segment_len = past_len = 1
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.size = torch.nn.Parameter(torch.ones(()))
-
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
-        assert isinstance(generator, torch.Generator)
-        x = past.states[:, -1:]
-        return x + self.size * torch.randn(x.shape, generator=generator)
+    def predict_segment(self, past: Segment, actions: Tensor) -> Tensor:
+        return past.states[:, -1:]
 
 
 def test_what_cannot_be_one_of_several_is_refused() -> None:
@@ -172,26 +194,42 @@ def test_what_cannot_be_one_of_several_is_refused() -> None:
     with pytest.raises(ValueError, match="found 2 policies, 1 models, 2 draws, 2 seeds, 2 measures, 2 checkpoints"):
         learn_stacked(learned, given[:1], arrive, draws(), OPTIONS, seeds=SEEDS)
     members: list[Any] = [in_units(Ensemble(DX, DU, members=2, hidden=4, layers=1)) for _ in SEEDS]
-    with pytest.raises(ValueError, match="a Ensemble cannot be one of several models; learn in it by learn_policy"):
-        learn_stacked(learned, members, arrive, draws(), OPTIONS, seeds=SEEDS)
-    with pytest.raises(ValueError, match=r"Drift draws its noise by other means than those of tsmlib\.sampling"):
-        learn_stacked(policies("onestep"), [Drift(), Drift()], arrive, draws(), OPTIONS, seeds=SEEDS)
+    for others, name in ((members, "Ensemble"), ([Whole(), Whole()], "Whole")):
+        with pytest.raises(ValueError, match=f"a {name} cannot be one of several models; learn in it by learn_policy"):
+            learn_stacked(learned, others, arrive, draws(), OPTIONS, seeds=SEEDS)
     with pytest.raises(ValueError, match="the reward has no gradient"):
         learn_stacked(learned, given, lambda _: lambda x, u: x[..., 0].sign().detach(), draws(), OPTIONS, seeds=SEEDS)
 
 
-@pytest.mark.parametrize("space", ["latent", "direct"])
+@pytest.mark.parametrize(("name", "value"), [("target_std", 0.5), ("copies", 3), ("hidden", 4)])
+def test_policies_that_are_not_alike_are_refused_naming_what_differs(name: str, value: float) -> None:
+    options: dict[str, Any] = dict(angles=(1,), copies=2, hidden=8) | {name: value}
+    learned = [policies("onestep")[0], OneStepPolicy(DX, DU, **options)]
+    with pytest.raises(ValueError, match="OneStepPolicys that are stacked must be alike; found .* and "):
+        learn_stacked(learned, models("onestep"), arrive, draws(), OPTIONS, seeds=SEEDS)
+
+
+def test_models_that_are_not_alike_are_refused_naming_what_differs() -> None:
+    longer = in_units(LSTM(DX, DU, angles=(1,), hidden=8, past_len=H, segment_len=9))
+    with pytest.raises(ValueError, match="LSTMs that are stacked must be alike; found segment_len 8 and 9"):
+        learn_stacked(policies("onestep"), [models("lstm")[0], longer], arrive, draws(), OPTIONS, seeds=SEEDS)
+    with pytest.raises(ValueError, match="found class 'LSTM' and 'OneStep'"):
+        learn_stacked(
+            policies("onestep"), [models("lstm")[0], models("onestep")[0]], arrive, draws(), OPTIONS, seeds=SEEDS
+        )
+
+
 def test_policies_of_several_runs_are_learned_as_one_and_found_by_each(
-    space: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = [runs.resolve("05_control", scale="smoke", seed=seed, run_dir=str(tmp_path)) for seed in (1, 2)]
-    task, method = study.load_task("tsm/Reacher-v0").take(3), study.method("onestep", space, "policy")
+    task, method = study.load_task("tsm/Reacher-v0").take(3), study.method("onestep", "direct", "policy")
     made = study_policies.learn_as_one(own, task, method, study.Budget(copies=2))
     monkeypatch.setattr(study_policies, "learn_policy", None)
     monkeypatch.setattr(study_policies, "learn_stacked", None)
     for run, (policy, header) in zip(own, made, strict=True):
         found = study.learn(run, task, method, study.Budget(copies=2))
-        assert (header["seed"], found.header["seed"], found.header["policies"]) == (run.seed, run.seed, 2)
+        assert (header["seed"], found.header["seed"], header["curve"]["policies"]) == (run.seed, run.seed, 2)
         kept, had = found.policy.state_dict(), policy.state_dict()
         assert all(torch.equal(kept[name], had[name]) for name in kept)
     again = study_policies.learn_as_one(own, task, method, study.Budget(copies=2))
@@ -208,5 +246,8 @@ def test_policies_that_cannot_learn_as_one_learn_one_by_one(
     task, method = study.load_task("tsm/Reacher-v0").take(3), study.method("onestep", "direct", "policy")
     monkeypatch.setattr(study_policies, "learn_stacked", refuse)
     made = study_policies.learn_as_one(own, task, method)
-    assert "policies of 2 seeds are not learned as one, but one by one: no such model" in capsys.readouterr().out
-    assert [("policies" in one.header, one.header["seed"]) for one in made] == [(False, 1), (False, 2)]
+    told = capsys.readouterr().out
+    assert "the direct policy in onestep of seeds 1, 2 is not made as one, but one by one: no such model" in told
+    assert [(one.header["curve"]["policies"], one.header["seed"]) for one in made] == [(1, 1), (1, 2)]
+    with pytest.raises(ValueError, match="found runs of smoke 1 on cpu, smoke 1 on cpu; expected different seeds"):
+        study_policies.learn_as_one([own[0], own[0]], task, method)

@@ -14,11 +14,13 @@ import torch
 from reliability import cluster
 
 from tsmlib.__main__ import main
+from tsmlib.figures.method import Method
 from tsmlib.storage import artifacts, files, manifest
 from tsmlib.storage.provenance import provenance
-from tsmlib.study import parameters, runs, workflow, zoo
+from tsmlib.study import needed, parameters, runs, workflow, zoo
 from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
 from tsmlib.study.parameters import ParameterError
+from tsmlib.study.policies import Budget
 from tsmlib.study.runs import RunError
 
 HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
@@ -150,6 +152,20 @@ def test_a_policy_is_one_step_of_all_seeds_too_after_the_models_that_it_learns_i
 
 
 @pytest.mark.usefixtures("gpu")
+def test_seeds_that_need_a_policy_with_other_settings_are_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stored(run: runs.Run, env: str, method: Method) -> Budget | None:
+        return Budget(3, 2200) if run.seed == 2 else None
+
+    monkeypatch.setattr(needed, "stored_budget", stored)
+    steps = table("paper", (0, 2, 4), device="cuda")
+    name = "models/ReacherPush/policy-rtsm-latent"
+    assert {f"seeds0-4/{name}", f"seed2/{name}"} <= steps.keys()
+    assert steps[f"seeds0-4/{name}"].files == [f"seed{seed}/{name}.safetensors" for seed in (0, 4)]
+    with pytest.raises(ParameterError, match="seeds 0 and 2 need models/ReacherPush/policy-rtsm-latent with different"):
+        workflow.step(workflow.prepare([runs.notebooks()["control"]], (0, 2), scale="paper", device="", given={}), name)
+
+
+@pytest.mark.usefixtures("gpu")
 def test_a_seed_whose_model_ships_is_none_of_those_that_are_trained(place: Path) -> None:
     steps = table("laptop", (0, 1, 2), device="cuda")
     assert steps["seeds1-2/models/Reacher/lstm"].files == [
@@ -264,6 +280,15 @@ def test_a_step_of_several_seeds_trains_a_model_with_those_that_lack_it_as_one(
     assert "a step is of one notebook" in capsys.readouterr().err
 
 
+def test_a_step_of_several_seeds_learns_a_policy_with_them_as_one(place: Path) -> None:
+    job = "models/Reacher/policy-tsm-latent"
+    words = ["step", "control", "--scale", "smoke", "--device", "cpu"]
+    assert main([*words, "--job", job, "--seeds", "0,2"]) == 0
+    for seed in (0, 2):
+        header: Any = artifacts.read_header(place / "runs" / "smoke" / f"seed{seed}" / f"{job}.safetensors")
+        assert (header["seed"], header["curve"]["policies"]) == (seed, 2)
+
+
 def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebooks(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,7 +296,7 @@ def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebo
     prepared = workflow.prepare([runs.notebooks()["train"]], (0, 2, 3, 4), scale="smoke", device="", given=given)
     groups = {(each.run.seed, job): group for group in (prepared[:2], prepared[2:]) for each in group}
     monkeypatch.setattr(workflow, "seed_groups", lambda _: groups)  # as on a GPU
-    workflow._make_ahead(prepared)
+    workflow._precompute_groups(prepared)
     for execution in prepared:
         assert artifacts.read_header(execution.run.dir / f"{job}.safetensors")["copies"] == 2
 

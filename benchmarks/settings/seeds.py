@@ -18,8 +18,8 @@ headers say.
         --policies 880 --together 2
 
 learns policies in those models for so many iterations, three copies of each seed and all seeds as one
-(``tsmlib.policies.stacked``): direct ones, and where a model has codes also latent ones. Policies that are there stay;
-those that were stopped go on. ``rows.py policies`` then finds them, with the same --iterations.
+(``tsmlib.policies.stacked``): direct ones, and where a model has codes also latent ones. The models have to be there.
+Policies that are there stay, whatever their iterations; those that were stopped go on. ``rows.py policies`` finds them.
 """
 
 from __future__ import annotations
@@ -69,8 +69,11 @@ def train(of: list[runs.Run], env: str, word: str, compiled: bool) -> str:
 def learn(of: list[runs.Run], env: str, method: Method, iterations: int) -> str:
     """One policy of all seeds, learned and stored; a line on it."""
     torch.set_num_threads(1)
-    task = study.load_task(env).take(TARGETS)
-    found = policies.learn_as_one(of, task, method, policies.Budget(COPIES, iterations))
+    task, budget = study.load_task(env).take(TARGETS), policies.Budget(COPIES, iterations)
+    of = [run for run in of if policies.stored_budget(run, env, method) is None]
+    if not of:
+        return f"{env} {method.label}: there"
+    found = policies.learn_as_one(of, task, method, budget)
     ends = [sum(one.header["curve"]["measured"]["return_true"][-1]) / COPIES for one in found]
     return f"{env} {method.label}: {found[0].header['seconds']:.0f} s, {' '.join(f'{end:.3f}' for end in ends)}"
 
@@ -117,6 +120,9 @@ def main() -> None:
     began, spawn = time.perf_counter(), multiprocessing.get_context("spawn")
     if given.policies:
         words = [word for word in given.models if zoo.find(word).group != "prior"]
+        for env, word, run in product(given.envs, words, own):
+            if not (run.dir / "models" / EnvSpec.parse(env).name / f"{word}.safetensors").exists():
+                parser.error(f"{run.dir} has no {word} of {env}; train it first, by this script without --policies")
         ways = [way for way in zoo.methods(words, "policy") if way.search_space == "direct" or way.model in CODED]
         with ProcessPoolExecutor(given.together, mp_context=spawn, max_tasks_per_child=1) as learners:
             finish(began, {

@@ -68,7 +68,9 @@ class Features(nn.Module):
 
     def settle(self) -> None:
         """Fix which columns change: within ``torch.func`` and CUDA graphs no value can be looked at. After another
-        ``fit`` call it again."""
+        ``fit`` call it again. ValueError without statistics."""
+        if not self.fitted:
+            raise ValueError("these features have no statistics of data; call fit first")
         self._settled = tuple(  # type: ignore[assignment]  # of two
             index if isinstance(index := _columns(some.nonzero()[:, 0].tolist()), slice)
             else torch.tensor(index, dtype=torch.long, device=some.device)

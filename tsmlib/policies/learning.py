@@ -100,7 +100,8 @@ class LearningCurve(Curve):
     """Record of ``learn_policy``: updates done, and one number per copy for each of the rest.
 
     predicted: undiscounted predicted return, mean over 50 episodes that are the same at every record; measured: what
-    ``measure`` returned, such as the executed return.
+    ``measure`` returned, such as the executed return. policies: the most that were learned as one at any time
+    (``stacked``); seconds are of all of them.
     """
 
     unit: ClassVar[str] = "iteration"
@@ -108,6 +109,7 @@ class LearningCurve(Curve):
     iteration: list[int] = field(default_factory=list)
     predicted: list[list[float]] = field(default_factory=list)
     measured: dict[str, list[list[float]]] = field(default_factory=dict)
+    policies: int = 1
 
 
 @torch.enable_grad()  # see training.fit
@@ -153,7 +155,7 @@ def learn_policy(
             value = discounted(learner.rewards(iteration, o.episodes), o.gamma).mean(1)  # Eq. 4, (M,)
             optimizer.zero_grad(set_to_none=True)
             (-value.sum()).backward()
-            if not torch.isfinite(clip([p.grad for p in trained if p.grad is not None], o.clip)).all():
+            if not torch.isfinite(clip_gradients([p.grad for p in trained if p.grad is not None], o.clip)).all():
                 raise state.stopped(NOT_FINITE, iteration)
             optimizer.step()
             state.step, state.seconds = iteration + 1, state.seconds + time.process_time() - began
@@ -184,7 +186,8 @@ class Learner:
         cls, policy: Policy, model: Model, reward: Callable[[Tensor], Reward], draw: Draw, options: LearningOptions,
         seed: int, *, measure: Measure | None = None, callback: Callback | None = None, checkpoint: Path | None = None,
     ) -> Self:  # fmt: skip
-        """As learning starts: with statistics, a new optimiser and what tells it from other runs."""
+        """As learning starts: with statistics, and a new optimiser. Called by the two public functions, whose callers
+        are shown a warning of ``_take_statistics``."""
         _take_statistics(policy, model)
         optimizer = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], lr=options.lr)
         identity = asdict(options) | dict(
@@ -215,10 +218,10 @@ class Learner:
             self.policy, self.model, start, target, horizon=self.options.horizon, noise=self.options.noise,
             generator=noise,
         )  # fmt: skip
-        return self.rewarded(target, seen, iteration)
+        return self.checked_rewards(target, seen, iteration)
 
-    def rewarded(self, target: Tensor, seen: Segment, iteration: int) -> Tensor:
-        """Rewards (M, n, T) of what was imagined, checked."""
+    def checked_rewards(self, target: Tensor, seen: Segment, iteration: int) -> Tensor:
+        """Rewards (M, n, T) of imagined episodes (M n, T, .); see ``learn_policy`` for what is raised."""
         if not torch.isfinite(seen.states).all():
             raise self.state.stopped("the model predicts states that are not finite", iteration)
         rewards = rewarded(self.reward(target), *seen)
@@ -285,7 +288,7 @@ def summary(draw: Draw, n: int = 1000) -> dict[str, list[list[float]]]:
     }
 
 
-def clip(gradients: Sequence[Tensor], norm: float) -> Tensor:
+def clip_gradients(gradients: Sequence[Tensor], norm: float) -> Tensor:
     """Shorten each copy's gradients (M, ...) to ``norm``, in place, unless that is 0; the norms before (M,)."""
     found = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
     if norm:

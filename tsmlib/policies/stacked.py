@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from itertools import groupby
 from pathlib import Path
 from typing import cast
 
@@ -23,6 +22,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from tqdm.auto import tqdm
 
 from tsmlib.models.base import EnsembleModel, Model
+from tsmlib.models.config import Configured
 from tsmlib.models.features import Features
 from tsmlib.models.recurrence import as_operations
 from tsmlib.policies.learning import (
@@ -32,7 +32,7 @@ from tsmlib.policies.learning import (
     LearningCurve,
     LearningOptions,
     Measure,
-    clip,
+    clip_gradients,
     discounted,
     imagine,
     learning_rate,
@@ -40,7 +40,9 @@ from tsmlib.policies.learning import (
 from tsmlib.policies.networks import Policy
 from tsmlib.rewards import Reward
 from tsmlib.sampling import GivenNoise, Noise, RecordedNoise
-from tsmlib.training.checkpoint import resumable
+from tsmlib.storage import artifacts
+from tsmlib.storage.files import Json
+from tsmlib.training.checkpoint import TrainingStopped, resumable
 from tsmlib.trajectory import Segment
 
 
@@ -59,49 +61,67 @@ def learn_stacked(
 ) -> list[LearningCurve]:
     """``learn_policy`` of several policies of one configuration, each in its own of as many models, at once.
 
-    The arguments are those of ``learn_policy``, one for each policy. Checkpoints are those of ``learn_policy``: what
-    was stopped goes on together or alone. Seconds of a curve are CPU time of all policies together.
+    policies, models, draws, seeds, measures, checkpoints: one for each policy. Checkpoints are those of
+    ``learn_policy``, so that what was stopped goes on in either way; policies that had come less far are learned first,
+    until they can join the others. Seconds of a curve are CPU time of all ``policies`` of the curve.
 
-    ValueError where there are not as many of each, for models that are no ``nn.Module`` or draw their noise by other
-    means than ``tsmlib.sampling``, for ensembles, and for a reward that ``learn_policy`` refuses. TrainingStopped where
-    states or gradients of one are not finite, with the weights of the last record in all policies.
+    ValueError where there are not as many of each or they are not alike, for ensembles and models without ``begin``,
+    and for a reward that ``learn_policy`` refuses; FloatingPointError and StoreError as in ``learn_policy``.
+    TrainingStopped, naming the seed, where states or gradients of one are not finite: all policies have the weights of
+    their last record.
     """
     o = options or LearningOptions()
     measures, checkpoints = measures or [None] * len(policies), checkpoints or [None] * len(policies)
-    counts = [len(given) for given in (policies, models, draws, seeds, measures, checkpoints)]
-    if len(set(counts)) > 1 or not policies:
-        words = ("policies", "models", "draws", "seeds", "measures", "checkpoints")
-        found = ", ".join(f"{count} {word}" for count, word in zip(counts, words, strict=True))
-        raise ValueError(f"found {found}; expected as many of each, and one at least")
-    for model in models:
-        if not isinstance(model, nn.Module) or isinstance(model, EnsembleModel):
-            raise ValueError(f"a {type(model).__name__} cannot be one of several models; learn in it by learn_policy")
-    learners = [
-        Learner.of(policy, model, reward, draw, o, seed, measure=measure, checkpoint=checkpoint)
-        for policy, model, draw, seed, measure, checkpoint in zip(
-            policies, models, draws, seeds, measures, checkpoints, strict=True
-        )
-    ]
+    _require(dict(
+        policies=policies, models=models, draws=draws, seeds=seeds, measures=measures, checkpoints=checkpoints
+    ))  # fmt: skip
+    _require_alike(policies)
+    _require_alike(models)
+    learners = []
+    for k, (policy, model) in enumerate(zip(policies, models, strict=True)):
+        learners.append(Learner.of(
+            policy, cast(Model, model), reward, draws[k], o, seeds[k], measure=measures[k], checkpoint=checkpoints[k]
+        ))  # fmt: skip
     with ExitStack() as held:
         for learner in learners:
             held.enter_context(resumable(learner.state, purpose=f"learning a policy, seed {learner.seed}", progress=""))
-        done = [learner.state.step for learner in learners]
+        done = sum(learner.state.step for learner in learners)
         bar = held.enter_context(
-            tqdm(total=len(learners) * o.iterations, initial=sum(done), desc=progress, disable=not progress)
+            tqdm(total=len(learners) * o.iterations, initial=done, desc=progress, disable=not progress)
         )
-        for _, group in groupby(sorted(learners, key=_step), key=_step):
-            together = _Together(list(group))
+        while (least := min(learner.state.step for learner in learners)) < o.iterations:
+            ahead = [learner.state.step for learner in learners if learner.state.step > least]
+            group = [learner for learner in learners if learner.state.step == least]
             try:
-                together.learn(bar)
+                _Stack(group).learn(min(ahead, default=o.iterations), bar)
             except BaseException:
-                for learner in together.learners:
+                for learner in group:
                     learner.state.restore_best()
                 raise
     return [learner.state.curve for learner in learners]
 
 
-def _step(learner: Learner) -> int:
-    return learner.state.step
+def _require(given: dict[str, Sequence[object]]) -> None:
+    """As many of each, and models that can be stacked."""
+    if len({len(each) for each in given.values()}) > 1 or not given["policies"]:
+        found = ", ".join(f"{len(each)} {word}" for word, each in given.items())
+        raise ValueError(f"found {found}; expected as many of each, and one at least")
+    for model in given["models"]:
+        if not isinstance(model, nn.Module) or isinstance(model, EnsembleModel) or not hasattr(model, "begin"):
+            raise ValueError(f"a {type(model).__name__} cannot be one of several models; learn in it by learn_policy")
+
+
+def _require_alike(modules: Sequence[nn.Module]) -> None:
+    """One class, one configuration, weights of one shape."""
+    first, *others = ({"class": type(each).__name__} | _made_of(each) for each in modules)
+    for other in others:
+        if differs := [f"{name} {value!r} and {other.get(name)!r}" for name, value in first.items()
+                       if other.get(name) != value]:  # fmt: skip
+            raise ValueError(f"{first['class']}s that are stacked must be alike; found {'; '.join(differs[:3])}")
+
+
+def _made_of(module: nn.Module) -> dict[str, Json]:
+    return {**artifacts.layout(module.state_dict()), **(module.config() if isinstance(module, Configured) else {})}
 
 
 class _Imagination(nn.Module):
@@ -109,9 +129,7 @@ class _Imagination(nn.Module):
 
     def __init__(self, learner: Learner) -> None:
         super().__init__()
-        self.policy, self.options = learner.policy, learner.options
-        assert isinstance(learner.model, nn.Module)
-        self.model = learner.model
+        self.policy, self.model, self.options = learner.policy, cast(nn.Module, learner.model), learner.options
 
     def forward(self, start: Tensor, target: Tensor, noise: GivenNoise | RecordedNoise) -> tuple[Tensor, Tensor]:
         o = self.options
@@ -122,8 +140,8 @@ class _Imagination(nn.Module):
         return seen.states, seen.actions
 
 
-class _Together:
-    """Weights and moments of policies that have come equally far, stacked."""
+class _Stack:
+    """Weights and moments of policies that have come equally far."""
 
     def __init__(self, learners: Sequence[Learner]) -> None:
         self.learners, first = learners, learners[0]
@@ -136,38 +154,27 @@ class _Together:
         self.device = next(iter(self.weights.values())).device
         self.optimizer = torch.optim.Adam(self.weights.values(), lr=self.options.lr)
         self.module = deepcopy(modules[0])
-        for part in self.module.modules():
-            if isinstance(part, Features):
-                part.settle()
-        self.asked = self._asked()
+        self.draws = self._recorded_draws()
+        if isinstance(features := getattr(self.module.model, "features", None), Features):
+            features.settle()
         if first.state.step:
-            self._take_moments()
+            for i, weight in enumerate(self.weights.values()):
+                own = [learner.state.optimizers["adam"].state[learner.trained[i]] for learner in learners]
+                self.optimizer.state[weight] = {
+                    name: torch.stack([moments[name] for moments in own]) if value.ndim else value.clone()
+                    for name, value in own[0].items()
+                }
 
-    def _asked(self) -> list[torch.Size]:
+    def _recorded_draws(self) -> list[torch.Size]:
         """Shapes of the noise of n episodes of one copy, in the order in which it is drawn."""
         noise, learner = RecordedNoise(), self.learners[0]
         start, target, _ = learner.episodes(0, self.options.episodes)
         with torch.no_grad():
-            try:
-                self.module(start, target, noise)
-            except (AttributeError, TypeError) as error:
-                raise ValueError(
-                    f"{type(learner.model).__name__} draws its noise by other means than those of tsmlib.sampling; "
-                    "learn in it by learn_policy"
-                ) from error
+            self.module(start, target, noise)
         return [torch.Size((draw.shape[0] // self.copies, *draw.shape[1:])) for draw in noise.draws]
 
-    def _take_moments(self) -> None:
-        """Those of the policies' own optimisers."""
-        for i, weight in enumerate(self.weights.values()):
-            own = [learner.state.optimizers["adam"].state[learner.trained[i]] for learner in self.learners]
-            self.optimizer.state[weight] = {
-                name: torch.stack([moments[name] for moments in own]) if value.ndim else value.clone()
-                for name, value in own[0].items()
-            }
-
-    def give_back(self) -> None:
-        """Weights and moments, to each policy and its own optimiser."""
+    def unstack(self) -> None:
+        """Weights and moments, into each policy and its own optimiser."""
         for k, learner in enumerate(self.learners):
             for own, weight in zip(learner.trained, self.weights.values(), strict=True):
                 own.detach().copy_(weight.detach()[k])
@@ -176,20 +183,22 @@ class _Together:
                     for name, value in self.optimizer.state[weight].items()
                 }
 
-    def learn(self, bar: tqdm) -> None:
-        """To the end, with records and checkpoints as ``learn_policy`` makes them."""
+    def learn(self, until: int, bar: tqdm) -> None:
+        """Until an iteration that ends with a record; records and checkpoints as ``learn_policy`` makes them."""
         o, states = self.options, [learner.state for learner in self.learners]
-        if not states[0].step:
-            for learner in self.learners:
+        for learner in self.learners:
+            learner.state.curve.policies = max(learner.state.curve.policies, len(states))
+            if not learner.state.step:
                 learner.record()
-        for iteration in range(states[0].step, o.iterations):
+        for iteration in range(states[0].step, until):
             began = time.process_time()
             self._update(iteration)
+            spent = time.process_time() - began
             for state in states:
-                state.step, state.seconds = iteration + 1, state.seconds + time.process_time() - began
+                state.step, state.seconds = iteration + 1, state.seconds + spent
             bar.update(len(states))
             if states[0].step % o.record_every == 0 or states[0].step == o.iterations:
-                self.give_back()
+                self.unstack()
                 for learner in self.learners:
                     learner.record()
                 for state in states:
@@ -198,7 +207,7 @@ class _Together:
 
     def _update(self, iteration: int) -> None:
         """One step of the optimiser for all policies."""
-        o, seeds = self.options, len(self.learners)
+        o = self.options
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(iteration, o.lr, o.lr_decay, o.lr_final)
         drawn, noise = [], []
@@ -208,7 +217,7 @@ class _Together:
             noise.append(
                 [
                     torch.cat([torch.randn(shape, generator=g, dtype=start.dtype) for g in separate.generators])
-                    for shape in self.asked
+                    for shape in self.draws
                 ]
             )
         starts, targets = (torch.stack(part) for part in zip(*drawn, strict=True))
@@ -218,16 +227,20 @@ class _Together:
                 self.weights, self.fixed, starts.to(self.device), targets.to(self.device), numbers
             )
         states, actions = (part.to(starts.device) for part in seen)
-        values = [
-            discounted(learner.rewarded(targets[k], Segment(states[k], actions[k]), iteration), o.gamma).mean(1)
-            for k, learner in enumerate(self.learners)
-        ]  # Eq. 4, (M,) of each
+        values = []
+        for k, learner in enumerate(self.learners):
+            try:
+                rewards = learner.checked_rewards(targets[k], Segment(states[k], actions[k]), iteration)
+            except TrainingStopped as error:
+                raise _of(learner, error) from None
+            values.append(discounted(rewards, o.gamma).mean(1))  # Eq. 4, (M,)
         self.optimizer.zero_grad(set_to_none=True)
         (-torch.stack(values).sum()).backward()
         gradients = [w.grad.view(-1, *w.shape[2:]) for w in self.weights.values() if w.grad is not None]  # (S M, ...)
-        finite = torch.isfinite(clip(gradients, o.clip)).unflatten(0, (seeds, -1)).all(1)
+        finite = torch.isfinite(clip_gradients(gradients, o.clip)).unflatten(0, (len(values), -1)).all(1)
         if not finite.all():
-            raise self.learners[int(finite.int().argmin())].state.stopped(NOT_FINITE, iteration)
+            learner = self.learners[int(finite.int().argmin())]
+            raise _of(learner, learner.state.stopped(NOT_FINITE, iteration))
         self.optimizer.step()
 
     def _imagined(
@@ -235,3 +248,7 @@ class _Together:
     ) -> tuple[Tensor, Tensor]:
         """States and actions (M n, T, .) of one policy."""
         return functional_call(self.module, {**weights, **fixed}, (start, target, GivenNoise(list(noise))))
+
+
+def _of(learner: Learner, error: TrainingStopped) -> TrainingStopped:
+    return TrainingStopped(f"seed {learner.seed}: {error}")

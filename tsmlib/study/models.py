@@ -24,7 +24,7 @@ from tsmlib.storage.files import Json, StoreError
 from tsmlib.study import zoo
 from tsmlib.study.data import dataset, fingerprint, remade_by
 from tsmlib.study.runs import ROOT, Run
-from tsmlib.training.checkpoint import TrainingStopped
+from tsmlib.study.seeds import make_as_one, require_seeds
 from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
 
@@ -99,28 +99,14 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
 
 
 def load_or_train_as_one(runs: Sequence[Run], env: str, model: str) -> list[Trained]:
-    """``load_or_train`` of runs with several seeds; those that lack the model are trained as one, for a GPU.
-
-    Where that is not possible, with one seed whose loss is not finite for instance or too little memory, it is said,
-    and they are trained one after another; TrainingStopped for the first that could not be, when the others are there.
-    """
-    missing = [run for run in runs if not any(path.exists() for path in _places(run, env, model))]
-    if len(missing) > 1:
-        try:
-            train_as_one(missing, trained_on(env, model), model)
-        except StoreError:
-            raise
-        except (TrainingStopped, torch.OutOfMemoryError, ValueError) as error:
-            print(f"{env}: {model} of {len(missing)} seeds is not trained as one, but one by one: {error}")
-    found, stopped = list[Trained](), list[TrainingStopped]()
-    for run in runs:
-        try:
-            found.append(load_or_train(run, env, model))
-        except TrainingStopped as error:
-            stopped.append(error)
-    if stopped:
-        raise stopped[0]
-    return found
+    """``load_or_train`` of runs with several seeds; those that lack the model are trained as one (``make_as_one``), for
+    a GPU."""
+    return make_as_one(
+        f"{env}: {model}", runs,
+        lambda run: not any(path.exists() for path in _places(run, env, model)),
+        lambda lacking: train_as_one(lacking, trained_on(env, model), model),
+        lambda run: load_or_train(run, env, model),
+    )  # fmt: skip
 
 
 def _path(run: Run, env: str, model: str) -> Path:
@@ -265,9 +251,7 @@ def train_as_one(runs: Sequence[Run], env: str, model: str, *, compiled: bool = 
     training that is stopped. ValueError for runs of one seed or of several scales, for a model that is trained on the
     data of another environment, and where ``fit_stacked`` raises one.
     """
-    if len({run.seed for run in runs}) < len(runs) or len({(run.scale, run.device) for run in runs}) != 1:
-        given = ", ".join(f"{run.scale} {run.seed} on {run.device}" for run in runs)
-        raise ValueError(f"found runs of {given or 'no seed'}; expected different seeds, one scale and one device")
+    require_seeds(runs)
     if (other := trained_on(env, model)) != env:
         raise ValueError(f"{model} of {env} is trained on {other}; name that environment")
     parts = [training_data(run, env, model) for run in runs]

@@ -22,14 +22,14 @@ from tsmlib.policies.learning import Draw, LearningCurve, LearningOptions, episo
 from tsmlib.policies.networks import OneStepPolicy, Policy, SegmentPolicy, controller
 from tsmlib.policies.stacked import learn_stacked
 from tsmlib.storage import artifacts, tables
-from tsmlib.storage.files import Json, StoreError
+from tsmlib.storage.files import Json
 from tsmlib.study.comparison import table
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
 from tsmlib.study.results.policies import EPISODES, GRADIENTS, finished, learning_curves, learning_rows, plateau_rows
 from tsmlib.study.results.table import PolicyHeader, Row, of_task, select
 from tsmlib.study.runs import Run
-from tsmlib.training.checkpoint import TrainingStopped
+from tsmlib.study.seeds import make_as_one, require_seeds
 
 
 @dataclass(frozen=True)
@@ -62,34 +62,21 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
     From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its budget; else learned now,
     going on from its checkpoint if it was stopped.
     """
-    lesson = _Lesson.of(run, task, method, budget)
-    return lesson.kept() or lesson.learned()
+    asked = _Asked.of(run, task, method, budget)
+    return asked.kept() or asked.learned()
 
 
 def learn_as_one(runs: Sequence[Run], task: Task, method: Method, budget: Budget = USUAL) -> list[Learned]:
-    """``learn`` of runs with several seeds; those that lack the policy learn it as one (``learn_stacked``).
-
-    Where that is not possible, in an ensemble or with one seed whose model diverges for instance, it is said, and they
-    learn one after another; TrainingStopped for the first that could not, when the others are there.
-    """
-    lessons = [_Lesson.of(run, task, method, budget) for run in runs]
-    missing = [lesson for lesson in lessons if not lesson.kept()]
-    if len(missing) > 1:
-        try:
-            _learn_as_one(missing)
-        except StoreError:
-            raise
-        except (TrainingStopped, torch.OutOfMemoryError, ValueError) as error:
-            print(f"{task.env}: policies of {len(missing)} seeds are not learned as one, but one by one: {error}")
-    found, stopped = list[Learned](), list[TrainingStopped]()
-    for lesson in lessons:
-        try:
-            found.append(lesson.kept() or lesson.learned())
-        except TrainingStopped as error:
-            stopped.append(error)
-    if stopped:
-        raise stopped[0]
-    return found
+    """``learn`` of runs with several seeds; those that lack the policy learn it as one (``learn_stacked``,
+    ``make_as_one``)."""
+    require_seeds(runs)
+    asked = {run.seed: _Asked.of(run, task, method, budget) for run in runs}
+    return make_as_one(
+        f"{task.env}: the {method.search_space} policy in {method.model}", runs,
+        lambda run: asked[run.seed].kept() is None,
+        lambda lacking: _learn_as_one([asked[run.seed] for run in lacking]),
+        lambda run: asked[run.seed].kept() or asked[run.seed].learned(),
+    )  # fmt: skip
 
 
 def complete(run: Run, budget: Budget) -> Budget:
@@ -98,7 +85,7 @@ def complete(run: Run, budget: Budget) -> Budget:
 
 
 @dataclass(frozen=True)
-class _Lesson:
+class _Asked:
     """A policy that a run asks for: what it is learned in, and where its file is."""
 
     run: Run
@@ -129,6 +116,7 @@ class _Lesson:
 
     @property
     def made_from(self) -> dict[str, Json]:
+        """What a file has to be made from to be this policy."""
         weights: dict[str, Json] = {"model": artifacts.digest(self.net.state_dict())}
         if self.prior is not None:
             weights["prior"] = artifacts.digest(self.prior.state_dict())
@@ -147,8 +135,8 @@ class _Lesson:
         return None
 
     def learned(self) -> Learned:
-        """Learned now, going on from the checkpoint beside its file, and stored."""
-        self.say()
+        """The policy, learned now, going on from the checkpoint beside its file, and stored."""
+        print(self.announcement())
         policy, title = self.policy().to(self.run.device), f"{self.path.parent.name}: {self.path.stem}"
         curve = learn_policy(
             policy, self.net.to(self.run.device), self.task.reward_for, self.episodes(), self.options(),
@@ -156,11 +144,12 @@ class _Lesson:
         )  # fmt: skip
         return self.store(policy, curve)
 
-    def say(self) -> None:
-        print(
+    def announcement(self, seeds: str = "") -> str:
+        """What is going to be learned, and how long; seeds: of several as one."""
+        return (
             f"{self.task.env}: no {self.method.search_space} policy learned in {self.method.model} at scale "
-            f"{self.run.scale}; learning it now, {self.budget.iterations} iterations of 0.1 to 1 s. Stopped, it goes "
-            "on from there the next time"
+            f"{self.run.scale}{seeds}; learning it now, {self.budget.iterations} iterations of 0.1 to 1 s"
+            f"{', several times that for all' if seeds else ''}. Stopped, it goes on from there the next time"
         )
 
     @property
@@ -170,6 +159,7 @@ class _Lesson:
 
     @property
     def checkpoint(self) -> Path:
+        """Folder beside the file."""
         return self.path.with_suffix(".checkpoint")
 
     def policy(self) -> Policy:
@@ -185,19 +175,22 @@ class _Lesson:
         return policy
 
     def episodes(self) -> Draw:
+        """Starts as those of the training data."""
         return episodes_from(torch.from_numpy(dataset(self.run, self.task.env, "train").states[:, 0]))
 
     def options(self) -> LearningOptions:
+        """Schedule of the run's scale and the budget."""
         n = self.budget.iterations
         return LearningOptions(
             horizon=self.task.horizon, iterations=n, episodes=EPISODES[self.run.scale], record_every=max(1, n // 10)
         )
 
     def measure(self, policy: Policy) -> dict[str, Tensor]:
+        """Numbers of the learning curve."""
         return assess(policy, self.net, self.task, seed=self.run.seed + 1)
 
-    def store(self, policy: Policy, curve: LearningCurve, *, policies: int = 1) -> Learned:
-        """policies: that were learned as one."""
+    def store(self, policy: Policy, curve: LearningCurve) -> Learned:
+        """The policy as it is kept in the run's folder."""
         header: dict[str, Json] = {
             "made_from": self.made_from, "budget": asdict(self.budget), "model": self.method.model,
             "search_space": self.method.search_space, "targets": len(self.task),
@@ -205,27 +198,25 @@ class _Lesson:
             "curve": asdict(curve), "seconds": curve.seconds[-1], "torch": torch.__version__,
             "threads": torch.get_num_threads(), "device": self.run.device, "finished": time.strftime("%Y-%m-%d"),
         }  # fmt: skip
-        if policies > 1:
-            header["policies"] = policies
         artifacts.save_model(self.path, policy.cpu(), header)
         shutil.rmtree(self.checkpoint)
         return Learned(policy, cast(PolicyHeader, artifacts.read_header(self.path)))
 
 
-def _learn_as_one(lessons: Sequence[_Lesson]) -> None:
+def _learn_as_one(asked: Sequence[_Asked]) -> None:
     """Learn the policies of several seeds as one and store each where its run finds it."""
-    first = lessons[0]
-    first.say()
-    policies = [lesson.policy().to(first.run.device) for lesson in lessons]
+    first, device = asked[0], asked[0].run.device
+    print(first.announcement(f" with seeds {', '.join(str(each.run.seed) for each in asked)}"))
+    policies = [each.policy().to(device) for each in asked]
     curves = learn_stacked(
-        policies, [cast(torch.nn.Module, lesson.net.to(first.run.device)) for lesson in lessons],
-        first.task.reward_for, [lesson.episodes() for lesson in lessons], first.options(),
-        seeds=[lesson.seed for lesson in lessons], measures=[lesson.measure for lesson in lessons],
-        checkpoints=[lesson.checkpoint for lesson in lessons],
-        progress=f"{first.path.parent.name}: {first.path.stem}, {len(lessons)} seeds",
+        policies, [cast(torch.nn.Module, each.net.to(device)) for each in asked],
+        first.task.reward_for, [each.episodes() for each in asked], first.options(),
+        seeds=[each.seed for each in asked], measures=[each.measure for each in asked],
+        checkpoints=[each.checkpoint for each in asked],
+        progress=f"{first.path.parent.name}: {first.path.stem}, {len(asked)} seeds",
     )  # fmt: skip
-    for lesson, policy, curve in zip(lessons, policies, curves, strict=True):
-        lesson.store(policy, curve, policies=len(lessons))
+    for each, policy, curve in zip(asked, policies, curves, strict=True):
+        each.store(policy, curve)
 
 
 def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[Row]:

@@ -42,7 +42,7 @@ POOL = "pool"  # in place of an executor: no Snakemake
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 COPY = 500  # MB more for each further seed of a training of several: its data
-AT_ONCE = 10  # seeds of what several make as one
+AT_ONCE = 10  # seeds of a group
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
@@ -126,17 +126,20 @@ def seed_groups(executions: Sequence[Execution]) -> dict[tuple[int, str], list[E
 
     (Seed, name of the job) -> a notebook of each seed of its group that needs it; the groups by their seeds.
     """
-    need: dict[str, dict[int, Execution]] = {}
+    need: dict[SeedsJob, dict[int, Execution]] = {}  # the same with the same settings
+    known: set[tuple[int, str]] = set()
     for execution in executions:
         for job in needs(execution.run) if execution.run.device != "cpu" else ():
-            if isinstance(job, SeedsJob) and not job.ships(execution.run):
-                need.setdefault(job.name, {}).setdefault(execution.run.seed, execution)
+            key = (execution.run.seed, job.name)
+            if isinstance(job, SeedsJob) and not job.ships(execution.run) and key not in known:
+                known.add(key)
+                need.setdefault(job, {})[execution.run.seed] = execution
     found: dict[tuple[int, str], list[Execution]] = {}
-    for name, of in need.items():
+    for job, of in need.items():
         in_order = [of[seed] for seed in sorted(of)]
         for first in range(0, len(in_order), AT_ONCE):
             if len(group := in_order[first : first + AT_ONCE]) > 1:
-                found |= {(each.run.seed, name): group for each in group}
+                found |= {(each.run.seed, job.name): group for each in group}
     return found
 
 
@@ -206,23 +209,25 @@ def run_all(
         manifest.write_json(folder / "code.json", {"codes": codes})
         if executor == POOL:
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
-            _make_ahead(executions)
+            _precompute_groups(executions)
             for execution in executions:
                 print(notebooks.execute(execution))
             return 0
         return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
 
 
-def _make_ahead(executions: Sequence[Execution]) -> None:
+def _precompute_groups(executions: Sequence[Execution]) -> None:
     """What several seeds make as one, before the notebooks that need it."""
-    for (seed, name), group in seed_groups(executions).items():
+    groups = seed_groups(executions)
+    for (seed, name), group in groups.items():
         runs = [each.run for each in group]
         if seed != runs[0].seed:  # of the same group
             continue
         job = complete(runs[0], needs(runs[0]))[name]
         assert isinstance(job, SeedsJob)
         for run in runs:
-            precompute(run, job.needs(run), progress=f"before {job.name}, seed {run.seed}")
+            before = [each for each in job.needs(run) if (run.seed, each.name) not in groups]
+            precompute(run, before, progress=f"before {job.name}, seed {run.seed}")
         _make_as_one(job, runs)
 
 
@@ -251,6 +256,10 @@ def step(executions: Sequence[Execution], job: str) -> None:
         with terminable(), _locked([run], job):
             known[job].make(run)
     elif isinstance(found := known.get(job), SeedsJob):
+        for other in executions[1:]:
+            if complete(other.run, needs(other.run)).get(job) != found:
+                seeds = f"{run.seed} and {other.run.seed}"
+                raise ParameterError(f"seeds {seeds} need {job} with different settings; make it with one at a time.")
         _make_as_one(found, [each.run for each in executions])
     else:
         raise ParameterError(

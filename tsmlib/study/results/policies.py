@@ -49,11 +49,11 @@ def learning_rows(
         for iteration, values in zip(curve["iteration"], measured[metric], strict=True)
         for copy, value in enumerate(values)
     ]
-    rows += [
-        dict(common, iteration=iteration, metric="seconds", value=seconds, unit="s")
-        for iteration, seconds in zip(curve["iteration"], curve["seconds"], strict=True)
-        if "policies" not in header
-    ]
+    if curve.get("policies", 1) == 1:
+        rows += [
+            dict(common, iteration=iteration, metric="seconds", value=seconds, unit="s")
+            for iteration, seconds in zip(curve["iteration"], curve["seconds"], strict=True)
+        ]
     common["iteration"] = curve["iteration"][-1]
     for metric, value, unit in (("samples", samples, "steps"), ("train_seconds", train_seconds, "s")):
         if value is not None:
@@ -87,7 +87,7 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
         for metric, against in ways.items():
-            if np.isnan(own[against]).any():  # seconds that are not known
+            if against not in own:  # seconds that are not known
                 continue
             spent = reached(own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
@@ -158,15 +158,25 @@ def _curves(own: pd.DataFrame) -> Curves:
     at, wide = wide.columns.to_numpy(dtype=int), seed_means(wide)
     curves: Curves = {"seeds": np.array(own["seed"].nunique())}
     curves |= {metric: wide.loc[metric].to_numpy() for metric in wide.index.unique("metric")}
-    curves["seconds"] = curves.pop(clock).mean(0) if clock in curves else np.full(len(at), np.nan)
+    curves.pop(clock, None)
+    curves |= _seconds(own, clock)
     if not own["search_space"].iloc[0]:
         return curves | {"steps": at, "samples": at}
-    samples, before = (own[own["metric"] == metric]["value"].mean() for metric in ("samples", "train_seconds"))
+    samples = own[own["metric"] == "samples"]["value"].mean()
     (task, scale), within = own[["task", "scale"]].iloc[0], own[own["metric"] == "within_data"]
     within = seed_means(within.set_index(["seed", "copy"])[["value"]])
     curves |= {"iterations": at, "steps": at * model_steps(task, scale)}
-    return curves | {"samples": np.full(len(at), samples), "seconds": curves["seconds"] + before,
-                     "within_data": within.to_numpy()}  # fmt: skip
+    return curves | {"samples": np.full(len(at), samples), "within_data": within.to_numpy()}
+
+
+def _seconds(own: pd.DataFrame, clock: str) -> Curves:
+    """Seconds at each record, training of the model included: means over the seeds of which both are known; none where
+    there is none."""
+    spent = own[own["metric"] == clock].pivot_table(index="seed", columns="at", values="value")
+    if own["search_space"].iloc[0]:
+        spent = spent.add(own[own["metric"] == "train_seconds"].groupby("seed")["value"].mean(), axis="index")
+    known = spent.dropna()
+    return {} if known.empty else {"seconds": known.mean(axis="index").to_numpy()}
 
 
 def seed_means(values: pd.DataFrame) -> pd.DataFrame:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypedDict, TypeVar
+from typing import Any, Concatenate, NotRequired, ParamSpec, TypedDict, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -48,12 +48,13 @@ class LearnedCurve(TypedDict):
     predicted: list[list[float]]
     measured: dict[str, list[list[float]]]
     resumed: list[str]
+    policies: NotRequired[int]  # older files were learned alone
 
 
 class PolicyHeader(TypedDict, total=False):
     """What the file of a learned policy says of itself; targets: that it was measured on as it was learned.
 
-    seconds: of the CPU; of ``policies`` that were learned as one, of all together.
+    seconds: of the CPU, of all ``policies`` of the curve together.
     """
 
     fingerprint: dict[str, Json]
@@ -70,7 +71,6 @@ class PolicyHeader(TypedDict, total=False):
     threads: int
     device: str
     finished: str
-    policies: int
 
 
 # Places and methods --------------------------------------------------------------------------------------------------
