@@ -126,20 +126,20 @@ def seed_groups(executions: Sequence[Execution]) -> dict[tuple[int, str], list[E
 
     (Seed, name of the job) -> a notebook of each seed of its group that needs it; the groups by their seeds.
     """
-    need: dict[SeedsJob, dict[int, Execution]] = {}  # the same with the same settings
+    need: dict[tuple[str, str], dict[int, Execution]] = {}  # by name and settings
     known: set[tuple[int, str]] = set()
     for execution in executions:
-        for job in needs(execution.run) if execution.run.device != "cpu" else ():
-            key = (execution.run.seed, job.name)
-            if isinstance(job, SeedsJob) and not job.ships(execution.run) and key not in known:
-                known.add(key)
-                need.setdefault(job, {})[execution.run.seed] = execution
+        run = execution.run
+        for job in needs(run) if run.device != "cpu" else ():
+            if isinstance(job, SeedsJob) and not job.ships(run) and (run.seed, job.name) not in known:
+                known.add((run.seed, job.name))
+                need.setdefault((job.name, _settings(run, job)), {})[run.seed] = execution
     found: dict[tuple[int, str], list[Execution]] = {}
-    for job, of in need.items():
+    for (name, _), of in need.items():
         in_order = [of[seed] for seed in sorted(of)]
         for first in range(0, len(in_order), AT_ONCE):
             if len(group := in_order[first : first + AT_ONCE]) > 1:
-                found |= {(each.run.seed, job.name): group for each in group}
+                found |= {(each.run.seed, name): group for each in group}
     return found
 
 
@@ -256,9 +256,10 @@ def step(executions: Sequence[Execution], job: str) -> None:
         with terminable(), _locked([run], job):
             known[job].make(run)
     elif isinstance(found := known.get(job), SeedsJob):
-        for other in executions[1:]:
-            if complete(other.run, needs(other.run)).get(job) != found:
-                seeds = f"{run.seed} and {other.run.seed}"
+        for other in (each.run for each in executions[1:]):
+            its = complete(other, needs(other)).get(job)
+            if its is None or _settings(other, its) != _settings(run, found):
+                seeds = f"{run.seed} and {other.seed}"
                 raise ParameterError(f"seeds {seeds} need {job} with different settings; make it with one at a time.")
         _make_as_one(found, [each.run for each in executions])
     else:
