@@ -22,6 +22,7 @@ from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
 from tsmlib.study.comparison import published
+from tsmlib.study.models import Trained, load_pretrained
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
 from tsmlib.study.results.exploration import PENDULUM, PUSH
@@ -478,6 +479,19 @@ def test_every_variant_changes_the_pushing_arm_and_those_of_the_mass_no_reacher(
     }
     with pytest.raises(ValueError, match="no variant is called 'heavier'; there are standard, mass0.5"):
         adaptation.changed(PUSH, "heavier")
+
+
+def test_seconds_of_models_trained_as_one_are_seconds_of_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    net = load_pretrained("lstm", env="tsm/Reacher-v0")
+    metrics = []
+    for header in ({"seconds": 9.0, "copies": 3}, {"seconds": 9.0}):
+        monkeypatch.setattr(adaptation, "load_or_train", lambda *_, h=header: Trained(net, h))
+        rows = tables.frame(adaptation.rows(RUN, "lstm", WEAK, way="reference", episodes=5, n_test=4)[1])
+        metrics.append(set(rows["metric"]))
+        (_, _, line) = str(results.ways_table(rows)).splitlines()
+        assert ("| - " in line) == ("copies" in header)
+    assert metrics[1] - metrics[0] == {"train_seconds"}
+    assert metrics[0] == set(results.SCORES)
 
 
 def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None:

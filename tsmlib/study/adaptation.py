@@ -148,7 +148,7 @@ def rows(
     """A model of ``env`` by a way, and the rows of its scores. A reference has the scale's episodes and updates."""
     if way == REFERENCE:
         found, n = load_or_train(run, env, word), sizes(run, env)["train"]
-        net, seconds = found.model, found.header["seconds"]
+        net, seconds = found.model, None if "copies" in found.header else found.header["seconds"]
     else:
         net, seconds = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
         n = 0 if way == "zero-shot" else episodes

@@ -127,9 +127,11 @@ def _of_loop(run: Run, word: str, env: str, data: str) -> Row:
 
 
 def adapted_rows(
-    run: Run, env: str, word: str, way: str, scores: Scores, *, episodes: int, ahead: Sequence[int], seconds: float
-) -> list[Row]:
-    """Both scores of an adapted model at some steps ahead, and the CPU ``seconds`` of its training."""
+    run: Run, env: str, word: str, way: str, scores: Scores, *, episodes: int, ahead: Sequence[int],
+    seconds: float | None,
+) -> list[Row]:  # fmt: skip
+    """Both scores of an adapted model at some steps ahead, and the CPU ``seconds`` of its training; no row of these for
+    None, where they are of several models together."""
     curves = scores.against_horizon()
     common = dict(
         env=env, sim=EnvSpec.parse(env).simulator, model=word, planner="none", execution=OPEN, configuration=way,
@@ -139,7 +141,9 @@ def adapted_rows(
         common | dict(metric=metric, steps_ahead=steps, value=float(curves[metric][steps - 1]), unit="1")
         for metric in SCORES for steps in ahead
     ]  # fmt: skip
-    return [*found, common | dict(metric="train_seconds", value=seconds, unit="s")]
+    if seconds is not None:
+        found.append(common | dict(metric="train_seconds", value=seconds, unit="s"))
+    return found
 
 
 # Panels --------------------------------------------------------------------------------------------------------------
@@ -342,7 +346,8 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
         for metric, title in SCORES.items():
             for ahead, part in table.groups(table.select(own, metric=metric), "steps_ahead"):
                 line[f"{title}, {ahead} steps"] = table.spell(part["value"])
-        line["CPU s"] = table.spell(table.select(own, metric="train_seconds")["value"], "{:.0f}")
+        spent = table.select(own, metric="train_seconds")["value"]
+        line["CPU s"] = table.spell(spent, "{:.0f}") if len(spent) else "-"
         lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
