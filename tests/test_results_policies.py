@@ -83,9 +83,11 @@ def test_seconds_of_several_are_no_seconds_of_one() -> None:
     three = curves_of([*rows(), *learned_as_one(1), *untimed_of(2)])["reach"][TSM]
     assert three["seconds"].tolist() == [100, 150, 200]  # of seed 0, which alone has both
     assert three["seeds"] == 3
-    own = {TSM: {name: part for name, part in ended(-12, -4, -3).items() if name != "seconds"}}
-    found = policies_results.plateau_rows(own, {}, steps=50)
-    assert {row["metric"] for row in found} == {"samples_to_90", "env_samples_to_90"}
+    untimed_tsm = {name: part for name, part in ended(-12, -4, -3).items() if name != "seconds"}
+    compared = {TSM: untimed_tsm, PPO: ended(-13, -8, -2, prior=False)}
+    found = policies_results.plateau_rows(compared, {}, steps=50)
+    metrics = {"samples_to_90", "env_samples_to_90"}  # nor of PPO, whose seeds are to be those of TSM
+    assert {(row["model"], row["metric"]) for row in found} == {(m, what) for m in ("tsm", "ppo") for what in metrics}
 
 
 def untimed_of(seed: int) -> list[dict[str, Any]]:

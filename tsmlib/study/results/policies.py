@@ -73,7 +73,8 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
     that it took. steps: of its model that a policy takes per iteration.
 
     ``samples_to_90``: steps of what it learned in, the model or else the environment; ``env_samples_to_90``: steps of
-    the environment, the data of its model included; ``seconds_to_90``: training of its model included.
+    the environment, the data of its model included; ``seconds_to_90``: training of its model included, where seconds of
+    all policies are known.
     """
     means = {method: own["return_true"].mean(0) for method, own in curves.items()}
     inside, free = ([mean[-1] for method, mean in means.items() if bool(method.search_space) is way]
@@ -83,11 +84,12 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
     if not ends or not min(ends) > start:
         return []
     level, rows = start + share * (min(ends) - start), []
+    timed = all("seconds" in own for own in curves.values())  # what is compared has the same seeds
     for method, own in curves.items():
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
         for metric, against in ways.items():
-            if against not in own:  # seconds that are not known
+            if against == "seconds" and not timed:
                 continue
             spent = reached(own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
