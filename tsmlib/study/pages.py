@@ -407,7 +407,7 @@ first round.
 The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque, of `mass0.5` the object has half its
 mass. n test episodes, open loop after ten
 observed steps, in units of the standard arm.
-Seeds are of the few episodes and of the updates on them: all begin from one model, as it shipped until November 2026.
+Seeds are of the few episodes and of the updates on them: all begin from one model, as it ships.
 
 ![Energy scores of adapted models against the episodes that they know](../figures/10_ways.png)
 
