@@ -130,3 +130,9 @@ def test_the_library_is_imported_when_it_is_used() -> None:
     code = f"import sys, tsmlib; sys.exit(bool({HEAVY} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert {getattr(tsmlib, name).__name__ for name in tsmlib.__all__} == set(tsmlib.__all__)
+
+
+def test_policies_act_in_codes_only_of_models_that_have_some() -> None:
+    found = [(way.model, way.search_space) for way in zoo.policies(zoo.words("dynamics"))]
+    assert [model for model, space in found if space == "direct"] == list(zoo.words("dynamics"))
+    assert {model for model, space in found if space == "latent"} == {"tsm", "rtsm"}

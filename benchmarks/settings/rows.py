@@ -270,12 +270,11 @@ def main() -> None:
     elif given.part in NOTEBOOKS:
         publish(notebook, executed(runs.notebooks()[given.part], run, given.envs, given.models))
     elif given.part == "policies":
-        budget, codes = Budget(given.copies, given.iterations), set(zoo.words(cls=zoo.CODED))
+        budget = Budget(given.copies, given.iterations)
         policies = [
             (study.load_task(env), way, stored_budget(run, env, way) or budget)
-            for env in given.envs for way in zoo.methods(given.models, "policy")
-            if way.search_space == "direct" or way.model in codes
-        ]  # fmt: skip
+            for env, way in product(given.envs, zoo.policies(given.models))
+        ]
         study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in policies])
         publish(notebook, study.policy_rows(run, policies))
     else:

@@ -47,7 +47,6 @@ HERE = Path(__file__).parent
 ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
 MODELS = ("rtsm", "tsm", "lstm", "multistep", "onestep", "prior")
 SPLITS = ("train", "validation")
-CODED = zoo.words(cls=zoo.CODED)
 TARGETS, COPIES = 100, 3  # of policies, as in rows.py
 
 
@@ -123,11 +122,10 @@ def main() -> None:
         for env, word, run in product(given.envs, words, own):
             if not (run.dir / "models" / EnvSpec.parse(env).name / f"{word}.safetensors").exists():
                 parser.error(f"{run.dir} has no {word} of {env}; train it first, by this script without --policies")
-        ways = [way for way in zoo.methods(words, "policy") if way.search_space == "direct" or way.model in CODED]
         with ProcessPoolExecutor(given.together, mp_context=spawn, max_tasks_per_child=1) as learners:
             finish(began, {
                 learners.submit(learn, own, env, way, given.policies): f"{env} {way.label}"
-                for env, way in product(given.envs, ways)
+                for env, way in product(given.envs, zoo.policies(words))
             })  # fmt: skip
         return
     wanted = [(env, word) for env, word in product(given.envs, given.models) if models.trained_on(env, word) == env]

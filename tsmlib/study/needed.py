@@ -108,7 +108,7 @@ def control(run: Run) -> Control:
 def _policies(run: Run) -> list[tuple[str, Method, Budget]]:
     """Environment, method and budget, the smaller one where an iteration takes long: inside the paper's model, and on
     pushing. At scale laptop one begins to learn to reach."""
-    inside = [*methods((PAPERS, OURS), "policy"), *methods(BASELINES, "policy", ["direct"])]
+    inside = zoo.policies((PAPERS, OURS, *BASELINES))
     found: list[tuple[str, Method, Budget]] = []
     envs = run.pick(smoke=(REACH, PUSH), laptop=(REACH,), paper=(REACH, PUSH))
     for env, way in product(envs, run.pick(smoke=inside[:1], laptop=[method(OURS, "latent", "policy")], paper=inside)):

@@ -298,3 +298,9 @@ def method(model: str, search_space: str = "", planner: str = "", variant: str =
 def methods(models: Iterable[str], planner: str, spaces: Iterable[str] = SEARCH_SPACES) -> list[Method]:
     """Every model with a planner, in every search space."""
     return [method(model, space, planner) for model, space in product(models, spaces)]
+
+
+def policies(models: Iterable[str]) -> list[Method]:
+    """Every model with a policy that acts directly, and those that have codes also with a latent one."""
+    coded = words(cls=CODED)
+    return [way for way in methods(models, "policy") if way.search_space == "direct" or way.model in coded]
