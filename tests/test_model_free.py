@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from scripts import pins, start_with_only
 
 from tsmlib import study
 from tsmlib.models.features import Features
@@ -195,9 +196,12 @@ def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureF
     assert len({row["configuration"] for row in rows if row["subset"] == ""}) == 1
 
 
-def pins(path: Path) -> dict[str, str]:
-    lines = path.read_text().splitlines()
-    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+@pytest.mark.parametrize(("without", "starts"), [("", True), ("lazy-loader", False)])
+def test_the_script_starts_where_nothing_is_installed_but_the_requirements(without: str, starts: bool) -> None:
+    names = [name for name in pins(FOLDER / "requirements.txt") if name != without]
+    code, said = start_with_only(FOLDER / "model_free.py", names)
+    assert (code == 0) is starts, said[-500:]
+    assert starts or "lazy_loader is no requirement" in said
 
 
 def test_pins_are_those_of_the_lock_where_both_name_a_package() -> None:

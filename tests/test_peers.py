@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from itertools import count, pairwise
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scripts import pins, start_with_only
 from torch import Tensor
 
 from tsmlib import study
@@ -353,44 +352,11 @@ def test_the_trained_network_is_found_again_until_its_training_changes(
     assert len(made) == 3
 
 
-def pins(path: Path) -> dict[str, str]:
-    lines = path.read_text().splitlines()
-    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
-
-
 def test_pins_are_those_of_the_lock_where_both_name_a_package() -> None:
     own, lock = pins(FOLDER / "requirements.txt"), pins(ROOT / "environment.lock")
     assert {"torch", "hydra-core", "omegaconf", "antlr4-python3-runtime", "gymnasium", "mujoco"} <= set(own)
     assert "mbrl" not in own  # it would bring its own pins
     assert {name: lock[name] for name in own if name in lock} == {k: v for k, v in own.items() if k in lock}
-
-
-REFUSING = """
-import importlib.metadata as metadata, runpy, sys
-from packaging.requirements import Requirement
-
-installed = {found.name.lower().replace("_", "-"): found for found in metadata.distributions()}
-allowed, left = {"tsmlib", "packaging", "setuptools"}, list(sys.argv[2:])
-while left:
-    if (name := left.pop().lower().replace("_", "-")) not in allowed and name in installed:
-        wanted = map(Requirement, installed[name].requires or [])
-        left += [other.name for other in wanted if not other.marker or other.marker.evaluate({"extra": ""})]
-    allowed.add(name)
-owners = {
-    module: {name.lower().replace("_", "-") for name in names}
-    for module, names in metadata.packages_distributions().items()
-}
-
-
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if (own := owners.get(name.split(".")[0])) and not own & allowed:
-            raise ModuleNotFoundError(f"{name} is no requirement", name=name)
-
-
-sys.meta_path.insert(0, Refuse())
-runpy.run_path(sys.argv[1], run_name="imported")
-"""
 
 
 @pytest.mark.parametrize(("script", "without", "starts"), [
@@ -400,11 +366,9 @@ def test_the_scripts_start_where_nothing_is_installed_but_the_requirements(
     script: str, without: str, starts: bool
 ) -> None:
     names = [name for name in pins(FOLDER / "requirements.txt") if name != without]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(FOLDER), str(FOLDER.parent)])}
-    command = [sys.executable, "-c", REFUSING, str(FOLDER / f"{script}.py"), *names]
-    done = subprocess.run(command, capture_output=True, text=True, env=env, check=False)
-    assert (done.returncode == 0) is starts, done.stderr[-500:]
-    assert starts or "lazy_loader is no requirement" in done.stderr
+    code, said = start_with_only(FOLDER / f"{script}.py", names)
+    assert (code == 0) is starts, said[-500:]
+    assert starts or "lazy_loader is no requirement" in said
 
 
 def test_the_readme_names_the_pins_and_options_that_exist() -> None:
