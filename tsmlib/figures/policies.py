@@ -124,7 +124,7 @@ def _draw(
 
 def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, floored: bool) -> tuple[float, float]:
     """The range of returns of some tasks: of the ends of curves, and below them as far as curves begin, or somewhat
-    more than as far again.
+    more than as far again. Ends that fall half as far below all references as the best lies above may lie outside.
 
     floored: of everything, but what falls far below doing nothing may lie outside.
     """
@@ -132,6 +132,8 @@ def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, 
     floors = [level for task in checked for level in levels[task].values()]
     if not floored:
         ends = np.array([*(mean[-1] for mean in means), *(max(own.values()) for own in levels.values() if own)])
+        if floors:
+            ends = ends[ends >= min(floors) - 0.5 * (ends.max() - min(floors))]
         low, high = axes.limits(ends, ends)
         start = min(low, *(mean[0] for mean in means)) - 0.1 * (high - low)
         return max(low - 0.6 * (high - low), start), high + 0.3 * (high - low)
