@@ -268,6 +268,24 @@ def test_a_learning_curve_is_asked_for_its_end_or_its_average() -> None:
         evaluate.measure(rule.checks[""][0], frames(of_05_control=rows[:-1]))
 
 
+def test_averages_of_learning_curves_are_over_the_places_that_all_have() -> None:
+    common = dict(metric="return_true", env="tsm/Reacher-v0", planner="policy", execution="policy", scale="paper")
+    rows: Rows = [
+        dict(common, copy=0, model=model, search_space=space, seed=k, iteration=h, value=-8 * 0.5 ** (h / 10) + k)
+        for model, space, places in (("tsm", "latent", (0, 10, 20, 40)), ("lstm", "direct", (0, 40, 80, 120)))
+        for k in (0, 1) for h in places
+    ]  # fmt: skip
+
+    def rule(rows: Rows) -> evaluate.Effect:
+        way = returns(lambda q: q.policy("return_true", LAP, REACHER, average=True).mean()
+                      - q.policy("return_true", LSTM, REACHER, average=True).mean() > 0)  # fmt: skip
+        return evaluate.measure(way.checks[""][0], frames(of_05_control=rows))
+
+    assert rule(rows).value == pytest.approx(0.0)  # they are one curve, of which one is recorded for longer
+    with pytest.raises(evaluate.ClaimError, match="recorded at different places"):
+        rule([row for row in rows if row["iteration"] != 40])
+
+
 def test_a_check_is_read_as_it_was_written() -> None:
     q = Query()
     tsm, lstm = q.ll(TSM, REACHER), q.ll(LSTM, REACHER)

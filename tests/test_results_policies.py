@@ -154,6 +154,13 @@ def test_a_common_plateau_is_what_policies_of_models_and_the_best_other_have_all
     assert len(policies_results.plateaus_table(found).splitlines()) == 5
 
 
+def test_a_policy_that_was_there_by_its_first_record_has_no_number_of_samples() -> None:
+    curves = {TSM: ended(-12, -3, -3), PPO: ended(-13, -8, -2, prior=False)}
+    found = {(row["model"], row["metric"]) for row in policies_results.plateau_rows(curves, {}, steps=50)}
+    assert ("tsm", "samples_to_90") not in found
+    assert {("tsm", "env_samples_to_90"), ("tsm", "seconds_to_90"), ("ppo", "samples_to_90")} <= found
+
+
 def test_policies_that_gain_nothing_have_no_plateau() -> None:
     assert policies_results.plateau_rows({TSM: ended(-4, -4.5), PPO: ended(-9, -2, prior=False)}, {}, steps=50) == []
     assert policies_results.plateau_rows({}, {}, steps=50) == []

@@ -98,7 +98,7 @@ def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
         if not check.margin or check.op == "==" or not check.number.terms:
             continue
         try:
-            values, _ = evaluate.of_seeds(check, {term: rows.ask(term) for term in check.number.terms})
+            values, _ = evaluate.of_seeds(check, rows.asked(check))
         except evaluate.ClaimError:
             continue
         if len(values) < 2:

@@ -124,7 +124,7 @@ def _draw(
 
 def _limits(checked: Mapping[str, Mapping[Method, Curves]], levels: References, floored: bool) -> tuple[float, float]:
     """The range of returns of some tasks: of the ends of curves, and below them as far as curves begin, or somewhat
-    more than as far again. Ends that fall half as far below all references as the best lies above may lie outside.
+    more than as far again. Ends more than half as far below all references as the best lies above may lie outside.
 
     floored: of everything, but what falls far below doing nothing may lie outside.
     """

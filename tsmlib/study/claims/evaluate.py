@@ -28,6 +28,7 @@ from tsmlib.study.claims.query import Check, Term
 from tsmlib.study.notebooks import require
 from tsmlib.study.runs import RESULTS, Run, find, notebooks
 
+UNTOLD = {"samples_to_90"}  # what a curve that was recorded too rarely does not tell (``results.policies.plateau_rows``)
 TRIALS = ("target", "copy")  # columns that number the trials inside a seed
 MADE_BY = {  # table -> what to run where it lacks rows; of the others, their notebook
     "03_ablation": "python -m tsmlib run predict --scale paper",
@@ -164,7 +165,7 @@ class Tables:
 
     def __init__(self, rows: Mapping[str, pd.DataFrame]) -> None:
         self.rows = rows
-        self.ask = cache(self._ask)
+        self.ask, self._lines = cache(self._ask), cache(self._read)
         self.parts: dict[tuple[Hashable, ...], list[pd.DataFrame]] = {}
         for file, table in rows.items():
             trial = table[[name for name in TRIALS if name in table]].astype(float).max(axis=1).fillna(-1).astype(int)
@@ -176,8 +177,27 @@ class Tables:
         """The same rows with other models' names on them: a check of the checker."""
         return Tables({file: table.assign(model=table["model"].replace(models)) for file, table in self.rows.items()})
 
-    def _ask(self, term: Term) -> pd.DataFrame:
-        """Values (seeds, trials), one column where there are no trials. ClaimError for rows missing or wrong."""
+    def asked(self, check: Check) -> dict[Term, pd.DataFrame]:
+        """``ask`` for every term of a check. What is averaged along learning curves is where all of them were recorded,
+        since a curve that goes on for longer spends more of it near its end. ClaimError as ``ask``, and where curves
+        have no more than one such place."""
+        averaged = [set(next(iter(self._lines(term).values()))) for term in check.number.terms if term.average]
+        common = frozenset[float]().union(*averaged).intersection(*averaged)
+        if averaged and len(common) < 2:
+            raise ClaimError(f"curves were recorded at different places in {check.text}", check.number.terms[0].table)
+        return {term: self.ask(term, common if term.average else frozenset()) for term in check.number.terms}
+
+    def _ask(self, term: Term, among: frozenset[float] = frozenset()) -> pd.DataFrame:
+        """Values (seeds, trials), one column where there are no trials; of a curve at its end, or the mean ``among``
+        some places. ClaimError for rows missing or wrong."""
+        values = {
+            key: np.mean([line[at] for at in sorted(among)]) if among else line[max(line)]
+            for key, line in self._lines(term).items()
+        }  # fmt: skip
+        return pd.Series(values).unstack().sort_index().sort_index(axis=1)
+
+    def _read(self, term: Term) -> dict[tuple[int, int], dict[float, float]]:
+        """(seed, trial) -> place on the curve -> value."""
         asked = ", ".join(f"{column} {value}" for column, value in term.wanted.items() if value not in ("", "paper"))
         said = f"of {term.metric}{' by trial' * term.trials} (model {term.model}, {asked})"
         for part in self.parts.get((term.table, term.metric, term.model), []):
@@ -188,7 +208,7 @@ class Tables:
                 break
         else:
             raise ClaimError(f"no rows yet in {term.table}.csv {said}", term.table)
-        lines: dict[tuple[int, int], dict[float, float]] = {}  # (seed, trial) -> place on the curve -> value
+        lines: dict[tuple[int, int], dict[float, float]] = {}
         columns = (part[keep][name].tolist() for name in ("seed", "trial", term.curve or "trial", "value"))
         for seed, trial, at, value in zip(*columns, strict=True):
             line = lines.setdefault((seed, trial), {})
@@ -198,8 +218,7 @@ class Tables:
             line[at] = value
         if term.curve and len({tuple(sorted(line)) for line in lines.values()}) > 1:
             raise ClaimError(f"{term.table}.csv has curves of different lengths {said}", term.table)
-        values = {key: np.mean([*line.values()]) if term.average else line[max(line)] for key, line in lines.items()}
-        return pd.Series(values).unstack().sort_index().sort_index(axis=1)
+        return lines
 
 
 def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
@@ -306,7 +325,7 @@ def _effect(claim: Claim, check: Check, rows: Tables) -> Effect:
 
 def measure(check: Check, rows: Tables) -> Effect:
     """Estimate and interval of a check. ClaimError where rows are missing, doubled, or do not belong together."""
-    asked = {term: rows.ask(term) for term in check.number.terms}
+    asked = rows.asked(check)
     if not asked:  # arithmetic
         exact = float(check.number.of({}))
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
@@ -365,7 +384,7 @@ def _paired(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[list[int]
     for (a, one), (b, two) in itertools.combinations(asked.items(), 2):
         about = ("env", "noise", "delay", "subset", "execution")
         same = a.table == b.table and all(a.wanted.get(column) == b.wanted.get(column) for column in about)
-        if same and set(one.index) != set(two.index):  # elsewhere the seeds that both have count
+        if not {a.metric, b.metric} & UNTOLD and same and set(one.index) != set(two.index):  # elsewhere the seeds that both have count
             has = f"{one.index.tolist()} of {a.text}, and {two.index.tolist()} of {b.text}"
             raise ClaimError(f"{a.table}.csv has seeds {has} in {check.text}", a.table)
     seeds = sorted(set.intersection(*(set(found.index) for found in asked.values())))

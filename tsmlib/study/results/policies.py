@@ -72,9 +72,9 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
     before learning. There are no rows where that is none. A model-free policy that never comes there counts with all
     that it took. steps: of its model that a policy takes per iteration.
 
-    ``samples_to_90``: steps of what it learned in, the model or else the environment; ``env_samples_to_90``: steps of
-    the environment, the data of its model included; ``seconds_to_90``: training of its model included, where seconds of
-    all policies are known.
+    ``samples_to_90``: steps of what it learned in, the model or else the environment, and no row where it was there by
+    the first record of its curve, which does not tell when; ``env_samples_to_90``: steps of the environment, the data
+    of its model included; ``seconds_to_90``: training of its model included, where seconds of all policies are known.
     """
     means = {method: own["return_true"].mean(0) for method, own in curves.items()}
     inside, free = ([mean[-1] for method, mean in means.items() if bool(method.search_space) is way]
@@ -89,7 +89,8 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
         for metric, against in ways.items():
-            if against == "seconds" and not timed:
+            early = bool((means[method][1:2] >= level).any())  # a line from the start would say it learned too late
+            if (against == "seconds" and not timed) or (metric == "samples_to_90" and early):
                 continue
             spent = reached(own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
