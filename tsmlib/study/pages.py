@@ -352,8 +352,8 @@ Target by target, as above:
 ## Policies
 
 Learned inside the models, and model-free ones in the environment; means of the last record
-with half the 95 % t interval over training seeds, or over the copies that learned in the models of a single one. Seconds
-are of those seeds whose models and policies were not trained and learned together with those of others.
+with half the 95 % t interval over training seeds, or over the copies that learned in the models of a single one.
+Seconds are of those seeds whose models and policies were not trained and learned together with those of others.
 
 {policies_results.policies_table(policies_results.learning_curves(learned))}
 

@@ -28,7 +28,7 @@ from tsmlib.study.claims.query import Check, Term
 from tsmlib.study.notebooks import require
 from tsmlib.study.runs import RESULTS, Run, find, notebooks
 
-UNTOLD = {"samples_to_90"}  # what a curve that was recorded too rarely does not tell (``results.policies.plateau_rows``)
+UNTOLD = {"samples_to_90"}  # not told by a curve that was recorded too rarely (``results.policies.plateau_rows``)
 TRIALS = ("target", "copy")  # columns that number the trials inside a seed
 MADE_BY = {  # table -> what to run where it lacks rows; of the others, their notebook
     "03_ablation": "python -m tsmlib run predict --scale paper",
@@ -185,7 +185,7 @@ class Tables:
         common = frozenset[float]().union(*averaged).intersection(*averaged)
         if averaged and len(common) < 2:
             raise ClaimError(f"curves were recorded at different places in {check.text}", check.number.terms[0].table)
-        return {term: self.ask(term, common if term.average else frozenset()) for term in check.number.terms}
+        return {term: self.ask(term, common) if term.average else self.ask(term) for term in check.number.terms}
 
     def _ask(self, term: Term, among: frozenset[float] = frozenset()) -> pd.DataFrame:
         """Values (seeds, trials), one column where there are no trials; of a curve at its end, or the mean ``among``
@@ -384,7 +384,8 @@ def _paired(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[list[int]
     for (a, one), (b, two) in itertools.combinations(asked.items(), 2):
         about = ("env", "noise", "delay", "subset", "execution")
         same = a.table == b.table and all(a.wanted.get(column) == b.wanted.get(column) for column in about)
-        if not {a.metric, b.metric} & UNTOLD and same and set(one.index) != set(two.index):  # elsewhere the seeds that both have count
+        same = same and not {a.metric, b.metric} & UNTOLD
+        if same and set(one.index) != set(two.index):  # elsewhere the seeds that both have count
             has = f"{one.index.tolist()} of {a.text}, and {two.index.tolist()} of {b.text}"
             raise ClaimError(f"{a.table}.csv has seeds {has} in {check.text}", a.table)
     seeds = sorted(set.intersection(*(set(found.index) for found in asked.values())))

@@ -28,8 +28,8 @@ def c09(q: Query) -> Checks:
        quote="residual layers and skip connections between layers give slightly better performance but are not "
              "essential",
        statistic="log-likelihood with them minus without, against a quarter of the lead over the one-step model",
-       why={DEPENDENT: "By the paper's likelihood they bring less than a tenth of the lead, by one shared variance more "
-                       "than all of it. The variant without them has TSM's learning rate."})
+       why={DEPENDENT: "By the paper's likelihood they bring less than a tenth of the lead, by one shared variance "
+                       "more than all of it. The variant without them has TSM's learning rate."})
 def c10(q: Query) -> Checks:
     """Residual and skip connections help a little and are not essential."""
     lead, change = _lead(q), q.ablation(TSM) - q.ablation(Model("tsm+plain"))
