@@ -406,8 +406,8 @@ first round.
 {exploration_results.rounds_table(rows)}
 {_pushing_rounds(rows, free)}
 The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque, of `mass0.5` the object has half its
-mass. n test episodes, open loop after ten
-observed steps, in units of the standard arm.
+mass, of `damping2` the joints have twice their damping, and of `links0.12x0.11` the upper link is 20 % longer. n test
+episodes, open loop after ten observed steps, in units of the standard arm.
 Seeds are of the few episodes and of the updates on them: all begin from one model, as it ships.
 
 ![Energy scores of adapted models against the episodes that they know](../figures/10_ways.png)
