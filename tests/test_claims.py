@@ -286,6 +286,22 @@ def test_averages_of_learning_curves_are_over_the_places_that_all_have() -> None
         rule([row for row in rows if row["iteration"] != 40])
 
 
+@pytest.mark.parametrize(("metric", "seeds"), [("samples_to_90", 3), ("env_samples_to_90", 0)])
+def test_seeds_may_lack_what_a_curve_does_not_tell_and_nothing_else(metric: str, seeds: int) -> None:
+    common = dict(metric=metric, env="tsm/Reacher-v0", planner="policy", execution="policy", scale="paper", value=2.0)
+    rows: Rows = [
+        dict(common, model=model, search_space=space, seed=k)
+        for model, space, of in (("tsm", "latent", (1, 2, 3)), ("ppo", "", range(5)), ("trpo", "", range(5)))
+        for k in of
+    ]  # fmt: skip
+    check = (replace(Query(), samples=metric).samples_ratio(REACHER)) < 3
+    if seeds:
+        assert evaluate.measure(check, frames(of_05_control=rows)).seeds == seeds
+    else:
+        with pytest.raises(evaluate.ClaimError, match=r"has seeds \[1, 2, 3\] of"):
+            evaluate.measure(check, frames(of_05_control=rows))
+
+
 def test_a_check_is_read_as_it_was_written() -> None:
     q = Query()
     tsm, lstm = q.ll(TSM, REACHER), q.ll(LSTM, REACHER)

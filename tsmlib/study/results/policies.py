@@ -88,10 +88,11 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
     for method, own in curves.items():
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
+        if (means[method][1:2] >= level).any():  # a line from the start would say it learned too late
+            del ways["samples_to_90"]
+        if not timed:
+            del ways["seconds_to_90"]
         for metric, against in ways.items():
-            early = bool((means[method][1:2] >= level).any())  # a line from the start would say it learned too late
-            if (against == "seconds" and not timed) or (metric == "samples_to_90" and early):
-                continue
             spent = reached(own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
             rows.append(dict(
