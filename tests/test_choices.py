@@ -26,7 +26,7 @@ from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import zero_torques
 from tsmlib.storage import artifacts, tables
 from tsmlib.study import runs
-from tsmlib.study.results import exploration
+from tsmlib.study.results import exploration, policies
 from tsmlib.study.results.exploration import PUSH
 from tsmlib.training import fit as fit_module
 from tsmlib.training.fit import TrainingHistory
@@ -202,6 +202,28 @@ def test_rows_of_a_metric_leave_those_of_another_and_a_learning_curve_is_replace
     new = [dict(plan, metric="gradient_snr"), *(dict(policy, iteration=i) for i in (88, 176))]
     found = [(line["metric"], line["iteration"]) for line in tables.records(rows.merged(published, new))]
     assert found == [("cost", ""), ("gradient_snr", ""), ("return_true", 88), ("return_true", 176)]
+
+
+def test_early_records_stand_beside_their_curve() -> None:
+    policy = dict(env="e", model="tsm", planner="policy", metric="return_true", seed=0, scale="paper", value=1.0, n=2)
+    published = tables.frame([dict(policy, iteration=220), dict(policy, iteration=10, subset="early")])
+    new = [dict(policy, iteration=22, subset="early", value=2.0)]
+    found = [(line["iteration"], line["value"]) for line in tables.records(rows.merged(published, new))]
+    assert found == [(220, 1.0), (22, 2.0)]
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_what_ships_of_plateaus_is_what_the_curves_that_ship_say(seed: int) -> None:
+    published = tables.load(runs.RESULTS / "05_control.csv")
+    run = runs.resolve("05_control", scale="paper", seed=seed)
+    again = rows.with_plateaus(published, run, ["tsm/Reacher-v0", PUSH])
+    assert len(again) == len(published)
+    key = ["env", "model", "search_space", "seed", "metric"]
+    before, after = (
+        table[table["metric"].isin(policies.SOONEST)].set_index(key)["value"].sort_index()
+        for table in (published, again)
+    )
+    pd.testing.assert_series_equal(before, after)
 
 
 def test_rows_without_a_configuration_replace_those_without_one_in_a_table_that_has_some() -> None:

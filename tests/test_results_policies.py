@@ -161,6 +161,31 @@ def test_a_policy_that_was_there_by_its_first_record_has_no_number_of_samples() 
     assert {("tsm", "env_samples_to_90"), ("tsm", "seconds_to_90"), ("ppo", "samples_to_90")} <= found
 
 
+def test_early_records_tell_when_a_policy_was_there_by_the_first_record_of_its_curve() -> None:
+    own, coarse = ended(-12, -3, -3), {PPO: ended(-13, -8, -2, prior=False)}
+    early = ended(-12, -6, -4, -3.5, -1) | {"iterations": np.array([0.0, 20, 40, 60, 110])}  # the last is not before
+    found = policies_results.with_early(own, early)
+    assert found["iterations"].tolist() == [0, 20, 40, 60, 100, 200]
+    assert found["return_true"].mean(0).tolist() == [-12, -6, -4, -3.5, -3, -3]
+    options = {"steps": 50, "early": {TSM: early}}
+    rows = policies_results.plateau_rows({TSM: own} | coarse, {}, **options)  # 90 % is -3.9
+    told = {(row["model"], row["metric"]): row["value"] for row in rows}
+    assert told["tsm", "samples_to_90"] == pytest.approx(50 * 44)
+    without = policies_results.plateau_rows({TSM: own} | coarse, {}, steps=50)
+    assert [row for row in rows if row["metric"] != "samples_to_90" or row["model"] == "ppo"] == without
+    early["return_true"] = early["return_true"] + 4  # there by the first of these, too
+    rows = policies_results.plateau_rows({TSM: own} | coarse, {}, **options)
+    assert rows == without
+
+
+def test_early_records_are_no_part_of_a_curve() -> None:
+    early = [row | {"subset": "early", "iteration": 22} for row in rows() if row["metric"] == "return_true"][:2]
+    both = tables.frame([*rows(), *early])
+    curve = policies_results.learning_curves(both)["reach"][TSM]
+    np.testing.assert_array_equal(curve["return_true"], curves_of(rows())["reach"][TSM]["return_true"])
+    assert policies_results.learning_curves(both, "early")["reach"][TSM]["iterations"].tolist() == [22]
+
+
 def test_policies_that_gain_nothing_have_no_plateau() -> None:
     assert policies_results.plateau_rows({TSM: ended(-4, -4.5), PPO: ended(-9, -2, prior=False)}, {}, steps=50) == []
     assert policies_results.plateau_rows({}, {}, steps=50) == []

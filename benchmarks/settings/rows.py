@@ -8,12 +8,13 @@ predict: open loop and on segments (03_predict); ablations: the same as rows of 
 compared on pushing with it and with the one-step model. control: plans by each planner in both search spaces, open
 loop, and by the cross-entropy method in codes planned again every ten steps for --closed; with the oracle over codes,
 no torque and random torques beside them (05_control); the model oracle is the true simulator. policies: learned inside
-each model, of ours and the paper's in both search spaces, of the others direct alone, as in 05_control, by --copies and
---iterations where the run has none; name all models in one call, since how soon a policy learns is told by the plateau
-of the best of them. Models, scores, plans and policies are those of the run, so what is missing is made first. torques:
-of plans by --planners in both search spaces, beside held-out torques and those of the prior, and the signal of
-gradients at the first 50 starts (07_action_prior). convergence: of Adam in codes, how many of 500 iterations until its
-plans are nearly done, for 25 targets (05_control).
+each model, of ours and the paper's in both search spaces, of the others direct alone, as in 05_control, by --copies
+and --iterations where the run has none; how soon each came to a common plateau is told anew from all that are
+published then. early: the first --iterations of latent policies again, with ten records, for those that were at 90 %
+of the plateau by the first record of their curve. Models, scores, plans and policies are those of the run, so what is
+missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques and those of the
+prior, and the signal of gradients at the first 50 starts (07_action_prior). convergence: of Adam in codes, how many of
+500 iterations until its plans are nearly done, for 25 targets (05_control).
 
 gradients: their errors (02_train). collect, latent and robustness execute 01_collect, 04_latent and 06_robustness in
 the run's folder for --envs and --models, as far as these ask for them, and publish what their tables then say:
@@ -36,7 +37,8 @@ same environment, model, data and seed, whatever their steps.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -50,6 +52,7 @@ from tsmlib.study import adaptation, needed, notebooks, parameters, rounds, runs
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
+from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import RESULTS
 
@@ -91,21 +94,34 @@ def _loops(rows: pd.DataFrame) -> list[tuple[str, ...]]:
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
     rows = rows if "configuration" in rows else rows.assign(configuration="")
-    curve, more = rows["planner"] == "policy", ("metric", "iteration", "subset", "steps_ahead")
+    curve, more = rows["planner"] == "policy", ("metric", "iteration", "steps_ahead")
     what = {name: rows[name].astype(str).mask(curve, "") for name in more}
-    what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps")}
+    what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps", "subset")}
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
-def publish(name: str, rows: pd.DataFrame | Iterable[Row], *, loops: bool = False) -> None:
+def publish(
+    name: str, rows: pd.DataFrame | Iterable[Row], *, loops: bool = False,
+    told: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
+) -> None:  # fmt: skip
     """Merge rows into a table of data/results, and its new checksum into the manifest. loops: of whole loops of
-    rounds, whose former rows go."""
+    rounds, whose former rows go. told: what becomes of the whole table then."""
     path, new = RESULTS / f"{name}.csv", tables.frame(rows)
     known = tables.load(path) if tables.stored(path) else tables.frame([])
     table = merged(without_loops(known, new) if loops else known, new)
+    table = told(table) if told else table
     tables.ship(path, table)
     manifest.write_manifest(Path(RESULTS).parent)
     print(f"{path.name}: {len(table)} rows")
+
+
+def with_plateaus(table: pd.DataFrame, run: runs.Run, envs: list[str]) -> pd.DataFrame:
+    """The published table, with what it says of when this seed's policies came to their plateaus told anew."""
+    own = (table["planner"] == "policy") & (table["seed"] == run.seed) & (table["scale"] == run.scale)
+    own &= table["env"].isin(envs) & table["noise"].isna() & table["delay"].isna()
+    soonest = table["metric"].isin(policies_results.SOONEST)
+    rows = study.plateaus(run, [study.load_task(env) for env in envs], table[own & ~soonest])
+    return tables.frame(pd.concat([table[~(own & soonest)], tables.frame(rows)]))
 
 
 def controlled(
@@ -208,7 +224,7 @@ def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: li
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "peers"))
+    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", "peers"))
     parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
     parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, rounds.PENDULUM), metavar="ENV")
     parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
@@ -276,7 +292,13 @@ def main() -> None:
             for env, way in product(given.envs, zoo.policies(given.models))
         ]
         study.precompute(run, [Policy(task.env, len(task), way, budget) for task, way, budget in policies])
-        publish(notebook, study.policy_rows(run, policies))
+        told = partial(with_plateaus, run=run, envs=given.envs)
+        publish(notebook, study.policy_rows(run, policies), told=told)
+    elif given.part == "early":
+        budget = Budget(given.copies, given.iterations)
+        latent = [way for way in zoo.policies(given.models) if way.search_space == "latent"]
+        rows = study.early_rows(run, [(study.load_task(env), way, budget) for env, way in product(given.envs, latent)])
+        publish(notebook, rows, told=partial(with_plateaus, run=run, envs=given.envs))
     else:
         rows, targets = controlled(run, given.envs, given.models, given.closed, given.spaces, given.planners)
         publish(notebook, rows)

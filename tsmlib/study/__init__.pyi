@@ -28,8 +28,10 @@ from .plans import trials as trials
 from .plans import with_modes as with_modes
 from .policies import Budget as Budget
 from .policies import assess as assess
+from .policies import early_rows as early_rows
 from .policies import execute_policy as execute_policy
 from .policies import learn as learn
+from .policies import plateaus as plateaus
 from .policies import policy_rows as policy_rows
 from .policies import stored_budget as stored_budget
 from .policies import within_data as within_data

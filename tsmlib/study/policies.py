@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Self, cast
@@ -26,7 +26,15 @@ from tsmlib.storage.files import Json
 from tsmlib.study.comparison import table
 from tsmlib.study.data import dataset, fingerprint, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_prior
-from tsmlib.study.results.policies import EPISODES, GRADIENTS, finished, learning_curves, learning_rows, plateau_rows
+from tsmlib.study.results.policies import (
+    EARLY,
+    EPISODES,
+    GRADIENTS,
+    finished,
+    learning_curves,
+    learning_rows,
+    plateau_rows,
+)
 from tsmlib.study.results.table import PolicyHeader, Row, of_task, select
 from tsmlib.study.runs import Run
 from tsmlib.study.seeds import make_as_one, require_seeds
@@ -237,14 +245,35 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
             n=found.header.get("targets", 100),  # those that it was measured on as it was learned
             within_data=within_data(run, task, found.policy).tolist(),
         )  # fmt: skip
+    return rows + plateaus(run, [task for task, *_ in wanted], tables.frame(rows))
+
+
+def plateaus(run: Run, tasks: Iterable[Task], learned: pd.DataFrame) -> list[Row]:
+    """``plateau_rows`` of one seed's tasks, from the rows of its policies, ``early_rows`` among them, and of those
+    without a model; none at scale laptop."""
     if run.scale == "laptop":
-        return rows
+        return []
     free = finished(select(table(run, "model_free"), model=GRADIENTS).drop(columns="source"))
-    curves = learning_curves(tables.frame(pd.concat([tables.frame(rows), free[free["seed"] == run.seed]])))
-    for task in {task.env: task for task, *_ in wanted}.values():
+    both = tables.frame(pd.concat([learned, free[free["seed"] == run.seed]]))
+    curves, early, rows = learning_curves(both), learning_curves(both, EARLY), list[Row]()
+    for task in {task.env: task for task in tasks}.values():
         compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}
-        common = of_task(task, run) | {"horizon": None}
-        rows += plateau_rows(compared, common, steps=task.horizon * EPISODES[run.scale])
+        common, steps = of_task(task, run) | {"horizon": None}, task.horizon * EPISODES[run.scale]
+        rows += plateau_rows(compared, common, steps=steps, early=early.get(task.name))
+    return rows
+
+
+def early_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[Row]:
+    """True returns of the first iterations of policies, which are learned again as far as their budgets say, with ten
+    records on the way, in files of their own. The rate of a step depends on no budget, so these are the same policies.
+    """
+    rows = list[Row]()
+    for task, method, budget in wanted:
+        asked = _Asked.of(run, task, method, budget)
+        asked = replace(asked, path=asked.path.with_stem(f"{asked.path.stem}-{EARLY}"))
+        header = (asked.kept() or asked.learned()).header
+        found = learning_rows(header, samples=0, train_seconds=None, n=header.get("targets", 100))
+        rows += [row | {"subset": EARLY} for row in found if row["metric"] == "return_true"]
     return rows
 
 

@@ -284,7 +284,8 @@ class Query:
     def policy(self, metric: str, model: Model, place: Place, *, average: bool = False) -> Number:
         """Of a policy at the end of its learning curve, or averaged along it, copy by copy."""
         return self._ask(place.table or "05_control", metric, model.word, place, trials=True, curve="iteration",
-                         average=average, planner="policy", search_space=model.space, execution="policy")  # fmt: skip
+                         average=average, planner="policy", search_space=model.space, execution="policy",
+                         subset="")  # fmt: skip
 
     def final(self, model: Model, place: Place) -> Number:
         """The final return of a policy."""

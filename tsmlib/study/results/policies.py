@@ -21,6 +21,7 @@ GRADIENTS = ("ppo", "trpo")  # the policy gradients of figure 7
 EPISODES = {"smoke": 4, "laptop": 20, "paper": 20}  # of each copy, per iteration of learning (A.3)
 UNITS = {"return_true": "m", "return_predicted": "m", "exploitation_gap": "m", "final_distance": "m",
          "success": "share"}  # fmt: skip
+EARLY = "early"  # subset: the first iterations of a policy learned again, with more records than its curve has there
 SOONEST = {"samples_to_90": "steps of model or environment", "env_samples_to_90": "steps of the environment",
            "seconds_to_90": "seconds"}  # fmt: skip
 
@@ -64,16 +65,20 @@ def learning_rows(
     ]
 
 
-def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, share: float = 0.9) -> list[Row]:
+def plateau_rows(
+    curves: Mapping[Method, Curves], common: Row, *, steps: int, share: float = 0.9,
+    early: Mapping[Method, Curves] | None = None,
+) -> list[Row]:  # fmt: skip
     """Rows of what each policy needed to come to ``share`` of the common plateau (claims C37 and C39), one task's.
 
     curves: of one seed, of the policies that are compared. Their common plateau is what those learned inside models
     and the best of the model-free ones have all come to in the end; what counts is the gain over the best of all
     before learning. There are no rows where that is none. A model-free policy that never comes there counts with all
-    that it took. steps: of its model that a policy takes per iteration.
+    that it took. steps: of its model that a policy takes per iteration. early: curves of the first iterations alone,
+    whose records tell when a policy was there that was so by the first record of its curve.
 
     ``samples_to_90``: steps of what it learned in, the model or else the environment, and no row where it was there by
-    the first record of its curve, which does not tell when; ``env_samples_to_90``: steps of the environment, the data
+    the first record, which does not tell when; ``env_samples_to_90``: steps of the environment, the data
     of its model included; ``seconds_to_90``: training of its model included, where seconds of all policies are known.
     """
     means = {method: own["return_true"].mean(0) for method, own in curves.items()}
@@ -88,18 +93,29 @@ def plateau_rows(curves: Mapping[Method, Curves], common: Row, *, steps: int, sh
     for method, own in curves.items():
         ways = {"samples_to_90": "iterations" if method.search_space else "samples", "env_samples_to_90": "samples",
                 "seconds_to_90": "seconds"}  # fmt: skip
-        if (means[method][1:2] >= level).any():  # a line from the start would say it learned too late
+        finer = with_early(own, early[method]) if early and method in early else own
+        if (finer["return_true"].mean(0)[1:2] >= level).any():  # a line from the start would say it learned too late
             del ways["samples_to_90"]
         if not timed:
             del ways["seconds_to_90"]
         for metric, against in ways.items():
-            spent = reached(own, level, against)
+            spent = reached(finer if metric == "samples_to_90" else own, level, against)
             value = (float(own[against][-1]) if spent is None else spent) * (steps if against == "iterations" else 1)
             rows.append(dict(
                 common, **table.fields(method) | {"planner": "policy"}, execution="policy", metric=metric, value=value,
                 unit="s" if against == "seconds" else "steps", n=len(own["return_true"]),
             ))  # fmt: skip
     return rows
+
+
+def with_early(curves: Curves, early: Curves) -> Curves:
+    """Iterations and true returns of a curve, with those records of ``early`` that are before its first one."""
+    first, second = curves["iterations"][:2]
+    new = np.flatnonzero((early["iterations"] > first) & (early["iterations"] < second))
+    return {
+        name: np.concatenate([curves[name][..., :1], early[name][..., new], curves[name][..., 1:]], axis=-1)
+        for name in ("iterations", "return_true")
+    }
 
 
 def reached(curves: Curves, level: float, against: str = "samples") -> float | None:
@@ -121,22 +137,22 @@ def reached(curves: Curves, level: float, against: str = "samples") -> float | N
 # Reading rows --------------------------------------------------------------------------------------------------------
 
 
-def _records(found: pd.DataFrame) -> pd.DataFrame:
+def _records(found: pd.DataFrame, subset: str = "") -> pd.DataFrame:
     """Rows of learning curves, with the columns method and ``at``, where they stand on the curve."""
-    own = table.select(found, execution="policy", subset="")
+    own = table.select(found, execution="policy", subset=subset)
     own = own.assign(at=own["iteration"].fillna(own["env_steps"]), copy=own["copy"].fillna(0) if "copy" in own else 0)
     return table.with_method(own[own["at"].notna()], "model", "search_space")
 
 
-def learning_curves(found: pd.DataFrame) -> dict[str, dict[Method, Curves]]:
+def learning_curves(found: pd.DataFrame, subset: str = "") -> dict[str, dict[Method, Curves]]:
     """The input of ``figures.figure7``: task -> method -> curves, from rows of policies, in the order of the zoo.
 
-    A method's k lines are those of ``seed_means``. Seconds are the CPU's where a table has them, else the
-    clock's, which are more on a busy machine; training of the model is counted. ValueError where lines were not
-    measured at the same points, or where one task was learned in two environments.
+    subset: ``EARLY`` for those alone. A method's k lines are those of ``seed_means``. Seconds are the CPU's where a
+    table has them, else the clock's, which are more on a busy machine; training of the model is counted. ValueError
+    where lines were not measured at the same points, or where one task was learned in two environments.
     """
     curves: dict[str, dict[Method, Curves]] = {}
-    for (task, method), own in table.groups(_one_env(_records(found)), ["task", "method"]):
+    for (task, method), own in table.groups(_one_env(_records(found, subset)), ["task", "method"]):
         try:
             curves.setdefault(task, {})[method] = _curves(own)
         except ValueError as error:
