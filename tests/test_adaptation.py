@@ -20,7 +20,7 @@ from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, drawings, pages, rounds, runs, zoo
+from tsmlib.study import adaptation, drawings, pages, pendulum, rounds, runs, worlds, zoo
 from tsmlib.study.comparison import published
 from tsmlib.study.models import Trained, load_pretrained
 from tsmlib.study.results import exploration as results
@@ -90,14 +90,14 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
 
 
 def test_a_pendulum_that_measures_starts_as_none_that_is_learned_from() -> None:
-    measured = rounds.swing_up(8, seed=rounds.TESTED).start
+    measured = pendulum.swing_up(8, seed=pendulum.TESTED).start
     for seed in range(10):
-        learned = rounds.first_episodes(6, seed).states[:, 0]
+        learned = pendulum.first_episodes(6, seed).states[:, 0]
         assert np.abs(learned[:, None] - measured[None]).max(-1).min() > 1e-3
 
 
 def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) -> None:
-    sizes = rounds.WORLDS[PUSH].sizes["smoke"]
+    sizes = worlds.WORLDS[PUSH].sizes["smoke"]
     found = [rounds.loop(RUN, "lstm", env=PUSH, data=data, folder=tmp_path) for data in results.DATA]
     everything = tables.frame([row for part in found for row in part.rows])
     rows = table.select(everything, execution="closed loop")
@@ -156,7 +156,7 @@ def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_on
 
 
 def test_the_map_has_as_many_episodes_of_each_source() -> None:
-    seen = {"few": rounds.world(PUSH).random(2, 0), "many": rounds.world(PUSH).random(5, 1)}
+    seen = {"few": worlds.world(PUSH).random(2, 0), "many": worlds.world(PUSH).random(5, 1)}
     found = rounds.places(seen)
     assert [*found] == ["fingertip: few", "fingertip: many", "object: few", "object: many"]
     assert {points.shape for points in found.values()} == {(2 * (rounds.HORIZON + 1), 2)}
@@ -183,7 +183,7 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
 def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does() -> None:
     few, model, prior = untrained()
     for judging in (0, 8):
-        sizes = replace(rounds.SIZES["smoke"], judging=judging, every=50)
+        sizes = replace(worlds.SIZES["smoke"], judging=judging, every=50)
         judge = tsmlib.expected_predictor if judging else tsmlib.model_predictor
         found = rounds.planned(few, model, prior, sizes, 0).found
         again = tsmlib.mpc(
@@ -215,7 +215,7 @@ def test_planner_judges_and_predicted_returns_draw_different_random_numbers(
     monkeypatch.setattr(execution, "fresh_predictor", predicts)
     few, model, prior = untrained()
     for seed in range(3):
-        sizes = replace(rounds.SIZES["smoke"], judging=judging, every=25)
+        sizes = replace(worlds.SIZES["smoke"], judging=judging, every=25)
         searched = rounds.planner(sizes, seed).keywords["seed"]  # type: ignore[attr-defined]
         judged.clear(), fresh.clear()
         rounds.planned(few.take(1), model, prior, sizes, seed)
@@ -226,9 +226,9 @@ def test_planner_judges_and_predicted_returns_draw_different_random_numbers(
 
 def untrained() -> tuple[tsmlib.Task, tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
     """Three starts of the pendulum, and a model and a prior that were never trained."""
-    data = rounds.first_episodes(3, 0)
+    data = pendulum.first_episodes(3, 0)
     model = tsmlib.RecurrentTSM.for_data(data, hidden=8)
-    return rounds.swing_up(3, seed=rounds.TESTED), model, tsmlib.ActionPrior.for_data(data, channels=4)
+    return pendulum.swing_up(3, seed=pendulum.TESTED), model, tsmlib.ActionPrior.for_data(data, channels=4)
 
 
 def unstable(bad: np.ndarray, run: Any) -> Any:
@@ -243,11 +243,11 @@ def unstable(bad: np.ndarray, run: Any) -> Any:
     return stub
 
 
-def measured_everywhere(monkeypatch: pytest.MonkeyPatch) -> tuple[tsmlib.Task, rounds.Sizes]:
+def measured_everywhere(monkeypatch: pytest.MonkeyPatch) -> tuple[tsmlib.Task, worlds.Sizes]:
     """A task of three starts in which every episode that ends is a success, and sizes of a loop that measures there."""
-    sizes = replace(rounds.SIZES["smoke"], starts=3, every=50)
+    sizes = replace(worlds.SIZES["smoke"], starts=3, every=50)
     every = replace(untrained()[0], success=lambda x: x[:, -1, 0] < 2)
-    here = replace(rounds.WORLDS[PENDULUM], tested=every.take)
+    here = replace(worlds.WORLDS[PENDULUM], tested=every.take)
     monkeypatch.setattr(rounds, "world", lambda env: here)
     return every, sizes
 
@@ -294,7 +294,7 @@ def test_a_first_plan_that_is_unstable_open_loop_takes_no_success_from_its_close
 def test_a_measurement_that_lost_all_its_episodes_has_no_row_of_another_distance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rounds, "mpc", unstable(rounds.world(PUSH).tested(2).start, rounds.mpc))
+    monkeypatch.setattr(rounds, "mpc", unstable(worlds.world(PUSH).tested(2).start, rounds.mpc))
     for _ in range(2):  # the second time from the folder
         rows = tables.frame(rounds.loop(RUN, "lstm", env=PUSH, folder=tmp_path).rows)
         closed = table.select(rows, execution="closed loop")
@@ -304,7 +304,7 @@ def test_a_measurement_that_lost_all_its_episodes_has_no_row_of_another_distance
 
 
 def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> None:
-    sizes = replace(rounds.SIZES["smoke"], every=50)
+    sizes = replace(worlds.SIZES["smoke"], every=50)
     found = rounds.loop(RUN, "rtsm", sizes=sizes)
     assert {row["samples"] for row in found.rows} == {8}
     assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
@@ -334,7 +334,7 @@ def test_a_table_of_rounds_says_of_every_learner_what_judged_its_plans() -> None
 
 
 def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
-    path, sizes = tmp_path / "round-0.json", asdict(rounds.SIZES["smoke"])
+    path, sizes = tmp_path / "round-0.json", asdict(worlds.SIZES["smoke"])
     old = {name: value for name, value in sizes.items() if name not in ("judging", "screened")}
     path.write_text(json.dumps({"made from": {"sizes": old, "seed": 0}, "found": 1.0}))
     mode = {"sizes": sizes | {"judging": 0, "screened": 1.0}, "seed": 0}
@@ -354,12 +354,12 @@ def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_
     script, place, seen = ROOT / "benchmarks" / "exploration" / "pendulum.py", tmp_path / "pendulum.csv", []
     row = dict(seed=10, iteration=0, env_steps=600)
 
-    def measured(run: Run, word: str, *, sizes: rounds.Sizes) -> rounds.Loop:
-        seen.append((run.seed, rounds.world(PENDULUM).tested(8).start))
+    def measured(run: Run, word: str, *, sizes: worlds.Sizes) -> rounds.Loop:
+        seen.append((run.seed, worlds.world(PENDULUM).tested(8).start))
         return rounds.Loop([row | {"metric": m, "value": 1} for m in ("return_true", "success", "gap_absolute")], [])
 
     monkeypatch.setattr(rounds, "loop", measured)
-    published = rounds.world(PENDULUM).tested(8).start
+    published = worlds.world(PENDULUM).tested(8).start
     for updates in (2, 4, 2):  # the third takes the place of the first
         run_script(script, "rtsm", "--updates", str(updates), "--out", str(place))
     assert pd.read_csv(place)["updates"].tolist() == [4, 2]
@@ -744,8 +744,8 @@ def test_the_benchmark_predicts_returns_by_samples_that_neither_planner_nor_judg
 
 
 def test_a_plane_shows_real_states_alone() -> None:
-    data = rounds.random_episodes(2, seed=0)
-    plane = rounds.plane(data)
+    data = pendulum.random_episodes(2, seed=0)
+    plane = pendulum.plane(data)
     assert plane.shape == (2 * (rounds.HORIZON + 1), 2)
     np.testing.assert_allclose(np.cos(plane[:, 0]), data.states[..., 0].ravel(), atol=1e-5)
     with pytest.raises(ValueError, match="expected"):

@@ -23,7 +23,7 @@ from tsmlib.models.features import Features
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.sampling import SharedNoise
 from tsmlib.storage import tables
-from tsmlib.study import rounds, runs
+from tsmlib.study import runs, worlds
 from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment, Trajectories
 
@@ -385,7 +385,7 @@ def test_the_readme_names_the_pins_and_options_that_exist() -> None:
 
 @pytest.mark.parametrize("env", loop.SETTINGS)
 def test_a_robot_of_mbrl_lib_returns_what_the_same_actions_do_here(env: str) -> None:
-    here = rounds.world(env)
+    here = worlds.world(env)
     task, unit = here.drawn(2, 5), loop.unit_of(here.random(2, 3))
     robot = loop.Robot(lambda i: task.take([i]), unit, bound=1.0)
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 100, task.action_dim)).astype(np.float32)
@@ -411,7 +411,7 @@ def test_its_own_loop_leaves_rows_of_the_last_round(tmp_path: Path) -> None:
     loop.main(["--env", "tsm/ReacherPush-v1", "--scale", "smoke", "--out", str(out)])
     rows = tables.load(out)
     assert set(rows["metric"]) == {"return_true", "success", "final_distance"}
-    sizes = rounds.world("tsm/ReacherPush-v1").sizes["smoke"]
+    sizes = worlds.world("tsm/ReacherPush-v1").sizes["smoke"]
     assert set(rows["env_steps"]) == {100 * (sizes.first + sizes.rounds * sizes.episodes)}
     assert set(rows["model"]) == {"pets"}
 

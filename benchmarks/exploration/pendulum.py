@@ -20,7 +20,7 @@ from unittest.mock import patch
 import pandas as pd
 import torch
 
-from tsmlib.study import rounds, runs
+from tsmlib.study import pendulum, rounds, runs, worlds
 from tsmlib.study.results.exploration import PENDULUM
 
 PLACE, SEED, STARTS, VALIDATION = Path(__file__).with_suffix(".csv"), 10, 16, 3000
@@ -28,11 +28,11 @@ GIVEN = ("updates", "before", "prior", "candidates", "elites", "iterations", "ev
 METRICS = ("return_true", "success", "gap_absolute")
 
 
-def lines(word: str, sizes: rounds.Sizes) -> pd.DataFrame:
+def lines(word: str, sizes: worlds.Sizes) -> pd.DataFrame:
     """One loop, round 0 first."""
     began, run = time.process_time(), runs.resolve("10_explore", scale="paper", seed=SEED)
-    validation = replace(rounds.WORLDS[PENDULUM], tested=lambda n: rounds.swing_up(n, seed=VALIDATION))
-    with patch.dict(rounds.WORLDS, {PENDULUM: validation}):
+    validation = replace(worlds.WORLDS[PENDULUM], tested=lambda n: pendulum.swing_up(n, seed=VALIDATION))
+    with patch.dict(worlds.WORLDS, {PENDULUM: validation}):
         rows = pd.DataFrame(rounds.loop(run, word, sizes=sizes).rows)
     table = rows[rows["metric"].isin(METRICS)].pivot(index="env_steps", columns="metric", values="value").reset_index()
     what = {"model": word} | {name: asdict(sizes)[name] for name in GIVEN}
@@ -40,9 +40,9 @@ def lines(word: str, sizes: rounds.Sizes) -> pd.DataFrame:
 
 
 def main() -> None:
-    default = rounds.SIZES["paper"]
+    default = worlds.SIZES["paper"]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", choices=rounds.WORLDS[PENDULUM].learners)
+    parser.add_argument("model", choices=worlds.WORLDS[PENDULUM].learners)
     for name in GIVEN:
         number = getattr(default, name)
         parser.add_argument(f"--{name}", type=type(number), default=number, help="default %(default)s")

@@ -1,6 +1,6 @@
 """PETS as mbrl-lib 0.2.0 runs it: its own loop of planning, executing and learning, beside the rounds of 10_explore.
 
-``mbrl.algorithms.pets.train`` with as many random steps before and planned steps after as ``study.rounds`` has at a
+``mbrl.algorithms.pets.train`` with as many random steps before and planned steps after as ``study.worlds`` has at a
 scale, from starts and targets drawn alike. What its model then plans is executed from the starts that measure there.
 README.md tells how to install it.
 
@@ -26,10 +26,10 @@ from tsmlib.envs.stepping import make_simulation
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import rewarded
 from tsmlib.storage import tables
-from tsmlib.study import rounds, runs
+from tsmlib.study import runs, worlds
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results.exploration import HORIZON, PENDULUM, PUSH
-from tsmlib.study.rounds import Sizes
+from tsmlib.study.worlds import Sizes
 from tsmlib.trajectory import Trajectories
 
 SETTINGS = {  # bound: of the actions, random ones included; every: steps between plans; trained: episodes between fits,
@@ -132,7 +132,7 @@ def loop(env: str, scale: str, sizes: Sizes, *, seed: int) -> dict[str, float]:
 
     from tsmlib.planning.mbrl_lib import never
 
-    here = rounds.world(env)
+    here = worlds.world(env)
     unit = unit_of(here.random(UNITS_FROM, 700_000 + seed))
     drawn = here.drawn(sizes.first + sizes.rounds * sizes.episodes + 1, 100_000 * (seed + 1))
     bound, cfg = SETTINGS[env]["bound"], settings(env, scale, sizes, seed=seed)
@@ -193,7 +193,7 @@ def main(given: list[str] | None = None) -> None:
     """The command."""
     arguments = parser().parse_args(given)
     run = runs.resolve("10_explore", scale=arguments.scale, seed=arguments.seed)
-    env, sizes = arguments.env, rounds.world(arguments.env).sizes[run.scale]
+    env, sizes = arguments.env, worlds.world(arguments.env).sizes[run.scale]
     torch.set_num_threads(1)
     try:
         import mbrl.algorithms.pets  # noqa: F401

@@ -48,7 +48,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, needed, notebooks, parameters, rounds, runs, zoo
+from tsmlib.study import adaptation, needed, notebooks, parameters, rounds, runs, worlds, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
@@ -178,7 +178,7 @@ def wanted_rounds(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
     """Environment, model and data of every loop; ends the command where a model does not explore there."""
     for env, word in (pairs := list(product(given.envs or [rounds.PENDULUM], given.models))):
         try:
-            rounds.require(env, word)
+            worlds.require(env, word)
         except ValueError as error:
             parser.error(str(error))
     return [(env, word, data) for env, word in pairs for data in given.data]

@@ -10,7 +10,7 @@ from tsmlib.envs.spec import MUJOCO_IDS
 from tsmlib.planning.predictors import JUDGING
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import needed, plans, rounds, runs, zoo
+from tsmlib.study import needed, plans, runs, worlds, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
@@ -398,7 +398,7 @@ def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> st
 
 Written from the rows that `python -m tsmlib run explore --scale paper` or `python
 benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every
-{rounds.SIZES["paper"].every} steps, from n starts that no round trains on; steps count the random episodes before the
+{worlds.SIZES["paper"].every} steps, from n starts that no round trains on; steps count the random episodes before the
 first round.
 
 ![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)

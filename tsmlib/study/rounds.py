@@ -8,151 +8,51 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from tsmlib.collection import collect, collect_random, open_loop
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.stepping import make_simulation
-from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.data import contact_counts, shares
-from tsmlib.exploration import BY_MODE, ExplorationOptions, Measure, Trainable, explore
+from tsmlib.exploration import BY_MODE, Measure, Trainable, explore
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics, members
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.planning.base import Judge, Planner, SearchSpace
 from tsmlib.planning.execution import Stable, Trial, execute, mpc, without_unstable
 from tsmlib.planning.planners import cem
-from tsmlib.planning.predictors import JUDGING, expected_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.predictors import expected_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import BLOCK, TIP
 from tsmlib.storage import files
 from tsmlib.storage.files import Json, decode_nonfinite, encode_nonfinite
-from tsmlib.study import zoo
-from tsmlib.study.data import random_data
+from tsmlib.study import pendulum, zoo
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results.exploration import FIRST_PRIOR, HORIZON, LAST_PRIOR, PENDULUM, PLANNED, PUSH, RANDOM
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
-from tsmlib.study.tasks import draw_task, load_task
-from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.study.worlds import Sizes, require, world
+from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
 
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans
-TESTED = 1000  # seed of the pendulum's starts that measure, of no episode that is learned from
-BEGINNING = 50_000  # of its random episodes before round 1, by a training seed of 0; each next one has 1,000 more
 SEARCHED = 25  # starts of the searches in which two priors are compared, at most
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Of a loop: random episodes before it, rounds, episodes of each, updates of each training, starts that measure.
-
-    candidates, elites, iterations, screened: of every plan; every: steps between plans. judging: samples by which
-    candidates are judged beside the mode; 0: by the mode alone. before: updates of the model before the
-    first round; prior: updates of each training of the prior; 0: as many as the model has in a round. searches:
-    iterations of the search in which the first prior and the last are compared (``search``); 0: they are not.
-    """
-
-    first: int
-    rounds: int
-    episodes: int
-    updates: int
-    starts: int
-    candidates: int
-    elites: int
-    iterations: int
-    before: int = 0
-    prior: int = 0
-    searches: int = 0
-    every: int = 10
-    judging: int = JUDGING
-    screened: float = 0.25
-
-    def training(self, past_len: int, future_len: int, *, updates: int = 0, muon: float = 0.0) -> TrainingOptions:
-        """Of a model or a prior, by default in a round."""
-        steps = updates or self.updates
-        return TrainingOptions(
-            past_len, future_len, steps, batch_size=64, lr=2e-3, warmup=min(20, steps), muon=muon,
-            validate_every=max(1, steps // 4),
-        )  # fmt: skip
-
-    def options(self, past_len: int, *, muon: float = 0.0, rms: float = 0.1) -> ExplorationOptions:
-        """Of ``explore``, for a model that reads as many steps of past; rms: of torques where no prior is searched."""
-        return ExplorationOptions(
-            model=self.training(past_len, 20, muon=muon), prior=self.training(10, 10, updates=self.prior),
-            rounds=self.rounds, every=self.every, candidates=self.candidates, elites=self.elites,
-            iterations=self.iterations, rms=rms, judging=self.judging, screened=self.screened,
-        )  # fmt: skip
-
-    def judged_for(self, model: DynamicsModel) -> Sizes:
-        """The same for a model that may have no samples, whose one rollout judges."""
-        return self if as_dynamics(model).stochastic else replace(self, judging=0, screened=1.0)
-
-
-SIZES = {  # of the pendulum, by scale
-    "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
-    "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
-    "paper": Sizes(6, 4, 4, 1000, 8, 64, 8, 5, 1500, 300, every=5),
-}
-
-
-def upright(states: Tensor, actions: Tensor) -> Tensor:
-    """Height of the pendulum, from -1 to 1, less what its speed costs."""
-    return states[..., 0] - 0.01 * states[..., 2].square()
-
-
-def swing_up(n: int, seed: int) -> Task:
-    """Swinging the pendulum up, from starts of the environment; success is to end within 18 degrees of upright."""
-    return Task.from_env(
-        PENDULUM, n=n, horizon=HORIZON, seed=seed, reward=upright, success=lambda x: x[:, -1, 0] > 0.95
-    )
-
-
 def tasks(episodes: int, seed: int) -> Callable[[int], Task]:
     """Round -> its starts."""
-    return lambda k: swing_up(episodes, seed=_seed(seed, k))
-
-
-def first_episodes(n: int, seed: int) -> Trajectories:
-    """Random episodes of the pendulum that a loop begins with, by training seed."""
-    return random_episodes(n, BEGINNING + 1000 * seed)
-
-
-def random_episodes(n: int, seed: int) -> Trajectories:
-    """Smooth random torques, which hardly ever swing the pendulum up."""
-    return collect_random(PENDULUM, n, horizon=HORIZON, seed=seed, rms=0.6, time_constant=0.3)
+    return lambda k: pendulum.swing_up(episodes, seed=_seed(seed, k))
 
 
 def divided(data: Trajectories) -> tuple[Trajectories, Trajectories]:
     """Training and held-out episodes, one in five."""
     n = max(1, len(data) // 5)
     return data.take(slice(n, None)), data.take(slice(n))
-
-
-def walks(prior: ActionPrior, n: int, *, seed: int = 0) -> Trajectories:
-    """What random codes of a prior do, an episode of each, from the environment's own starts."""
-    segments = HORIZON // prior.segment_len
-    codes = torch.randn(n, segments, prior.latent_dim, generator=torch.Generator().manual_seed(seed))
-    with torch.no_grad():
-        actions = LatentActions(prior, HORIZON).decode(codes[None])[0]
-    with closing(make_simulation(PENDULUM, n)) as simulation:
-        return collect(simulation, open_loop(actions), horizon=HORIZON, seed=seed)
-
-
-def plane(data: Trajectories) -> np.ndarray:
-    """Angle from upright (rad) and angular velocity (rad/s) of every state (n, 2)."""
-    cos, sin, speed = np.concatenate([x[: n + 1] for x, n in zip(data.states, data.steps, strict=True)]).T
-    return np.stack([np.arctan2(sin, cos), speed], axis=1)
 
 
 def contacts(data: Trajectories) -> dict[str, float]:
@@ -257,82 +157,16 @@ def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
             if task.position is not None:
                 found["final_distance"] = float(trial.final_distance.mean())
         if prior is not None and env == PENDULUM:
-            found["highest"] = highest(walks(prior, max(8, sizes.starts)))
+            found["highest"] = pendulum.highest(pendulum.walks(prior, max(8, sizes.starts)))
         return found
 
     return measured
-
-
-def highest(data: Trajectories) -> float:
-    """Mean over episodes of the greatest height, from -1 (hanging) to 1 (upright)."""
-    return float(data.states[..., 0].max(1).mean())
 
 
 def space_of(prior: ActionPrior | None, env: str = PENDULUM) -> SearchSpace:
     """Codes of the prior, or torques where there is none."""
     here = world(env)
     return DirectActions(HORIZON, here.action_dim, rms=here.rms) if prior is None else LatentActions(prior, HORIZON)
-
-
-@dataclass(frozen=True)
-class World:
-    """What differs between the robots that explore.
-
-    learners: arguments of each model, beyond the defaults; muon: its rate, if any. tested: starts that measure;
-    drawn: (episodes, seed) -> the tasks of a round; random: (episodes, seed) -> what random torques of ``rms`` do;
-    first: (episodes, training seed) -> those before round 1.
-    augmented: what a model is trained on, made of its training data.
-    """
-
-    sizes: Mapping[str, Sizes]
-    learners: Mapping[str, Mapping[str, Json]]
-    tested: Callable[[int], Task]
-    drawn: Callable[[int, int], Task]
-    random: Callable[[int, int], Trajectories]
-    first: Callable[[int, int], Trajectories]
-    action_dim: int
-    rms: float
-    muon: Mapping[str, float]
-    augmented: Callable[[Trajectories], Trajectories] | None = None
-
-
-WORLDS = {
-    PENDULUM: World(
-        SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 128}},
-        tested=lambda n: swing_up(n, seed=TESTED), drawn=swing_up, random=random_episodes, first=first_episodes,
-        action_dim=1, rms=0.6, muon={},
-    ),
-    # All episodes of a loop, 950, are less than a tenth of the steps that the model-free learners take. It begins with
-    # few, so that a round brings enough that is new (benchmarks/exploration). Hidden sizes make updates of both models
-    # take as long.
-    PUSH: World(
-        {
-            "smoke": Sizes(6, 1, 3, 2, 2, 4, 2, 1, searches=2),
-            "laptop": Sizes(100, 2, 10, 300, 10, 48, 6, 3, 600, 200, searches=10),
-            "paper": Sizes(200, 5, 150, 2500, 100, 64, 8, 3, 4000, 500, searches=10),
-        },
-        {"rtsm": {"hidden": 96}, "lstm": {}},
-        tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
-        random=lambda n, seed: random_data(PUSH, n, seed=seed),
-        first=lambda n, seed: random_data(PUSH, n, seed=1000 * seed), action_dim=2, rms=0.1,
-        muon={"rtsm": 0.01, "lstm": 0.02}, augmented=symmetric,  # twice the study's rates
-    ),
-}  # fmt: skip
-
-
-def world(env: str) -> World:
-    """The world of an environment; ValueError naming those that there are."""
-    if env not in WORLDS:
-        raise ValueError(f"no rounds are measured on {env!r:.80}; there are {', '.join(WORLDS)}")
-    return WORLDS[env]
-
-
-def require(env: str, word: str) -> World:
-    """The world of an environment; ValueError where there is none, or a model does not explore it."""
-    here = world(env)
-    if word not in here.learners:
-        raise ValueError(f"{word!r:.80} does not explore {env}; there are {', '.join(here.learners)}")
-    return here
 
 
 class Loop(NamedTuple):
