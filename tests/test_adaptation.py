@@ -23,6 +23,7 @@ from tsmlib.storage import manifest, tables
 from tsmlib.study import adaptation, drawings, pages, pendulum, rounds, runs, worlds, zoo
 from tsmlib.study.comparison import published
 from tsmlib.study.models import Trained, load_pretrained
+from tsmlib.study.results import adaptation as adaptation_results
 from tsmlib.study.results import exploration as results
 from tsmlib.study.results import table
 from tsmlib.study.results.exploration import PENDULUM, PUSH
@@ -33,7 +34,7 @@ WEAK = tsmlib.envs.variant("tsm/Reacher-v0", torque_gain=0.7)
 
 
 def test_every_way_of_a_model_has_a_budget_and_a_look() -> None:
-    assert set(results.WAYS) == {*adaptation.WAYS, adaptation.REFERENCE}
+    assert set(adaptation_results.WAYS) == {*adaptation.WAYS, adaptation.REFERENCE}
     assert adaptation.ways("rtsm") == adaptation.WAYS
     assert "codes" not in adaptation.ways("lstm")
 
@@ -141,7 +142,7 @@ def _check_priors(rows: pd.DataFrame) -> None:
     needed = table.select(rows, metric="iterations_to_same_return", subset=results.FIRST_PRIOR)
     assert len(needed) == 3
     assert needed["value"].max() <= 2
-    assert results.ways_table(rows) == ""  # which are open loop as well
+    assert adaptation_results.ways_table(rows) == ""  # which are open loop as well
     assert "iterations of the last prior" in results.priors_table(rows)
 
 
@@ -488,10 +489,10 @@ def test_seconds_of_models_trained_as_one_are_seconds_of_none(monkeypatch: pytes
         monkeypatch.setattr(adaptation, "load_or_train", lambda *_, h=header: Trained(net, h))
         rows = tables.frame(adaptation.rows(RUN, "lstm", WEAK, way="reference", episodes=5, n_test=4)[1])
         metrics.append(set(rows["metric"]))
-        (_, _, line) = str(results.ways_table(rows)).splitlines()
+        (_, _, line) = str(adaptation_results.ways_table(rows)).splitlines()
         assert ("| - " in line) == ("copies" in header)
     assert metrics[1] - metrics[0] == {"train_seconds"}
-    assert metrics[0] == set(results.SCORES)
+    assert metrics[0] == set(adaptation_results.SCORES)
 
 
 def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None:
@@ -499,11 +500,12 @@ def test_the_sentence_says_what_each_way_leaves_of_the_zero_shot_score() -> None
     rows = tables.frame([
         common | dict(configuration=way, env_steps=steps, metric=metric, steps_ahead=80, value=value)
         for way, steps, value in (("zero-shot", 0, 2.0), ("all", 2000, 0.5), ("reference", 50_000, 0.4))
-        for metric in results.SCORES
+        for metric in adaptation_results.SCORES
     ])  # fmt: skip
-    assert "is left, with n episodes, by all weights 25% (20); trained in full 20% (500)" in results.sentences(rows)
-    assert "of what training in full takes off it is taken off by all weights 94% (20)" in results.sentences(rows)
-    (curves,) = results.way_curves(rows, 80).values()
+    told = adaptation_results.sentences(rows)
+    assert "is left, with n episodes, by all weights 25% (20); trained in full 20% (500)" in told
+    assert "of what training in full takes off it is taken off by all weights 94% (20)" in told
+    (curves,) = adaptation_results.way_curves(rows, 80).values()
     assert [(way.model, *map(float, at), float(values[0, 0])) for way, (at, values) in curves.items()] == [
         ("zero-shot", 0, 2.0), ("all", 20, 0.5), ("reference", 500, 0.4),
     ]  # fmt: skip
@@ -583,15 +585,15 @@ def test_what_an_adapted_model_recovers_is_a_share_of_what_its_own_seed_lost() -
         common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
         for way, each in given.items() for steps, values in each.items() for seed, value in enumerate(values)
     ])  # fmt: skip
-    lines = results.recovered_table(rows).splitlines()
+    lines = adaptation_results.recovered_table(rows).splitlines()
     found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
     shares = {"all": {5: (0.5, 0.25), 20: (1.0, 0.5)}, "scratch": {20: (-1.0, 0.0)}}  # of the seeds with a reference
     assert found == [
-        [f"`{WEAK}`", "`rtsm`", results.WAYS[way].name,
+        [f"`{WEAK}`", "`rtsm`", adaptation_results.WAYS[way].name,
          *("{:.1%} ± {:.1%}".format(*interval(each[n])) if n in each else "" for n in (5, 20)), "2", "9"]
         for way, each in shares.items()
     ]  # fmt: skip
-    assert results.recovered_table(rows[rows["configuration"] != "reference"]) == ""
+    assert adaptation_results.recovered_table(rows[rows["configuration"] != "reference"]) == ""
 
 
 def test_where_a_model_trained_in_full_is_no_better_nothing_is_recovered() -> None:
@@ -602,14 +604,14 @@ def test_where_a_model_trained_in_full_is_no_better_nothing_is_recovered() -> No
         common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
         for way, (steps, values) in scores.items() for seed, value in enumerate(values)
     ])  # fmt: skip
-    assert results.recovered(rows)["all"].to_dict() == {500: {0: 0.5}}
-    assert "50.0%" in results.recovered_table(rows)
-    assert results.recovered_table(rows[rows["seed"] > 0]) == ""
+    assert adaptation_results.recovered(rows)["all"].to_dict() == {500: {0: 0.5}}
+    assert "50.0%" in adaptation_results.recovered_table(rows)
+    assert adaptation_results.recovered_table(rows[rows["seed"] > 0]) == ""
 
 
 def test_a_way_of_training_has_no_look_of_a_model() -> None:
     models = [*(spec.look for spec in zoo.ZOO.values() if spec.group != "choice"), *zoo.LOOKS.values()]
-    ways = results.WAYS.values()
+    ways = adaptation_results.WAYS.values()
     assert len({look.marker for look in ways}) == len({look.colour for look in ways}) == len(ways)
     assert not {look.colour for look in ways} & {look.colour for look in models}
     trained = [zoo.look(word) for word in zoo.words("dynamics", "ablation")]

@@ -27,7 +27,7 @@ from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.study import zoo
 from tsmlib.study.data import HELD_OUT_SEED, random_data, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_pretrained
-from tsmlib.study.results import exploration as results
+from tsmlib.study.results import adaptation as results
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 from tsmlib.training.fit import TrainingOptions, fit

@@ -19,7 +19,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.study import zoo
-from tsmlib.study.results import exploration, latent, planning, policies, prediction, robustness, table
+from tsmlib.study.results import adaptation, exploration, latent, planning, policies, prediction, robustness, table
 
 PROTOCOLS = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance"}  # of figure 5
 SCORES = {**PROTOCOLS, "ll_own": "own density", "energy_score_noise": "energy score"}
@@ -185,7 +185,7 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Dra
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:
     """Energy scores of models that were adapted to a changed arm, way by way."""
     rows = table.select(found, execution=planning.OPEN, env=env)
-    curves, yours = table.pair(rows, partial(exploration.way_curves, steps_ahead=steps_ahead))
+    curves, yours = table.pair(rows, partial(adaptation.way_curves, steps_ahead=steps_ahead))
     if curves:
         yield Drawing(
             figures.adapted(curves, f"energy score, {steps_ahead} steps (data's s.d.)", yours=yours), "10_ways", rows

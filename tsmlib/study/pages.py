@@ -15,6 +15,7 @@ from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
 from tsmlib.study.comparison import published
+from tsmlib.study.results import adaptation as adaptation_results
 from tsmlib.study.results import aims as aims_results
 from tsmlib.study.results import exploration as exploration_results
 from tsmlib.study.results import planning as planning_results
@@ -412,14 +413,15 @@ Seeds are of the few episodes and of the updates on them: all begin from one mod
 
 ![Energy scores of adapted models against the episodes that they know](../figures/10_ways.png)
 
-{exploration_results.ways_table(rows)}
+{adaptation_results.ways_table(rows)}
 {_recovered(rows)}
-{exploration_results.sentences(rows)}"""
+{exploration_results.sentences(rows)}
+{adaptation_results.sentences(rows)}"""
 
 
 def _recovered(rows: pd.DataFrame) -> str:
     """The part of that page on what adaptation recovers; empty without a model trained in full."""
-    if not (found := exploration_results.recovered_table(rows)):
+    if not (found := adaptation_results.recovered_table(rows)):
         return ""
     return f"""
 The share of its loss that a model recovers from n episodes, (zero-shot - adapted) / (zero-shot - trained in full) of

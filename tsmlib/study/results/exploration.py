@@ -1,26 +1,21 @@
-"""Results of 10_explore: rows of rounds of exploration and of adapted models; panels, tables and sentences from rows.
+"""Results of rounds of exploration (10_explore): their rows; panels, tables and sentences from rows.
 
 Rounds are ``closed loop``; ``iteration`` is the round, ``env_steps`` were executed until then, random ones included,
 and ``configuration`` says whose episodes were learned from (DATA). Rows of a round's episodes themselves (EPISODES)
 have the subset ``data`` and no execution. Returns of searches through the true simulator, in codes of the prior before
 round 1 (subset FIRST_PRIOR) and of the last (LAST_PRIOR), are ``open loop``; ``iteration`` is the planner's.
-
-Adapted models are ``open loop``, without a planner; ``env_steps`` are those of the changed arm that they know, and
-``configuration`` is the way (``study.adaptation``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
 
 import numpy as np
 import pandas as pd
 
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.evaluation.prediction import Scores
-from tsmlib.figures.method import Look, Method
+from tsmlib.figures.method import Method
 from tsmlib.statistics import interval
 from tsmlib.study import zoo
 from tsmlib.study.results import table
@@ -36,7 +31,6 @@ DRAWN = {
 TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
 DATA = (PLANNED, RANDOM, NONE)  # of each round; the last is training alone
-REFERENCE: Final = "reference"
 _BOTH = {
     "return_true": "executed return", "gap_absolute": "size of the first plan's gap",
     "gap_open_loop": "the first plan's gap open loop", "lost": "unstable episodes",
@@ -49,13 +43,6 @@ SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, with
 EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
-SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
-WAYS = {  # of training: no colour and no marker of a model; the redder, the more of the weights is trained on
-    "zero-shot": Look("zero-shot", "#6E6E6E", (5, 2, 0)), "all": Look("all weights", "#8B0A1A", (6, 1, 0)),
-    "head": Look("head", "#E34A33", "8"), "codes": Look("codes", "#F4A582", "+"),
-    "scratch": Look("from scratch", "#6B6B00", "x"),
-    "reference": Look("trained in full", "#1E1E1E", (4, 1, 45)),
-}  # fmt: skip
 UNITS = {  # of DRAWN, as a figure's axes say them
     PENDULUM: {
         "executed return": "return (sum of 100 rewards)",
@@ -126,26 +113,6 @@ def _of_loop(run: Run, word: str, env: str, data: str) -> Row:
     )  # fmt: skip
 
 
-def adapted_rows(
-    run: Run, env: str, word: str, way: str, scores: Scores, *, episodes: int, ahead: Sequence[int],
-    seconds: float | None,
-) -> list[Row]:  # fmt: skip
-    """Both scores of an adapted model at some steps ahead, and the CPU ``seconds`` of its training; no row of these for
-    None, where they are of several models together."""
-    curves = scores.against_horizon()
-    common = dict(
-        env=env, sim=EnvSpec.parse(env).simulator, model=word, planner="none", execution=OPEN, configuration=way,
-        env_steps=100 * episodes, n=len(scores.outside), seed=run.seed, scale=run.scale,
-    )  # fmt: skip
-    found = [
-        common | dict(metric=metric, steps_ahead=steps, value=float(curves[metric][steps - 1]), unit="1")
-        for metric in SCORES for steps in ahead
-    ]  # fmt: skip
-    if seconds is not None:
-        found.append(common | dict(metric="train_seconds", value=seconds, unit="s"))
-    return found
-
-
 # Panels --------------------------------------------------------------------------------------------------------------
 
 
@@ -185,20 +152,6 @@ def axis_ends(rows: pd.DataFrame, env: str) -> dict[str, float]:
             low = min(mean - half for mean, half in map(interval, before))
             ends[title] = low - 0.1 * abs(low)
     return ends
-
-
-def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
-    """Model -> way -> episodes of the changed arm (R,) and energy score (k, R), for ``figures.adapted``."""
-    found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
-    here = table.select(rows, execution=OPEN, metric="energy_score_noise", steps_ahead=steps_ahead)
-    for (word, way), own in table.groups(here, ["model", "configuration"]):
-        wide = own.pivot(index="seed", columns="env_steps", values="value").dropna()
-        looked = Method(way, look=WAYS[way])
-        found.setdefault(zoo.look(word).name, {})[looked] = wide.columns.to_numpy(float) / 100, wide.to_numpy(float)
-    return {
-        model: dict(sorted(ways.items(), key=lambda item: [*WAYS].index(item[0].model)))
-        for model, ways in found.items()
-    }
 
 
 # Tables and sentences ------------------------------------------------------------------------------------------------
@@ -336,62 +289,9 @@ def _first(curve: pd.Series, level: float) -> float | None:
     return float(there[0]) if len(there) else None
 
 
-@table.sourced
-def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """A line for each arm, model, way and number of episodes: both scores, and CPU seconds of training."""
-    lines = []
-    keys = ["env", "model", "configuration", "env_steps"]
-    for (env, word, way, steps), own in table.groups(table.select(rows, execution=OPEN, planner="none"), keys):
-        line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name, "episodes": int(steps) // 100}
-        for metric, title in SCORES.items():
-            for ahead, part in table.groups(table.select(own, metric=metric), "steps_ahead"):
-                line[f"{title}, {ahead} steps"] = table.spell(part["value"])
-        spent = table.select(own, metric="train_seconds")["value"]
-        line["CPU s"] = table.spell(spent, "{:.0f}") if len(spent) else "-"
-        lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
-    return pd.DataFrame(lines)
-
-
-@table.sourced
-def recovered_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """A line for each arm, model and way: the share of the loss of energy score that n episodes recover,
-
-        (zero-shot - adapted) / (zero-shot - trained in full),
-
-    paired by seed, at the greatest number of steps ahead. Only where the reference has rows, and is better than
-    zero-shot."""
-    lines = []
-    here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
-    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
-    for (env, word), own in table.groups(here, ["env", "model"]):
-        found = recovered(own)
-        for way in [way for way in WAYS if way in found and found[way].notna().to_numpy().any()]:
-            line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name}
-            for steps in sorted(found.columns.get_level_values("env_steps").unique()):
-                shares = found[way][steps].dropna() if steps in found[way] else []
-                line[f"{int(steps) // 100} episodes"] = table.spell(shares, "{:.1%} ± {:.1%}") if len(shares) else ""
-            lines.append({**line, "seeds": len(found[way].dropna(how="all")), "n": int(own["n"].max())})
-    return pd.DataFrame(lines)
-
-
-def recovered(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of energy scores of one arm and model, the share recovered of what zero-shot loses against the reference: a line
-    for each seed that has both, a column for each way and number of steps. NaN where the reference is no better than
-    zero-shot, so that there is nothing to recover."""
-    wide = rows.pivot(index="seed", columns=["configuration", "env_steps"], values="value")
-    if not {"zero-shot", REFERENCE} <= set(wide.columns.get_level_values(0)):
-        return pd.DataFrame()
-    one = wide.T.groupby(level=0).first().T  # column of each way; those two have one number of episodes
-    zero, full = one["zero-shot"], one[REFERENCE]
-    ways = wide.drop(columns=["zero-shot", REFERENCE], level=0)
-    lost = (zero - full).where(zero > full)
-    return ways.rsub(zero, axis=0).div(lost, axis=0).dropna(how="all")
-
-
 @table.told
 def sentences(rows: pd.DataFrame) -> Iterator[str]:
-    """What the rounds changed, learner by learner; how much of the zero-shot error each way leaves, and how much of
-    what the reference takes off it."""
+    """What the rounds changed, learner by learner."""
     keys = ["env", "model", "configuration"]
     for (env, word, data), own in table.groups(table.select(rows, execution=CLOSED), keys):
         if (first := own["iteration"].min()) == (last := own["iteration"].max()):
@@ -403,29 +303,3 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
         ]  # fmt: skip
         where = "" if env == PENDULUM else f"`{env}`, "
         yield f"{where}`{word}` on {data}, round {first} -> {last}: {', '.join(said)}."
-    last_steps = table.select(rows, execution=OPEN, metric="energy_score_noise")
-    last_steps = last_steps[last_steps["steps_ahead"] == last_steps["steps_ahead"].max()]
-    for (env, word), own in table.groups(last_steps, ["env", "model"]):
-        keyed = table.groups(own, ["configuration", "env_steps"])
-        left = {(str(way), int(steps)): float(part["value"].mean()) for (way, steps), part in keyed}
-        if (zero := left.pop(("zero-shot", 0), None)) is not None:
-            ahead = own["steps_ahead"].max()
-            shares = {key: value / zero for key, value in left.items()}
-            yield (
-                f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left, with n episodes, by "
-                f"{_by_way(shares)}."
-            )
-            lost = zero - next((value for (way, _), value in left.items() if way == REFERENCE), zero)
-            if lost > 0:
-                shares = {key: (zero - value) / lost for key, value in left.items() if key[0] != REFERENCE}
-                yield f"`{env}`, `{word}`: of what training in full takes off it is taken off by {_by_way(shares)}."
-
-
-def _by_way(shares: Mapping[tuple[str, int], float]) -> str:
-    """Shares in words, way by way; keys: way and steps."""
-    said = []
-    for way, look in WAYS.items():
-        own = sorted((steps, share) for (which, steps), share in shares.items() if which == way)
-        if own:
-            said.append(f"{look.name} {', '.join(f'{share:.0%} ({steps // 100})' for steps, share in own)}")
-    return "; ".join(said)
