@@ -31,6 +31,7 @@ NODES = ("n1", "n2")
 SEEDS = "0,2"
 KILLED = ("job", "node", "controller", "workflow")
 IN_TURN = ("job", "node", "controller")
+STEPS = 9  # of the workflow's ten those after which one always runs
 CONFIGURATION = """ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
 SlurmUser=root
@@ -216,9 +217,12 @@ def made(place: Path) -> dict[str, object]:
     return found
 
 
-def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes]) -> None:
-    """Kill a job's process, a node with all it runs, the controller, or the workflow."""
-    wait_for(lambda: cluster.running() or process.poll() is not None)
+def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Path, *, after: int = 0) -> None:
+    """Kill a job's process, a node with all it runs, the controller, or the workflow, while a job runs and at least
+    so many steps are done."""
+    done = place / "runs" / "smoke" / "workflow" / "done"
+    ready = lambda: sum(path.is_file() for path in done.glob("*/*")) >= after and cluster.running()  # noqa: E731
+    wait_for(lambda: ready() or process.poll() is not None)
     job, node = cluster.running()[0]
     if how == "job":
         kill(next(p for p in cluster.processes(job) if "step" in p.cmdline()))
@@ -239,8 +243,8 @@ def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes]) -> None:
 def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
     """R1, R14: jobs, nodes and controllers of a Slurm of two nodes killed, two seeds at smoke: the tables of the pool.
 
-    Each of ``kinds`` is killed in ``each`` runs of the workflow, one in a run; for 0 all of KILLED in one run, one
-    after another.
+    Each of ``kinds`` is killed in ``each`` runs of the workflow, one in a run, after none of its steps, one, ... in
+    turn; for 0 all of KILLED in one run, one after another.
     """
     if lacking := missing():
         return Outcome(note=f"{lacking}: not done")
@@ -253,13 +257,15 @@ def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
             there = place / f"trial{trial}"
             options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
             process = workflow(there, *options, environment=cluster.environment)
+            after = trial // len(kinds) % STEPS if each else 0
             for how in killed:
-                strike(cluster, how, process)
+                strike(cluster, how, process, there, after=after)
                 if how == "workflow":
                     process.wait()
                     process = workflow(there, *options, environment=cluster.environment)
             code, same = process.wait(1800), made(there) == expected
-            said, told = f"{', '.join(killed)}: exit {code}, same tables {same}", (there / "log").read_text()
+            said = f"{', '.join(killed)} after {after} steps: exit {code}, same tables {same}"
+            told = (there / "log").read_text()
             found.count(code == 0 and same, f"{said}: {told[-800:]}")
             print(said, flush=True)
     often = f"{each} times each" if each else "once each, in one run"
