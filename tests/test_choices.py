@@ -210,9 +210,12 @@ def test_early_records_stand_beside_their_curve() -> None:
     new = [dict(policy, iteration=22, subset="early", value=2.0)]
     found = [(line["iteration"], line["value"]) for line in tables.records(rows.merged(published, new))]
     assert found == [(220, 1.0), (22, 2.0)]
+    longer = [dict(policy, iteration=i, value=3.0) for i in (220, 440)]  # another curve, of which they tell nothing
+    found = [(line["iteration"], line["value"]) for line in tables.records(rows.merged(published, longer))]
+    assert found == [(220, 3.0), (440, 3.0)]
 
 
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("seed", range(5))
 def test_what_ships_of_plateaus_is_what_the_curves_that_ship_say(seed: int) -> None:
     published = tables.load(runs.RESULTS / "05_control.csv")
     run = runs.resolve("05_control", scale="paper", seed=seed)

@@ -262,10 +262,11 @@ def test_a_learning_curve_is_asked_for_its_end_or_its_average() -> None:
     rows: Rows = [
         dict(common, seed=k, iteration=h, value=v + k) for k in (0, 1) for h, v in ((0, 1.0), (10, 2.0), (20, 6.0))
     ]
+    rows += [dict(row, subset="early", iteration=5, value=9.0) for row in rows[:1]]  # no record of the curve
     rule = returns(lambda q: q.final(LAP, REACHER) - q.policy("return_true", LAP, REACHER, average=True).mean() > 0)
     assert evaluate.judge(rule, frames(of_05_control=rows)).key.value == pytest.approx(3.0)
     with pytest.raises(evaluate.ClaimError, match="curves of different lengths"):
-        evaluate.measure(rule.checks[""][0], frames(of_05_control=rows[:-1]))
+        evaluate.measure(rule.checks[""][0], frames(of_05_control=rows[:-2]))
 
 
 def test_averages_of_learning_curves_are_over_the_places_that_all_have() -> None:

@@ -502,6 +502,21 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     assert [path.name for path in (run.models / "Reacher").glob("policy*")] == [f"policy-onestep-{space}.safetensors"]
 
 
+def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: Path) -> None:
+    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    task, method = study.load_task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", "latent", "policy")
+    whole = study.Budget(copies=2)
+    curve = study.learn(run, task, method, whole).header["curve"]["measured"]["return_true"]
+    before = {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()}
+    assert not [row for row in study.policy_rows(run, [(task, method, whole)]) if row.get("subset")]
+    rows = study.early_rows(run, [(task, method, study.Budget(copies=2, iterations=2))])
+    told = [(row["metric"], row["subset"], row["iteration"], row["copy"], row["value"]) for row in rows]
+    assert told == [("return_true", "early", i, copy, curve[i][copy]) for i in range(3) for copy in range(2)]
+    assert {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()} == before
+    again = study.policy_rows(run, [(task, method, whole)])
+    assert [row for row in again if row.get("subset") == "early"] == rows
+
+
 def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     task = study.load_task("tsm/Reacher-v0").take(2).with_reward("reach", lambda states, actions: -states[..., 0].abs())

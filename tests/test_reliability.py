@@ -19,6 +19,7 @@ from reliability.world import Outcome
 from tqdm.auto import tqdm
 
 from tsmlib.storage import manifest
+from tsmlib.study import runs, workflow
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for check, quick, _ in part}
@@ -156,6 +157,18 @@ def test_on_a_cluster_each_kind_is_killed_as_often() -> None:
     assert {found.count((kind,)) for kind in ("job", "node", "controller")} == {20}
     assert cluster.strikes(2, ["workflow"]) == [("workflow",)] * 2
     assert cluster.strikes(0) == [cluster.KILLED]
+
+
+def test_on_a_cluster_steps_are_counted_by_the_marks_of_a_workflow(tmp_path: Path) -> None:
+    notebook = runs.notebooks()["train"]
+    given = {"env": "tsm/Reacher-v0", "models": "prior"}
+    steps = workflow.steps(workflow.prepare([notebook], (0, 2), scale="smoke", device="", given=given), given)
+    for n, step in enumerate(steps.values()):
+        assert cluster.steps_done(tmp_path) == n
+        mark = tmp_path / "runs" / "smoke" / "workflow" / step.done
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+    assert cluster.steps_done(tmp_path) == len(steps)
 
 
 def test_a_child_that_is_killed_while_it_draws_a_progress_bar_stops_no_other() -> None:

@@ -318,6 +318,7 @@ def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
         assert (folder / part / "seed2" / "models" / "Reacher" / f"prior{suffix}").exists()
     steps = json.loads((folder / "steps.json").read_text())
     assert all((folder / step["done"]).exists() for step in steps.values())
+    assert cluster.steps_done(place / "local") == len(steps) > cluster.STEPS
     again = cluster.workflow(place / "local", "--executor", "local")
     assert again.wait(600) == 0
     assert "Nothing to be done" in (place / "local" / "log").read_text()

@@ -10,11 +10,11 @@ loop, and by the cross-entropy method in codes planned again every ten steps for
 no torque and random torques beside them (05_control); the model oracle is the true simulator. policies: learned inside
 each model, of ours and the paper's in both search spaces, of the others direct alone, as in 05_control, by --copies
 and --iterations where the run has none; how soon each came to a common plateau is told anew from all that are
-published then. early: the first --iterations of latent policies again, with ten records, for those that were at 90 %
-of the plateau by the first record of their curve. Models, scores, plans and policies are those of the run, so what is
-missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques and those of the
-prior, and the signal of gradients at the first 50 starts (07_action_prior). convergence: of Adam in codes, how many of
-500 iterations until its plans are nearly done, for 25 targets (05_control).
+published then. early: the first --iterations of latent policies again, with ten records, which tell when a policy came
+to the plateau that was there by the first record of its curve. Models, scores, plans and policies are those of the
+run, so what is missing is made first. torques: of plans by --planners in both search spaces, beside held-out torques
+and those of the prior, and the signal of gradients at the first 50 starts (07_action_prior). convergence: of Adam in
+codes, how many of 500 iterations until its plans are nearly done, for 25 targets (05_control).
 
 gradients: their errors (02_train). collect, latent and robustness execute 01_collect, 04_latent and 06_robustness in
 the run's folder for --envs and --models, as far as these ask for them, and publish what their tables then say:
@@ -53,7 +53,8 @@ from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
 from tsmlib.study.results import policies as policies_results
-from tsmlib.study.results.table import Row
+from tsmlib.study.results.exploration import PENDULUM
+from tsmlib.study.results.table import Row, select
 from tsmlib.study.runs import RESULTS
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
@@ -70,10 +71,12 @@ FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
 def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
-    """The published table with ``rows`` in place of those with the same key."""
+    """The published table with ``rows`` in place of those with the same key; early records go with their curve."""
     new = tables.frame(rows)
-    replaced = set(_keys(new))
-    return tables.frame(pd.concat([published[[key not in replaced for key in _keys(published)]], new]))
+    replaced, policy = set(_keys(new)), published["planner"] == "policy"
+    curves = _keys(published.assign(subset=published["subset"].mask(policy, "")))
+    kept = [not {key, curve} & replaced for key, curve in zip(_keys(published), curves, strict=True)]
+    return tables.frame(pd.concat([published[kept], new]))
 
 
 def without_loops(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
@@ -117,11 +120,15 @@ def publish(
 
 def with_plateaus(table: pd.DataFrame, run: runs.Run, envs: list[str]) -> pd.DataFrame:
     """The published table, with what it says of when this seed's policies came to their plateaus told anew."""
-    own = (table["planner"] == "policy") & (table["seed"] == run.seed) & (table["scale"] == run.scale)
-    own &= table["env"].isin(envs) & table["noise"].isna() & table["delay"].isna()
-    soonest = table["metric"].isin(policies_results.SOONEST)
-    rows = study.plateaus(run, [study.load_task(env) for env in envs], table[own & ~soonest])
-    return tables.frame(pd.concat([table[~(own & soonest)], tables.frame(rows)]))
+    own = own_policies(table, run, envs)
+    told = own[own["metric"].isin(policies_results.SOONEST)]
+    rows = study.plateaus(run, [study.load_task(env) for env in envs], own.drop(told.index))
+    return tables.frame(pd.concat([table.drop(told.index), tables.frame(rows)]))
+
+
+def own_policies(table: pd.DataFrame, run: runs.Run, envs: list[str]) -> pd.DataFrame:
+    """The published rows of policies of a run's seed and scale on some environments."""
+    return select(table, planner="policy", seed=run.seed, scale=run.scale, env=envs, noise=None, delay=None)
 
 
 def controlled(
@@ -176,7 +183,7 @@ def adapted(run: runs.Run, models: list[str], envs: list[str], ways: list[str], 
 
 def wanted_rounds(parser: argparse.ArgumentParser, given: argparse.Namespace) -> list[tuple[str, str, str]]:
     """Environment, model and data of every loop; ends the command where a model does not explore there."""
-    for env, word in (pairs := list(product(given.envs or [rounds.PENDULUM], given.models))):
+    for env, word in (pairs := list(product(given.envs or [PENDULUM], given.models))):
         try:
             worlds.require(env, word)
         except ValueError as error:
@@ -226,7 +233,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", "peers"))
     parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
-    parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, rounds.PENDULUM), metavar="ENV")
+    parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, PENDULUM), metavar="ENV")
     parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
                         help="of control and torques also oracle, the true simulator")  # fmt: skip
     parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL")
@@ -256,8 +263,8 @@ def main() -> None:
         parser.error(f"the simulator has no gradient; --planners of {SIMULATOR} are cem and mppi")
     if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
         parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
-    if rounds.PENDULUM in given.envs and given.part != "rounds":
-        parser.error(f"{given.part} takes no {rounds.PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
+    if PENDULUM in given.envs and given.part != "rounds":
+        parser.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
         parser.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
     notebook = NOTEBOOKS.get(given.part, "05_control")
@@ -295,8 +302,13 @@ def main() -> None:
         told = partial(with_plateaus, run=run, envs=given.envs)
         publish(notebook, study.policy_rows(run, policies), told=told)
     elif given.part == "early":
-        budget = Budget(given.copies, given.iterations)
+        budget, published = Budget(given.copies, given.iterations), tables.load(RESULTS / f"{notebook}.csv")
         latent = [way for way in zoo.policies(given.models) if way.search_space == "latent"]
+        for env, way in product(given.envs, latent):
+            if not len(own_policies(published, run, [env]).query("model == @way.model and search_space == 'latent'")):
+                parser.error(
+                    f"{env}: no latent policy in {way.model} of seed {run.seed} is published; run policies first"
+                )
         rows = study.early_rows(run, [(study.load_task(env), way, budget) for env, way in product(given.envs, latent)])
         publish(notebook, rows, told=partial(with_plateaus, run=run, envs=given.envs))
     else:

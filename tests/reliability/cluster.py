@@ -217,13 +217,24 @@ def made(place: Path) -> dict[str, object]:
     return found
 
 
+def steps_done(place: Path) -> int:
+    """How many steps of the workflow in a folder are marked as done."""
+    return sum(path.is_file() for path in (place / "runs" / "smoke" / "workflow" / "done").rglob("*"))
+
+
 def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Path, *, after: int = 0) -> None:
     """Kill a job's process, a node with all it runs, the controller, or the workflow, while a job runs and at least
     so many steps are done."""
-    done = place / "runs" / "smoke" / "workflow" / "done"
-    ready = lambda: sum(path.is_file() for path in done.glob("*/*")) >= after and cluster.running()  # noqa: E731
+    running = list[tuple[str, str]]()
+
+    def ready() -> bool:
+        running[:] = cluster.running() if steps_done(place) >= after else []
+        return bool(running)
+
     wait_for(lambda: ready() or process.poll() is not None)
-    job, node = cluster.running()[0]
+    if not running:
+        raise RuntimeError(f"the workflow ended with {steps_done(place)} steps, before a {how} was killed")
+    job, node = running[0]
     if how == "job":
         kill(next(p for p in cluster.processes(job) if "step" in p.cmdline()))
     elif how == "node":
@@ -258,11 +269,16 @@ def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
             options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
             process = workflow(there, *options, environment=cluster.environment)
             after = trial // len(kinds) % STEPS if each else 0
-            for how in killed:
-                strike(cluster, how, process, there, after=after)
-                if how == "workflow":
-                    process.wait()
-                    process = workflow(there, *options, environment=cluster.environment)
+            try:
+                for how in killed:
+                    strike(cluster, how, process, there, after=after)
+                    if how == "workflow":
+                        process.wait()
+                        process = workflow(there, *options, environment=cluster.environment)
+            except Exception as error:
+                kill(psutil.Process(process.pid))
+                found.count(False, f"{', '.join(killed)} after {after} steps: {error!r}")
+                continue
             code, same = process.wait(1800), made(there) == expected
             said = f"{', '.join(killed)} after {after} steps: exit {code}, same tables {same}"
             told = (there / "log").read_text()

@@ -233,7 +233,7 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
     which those of scale laptop never come. No seconds of what was trained or learned as one of several: they are of
     all together.
 
-    Learned where they are missing.
+    Learned where they are missing. Early records (``early_rows``) are rows, too, where the run has them.
     """
     rows: list[Row] = []
     for task, method, budget in wanted:
@@ -245,32 +245,37 @@ def policy_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list
             n=found.header.get("targets", 100),  # those that it was measured on as it was learned
             within_data=within_data(run, task, found.policy).tolist(),
         )  # fmt: skip
+        if (early := _early_path(run, task.env, method)).exists():
+            rows += early_rows(run, [(task, method, _budget(early))])
     return rows + plateaus(run, [task for task, *_ in wanted], tables.frame(rows))
 
 
 def plateaus(run: Run, tasks: Iterable[Task], learned: pd.DataFrame) -> list[Row]:
     """``plateau_rows`` of one seed's tasks, from the rows of its policies, ``early_rows`` among them, and of those
-    without a model; none at scale laptop."""
+    without a model. None where either are missing, on a noisy or late arm, on which nobody learned without a model, or
+    at scale laptop, whose policies come to no plateau."""
     if run.scale == "laptop":
         return []
     free = finished(select(table(run, "model_free"), model=GRADIENTS).drop(columns="source"))
-    both = tables.frame(pd.concat([learned, free[free["seed"] == run.seed]]))
-    curves, early, rows = learning_curves(both), learning_curves(both, EARLY), list[Row]()
+    both, rows = tables.frame(pd.concat([learned, free[free["seed"] == run.seed]])), list[Row]()
     for task in {task.env: task for task in tasks}.values():
-        compared = {way: own for way, own in curves[task.name].items() if way.search_space != "direct"}
-        common, steps = of_task(task, run) | {"horizon": None}, task.horizon * EPISODES[run.scale]
-        rows += plateau_rows(compared, common, steps=steps, early=early.get(task.name))
+        own = select(both, env=task.env, noise=None, delay=None)  # none of an imperfect arm, whose id is no row's env
+        curves, early = (learning_curves(own, subset).get(task.name, {}) for subset in ("", EARLY))
+        compared = {way: curve for way, curve in curves.items() if way.search_space != "direct"}
+        if {bool(way.search_space) for way in compared} == {True, False}:
+            common, steps = of_task(task, run) | {"horizon": None}, task.horizon * EPISODES[run.scale]
+            rows += plateau_rows(compared, common, steps=steps, early=early)
     return rows
 
 
 def early_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[Row]:
     """True returns of the first iterations of policies, which are learned again as far as their budgets say, with ten
-    records on the way, in files of their own. The rate of a step depends on no budget, so these are the same policies.
+    records on the way, in the run's folder ``early``. An iteration does the same whatever the budget, so these are the
+    policies that longer learning goes on with, if it is in the same model and through the same prior.
     """
     rows = list[Row]()
     for task, method, budget in wanted:
-        asked = _Asked.of(run, task, method, budget)
-        asked = replace(asked, path=asked.path.with_stem(f"{asked.path.stem}-{EARLY}"))
+        asked = replace(_Asked.of(run, task, method, budget), path=_early_path(run, task.env, method))
         header = (asked.kept() or asked.learned()).header
         found = learning_rows(header, samples=0, train_seconds=None, n=header.get("targets", 100))
         rows += [row | {"subset": EARLY} for row in found if row["metric"] == "return_true"]
@@ -280,11 +285,20 @@ def early_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[
 def stored_budget(run: Run, env: str, method: Method) -> Budget | None:
     """How the policy that the run's folder holds was learned, for ``learn`` to find it again; else None."""
     path = _path(run, env, method)
-    return Budget(**cast("dict[str, int]", artifacts.read_header(path)["budget"])) if path.exists() else None
+    return _budget(path) if path.exists() else None
+
+
+def _budget(path: Path) -> Budget:
+    """How the policy in a file was learned."""
+    return Budget(**cast("dict[str, int]", artifacts.read_header(path)["budget"]))
 
 
 def _path(run: Run, env: str, method: Method) -> Path:
     return run.dir / "models" / EnvSpec.parse(env).name / f"{file_name(method)}.safetensors"
+
+
+def _early_path(run: Run, env: str, method: Method) -> Path:
+    return run.dir / EARLY / EnvSpec.parse(env).name / f"{file_name(method)}-{EARLY}.safetensors"  # none ships
 
 
 def file_name(method: Method) -> str:

@@ -75,7 +75,7 @@ def plateau_rows(
     and the best of the model-free ones have all come to in the end; what counts is the gain over the best of all
     before learning. There are no rows where that is none. A model-free policy that never comes there counts with all
     that it took. steps: of its model that a policy takes per iteration. early: curves of the first iterations alone,
-    whose records tell when a policy was there that was so by the first record of its curve.
+    with more records, which count in place of those of a whole curve as far as they go.
 
     ``samples_to_90``: steps of what it learned in, the model or else the environment, and no row where it was there by
     the first record, which does not tell when; ``env_samples_to_90``: steps of the environment, the data
@@ -109,12 +109,12 @@ def plateau_rows(
 
 
 def with_early(curves: Curves, early: Curves) -> Curves:
-    """Iterations and true returns of a curve, with those records of ``early`` that are before its first one."""
-    first, second = curves["iterations"][:2]
-    new = np.flatnonzero((early["iterations"] > first) & (early["iterations"] < second))
+    """Iterations and mean true return (1, R) of ``early``, and of a whole curve after the end of that."""
+    later = curves["iterations"] > early["iterations"][-1]
+    means = [early["return_true"].mean(0), curves["return_true"].mean(0)[later]]
     return {
-        name: np.concatenate([curves[name][..., :1], early[name][..., new], curves[name][..., 1:]], axis=-1)
-        for name in ("iterations", "return_true")
+        "iterations": np.concatenate([early["iterations"], curves["iterations"][later]]),
+        "return_true": np.concatenate(means)[None],
     }
 
 
