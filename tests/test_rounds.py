@@ -489,9 +489,24 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
         means = own.mean(axis=1)
         assert means[1] - means[0] > means[5] - means[1]  # most of it comes with the first round
     mean, half = interval(results.paired(gaps, 5)["round 0"])
-    assert mean + half > 0
-    mean, half = interval(results.paired(alone, 5)["round 0"])
+    assert mean - half > 0
+    ends = {what: interval(values) for what, values in results.paired(alone, 5).items()}
+    mean, half = ends["round 0"]
     assert mean + half < 0
+    mean, half = ends[results.NONE]
+    assert mean + half > 0  # not shown
+
+
+def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), planner="cem", execution="closed loop")
+    swung = table.select(rows, env=PENDULUM, model="rtsm", metric="success", iteration=4)
+    own, random = (
+        table.select(swung, configuration=data).set_index("seed")["value"] for data in (results.PLANNED, results.RANDOM)
+    )
+    assert own.tolist() == [1, 1, 1]
+    assert (random.sort_index() < own.sort_index()).all()
+    pushed = table.select(rows, env=PUSH, model="lstm", metric="return_true")
+    assert (pushed.groupby("iteration")["value"].mean().diff().iloc[1:] < 0).all()
 
 
 def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> None:

@@ -67,14 +67,15 @@ NOTEBOOKS = {
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
+EMPTY = tables.frame([])
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
 def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
     """The published table with ``rows`` in place of those with the same key; early records go with their curve."""
     new = tables.frame(rows)
-    replaced, policy = set(_keys(new)), published["planner"] == "policy"
-    curves = _keys(published.assign(subset=published["subset"].mask(policy, "")))
+    replaced, early = set(_keys(new)), published["subset"] == policies_results.EARLY
+    curves = _keys(published.assign(subset=published["subset"].mask(early, "")))
     kept = [not {key, curve} & replaced for key, curve in zip(_keys(published), curves, strict=True)]
     return tables.frame(pd.concat([published[kept], new]))
 
@@ -302,7 +303,8 @@ def main() -> None:
         told = partial(with_plateaus, run=run, envs=given.envs)
         publish(notebook, study.policy_rows(run, policies), told=told)
     elif given.part == "early":
-        budget, published = Budget(given.copies, given.iterations), tables.load(RESULTS / f"{notebook}.csv")
+        path = RESULTS / f"{notebook}.csv"
+        budget, published = Budget(given.copies, given.iterations), tables.load(path) if tables.stored(path) else EMPTY
         latent = [way for way in zoo.policies(given.models) if way.search_space == "latent"]
         for env, way in product(given.envs, latent):
             if not len(own_policies(published, run, [env]).query("model == @way.model and search_space == 'latent'")):

@@ -276,7 +276,9 @@ def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
                         process.wait()
                         process = workflow(there, *options, environment=cluster.environment)
             except Exception as error:
-                kill(psutil.Process(process.pid))
+                process.kill()
+                process.wait()
+                cluster.command("scancel", "--user", "root")
                 found.count(False, f"{', '.join(killed)} after {after} steps: {error!r}")
                 continue
             code, same = process.wait(1800), made(there) == expected

@@ -11,7 +11,9 @@
 The margins of Q1 to Q6 are zero, and were set when rows of one training seed were there; those of Q4 and Q5 when two
 rounds of seed 0 had been seen, that of Q6 when PETS was known to be ahead on seed 0. That of Q7 was a target of this
 study from the start, but the question was written when the rows of all three seeds were known. Its "same total of
-training" is read both ways: before the first round, where training had not gone on, and the same training alone.
+training" is read both ways: before the first round, where training had not gone on, and the same training alone. Rows
+of Q1 and Q4 to Q7 were made anew, of the same seeds and targets, with candidates judged by an expectation, when those
+judged by the mode were known: by these Q4 and Q7 were open. No margin was changed.
 """
 # fmt: off
 # isort: off
