@@ -139,7 +139,7 @@ def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, m
 def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does() -> None:
     few, model, prior = untrained()
     for judging in (0, 8):
-        sizes = replace(worlds.SIZES["smoke"], judging=judging, every=50)
+        sizes = replace(worlds.world(PENDULUM).sizes["smoke"], judging=judging, every=50)
         judge = tsmlib.expected_predictor if judging else tsmlib.model_predictor
         found = rounds.planned(few, model, prior, sizes, 0).found
         again = tsmlib.mpc(
@@ -171,7 +171,7 @@ def test_planner_judges_and_predicted_returns_draw_different_random_numbers(
     monkeypatch.setattr(execution, "fresh_predictor", predicts)
     few, model, prior = untrained()
     for seed in range(3):
-        sizes = replace(worlds.SIZES["smoke"], judging=judging, every=25)
+        sizes = replace(worlds.world(PENDULUM).sizes["smoke"], judging=judging, every=25)
         searched = rounds.planner(sizes, seed).keywords["seed"]  # type: ignore[attr-defined]
         judged.clear(), fresh.clear()
         rounds.planned(few.take(1), model, prior, sizes, seed)
@@ -201,7 +201,7 @@ def unstable(bad: np.ndarray, run: Any) -> Any:
 
 def measured_everywhere(monkeypatch: pytest.MonkeyPatch) -> tuple[tsmlib.Task, worlds.Sizes]:
     """A task of three starts in which every episode that ends is a success, and sizes of a loop that measures there."""
-    sizes = replace(worlds.SIZES["smoke"], starts=3, every=50)
+    sizes = replace(worlds.world(PENDULUM).sizes["smoke"], starts=3, every=50)
     every = replace(untrained()[0], success=lambda x: x[:, -1, 0] < 2)
     here = replace(worlds.WORLDS[PENDULUM], tested=every.take)
     monkeypatch.setattr(rounds, "world", lambda env: here)
@@ -260,7 +260,7 @@ def test_a_measurement_that_lost_all_its_episodes_has_no_row_of_another_distance
 
 
 def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> None:
-    sizes = replace(worlds.SIZES["smoke"], every=50)
+    sizes = replace(worlds.world(PENDULUM).sizes["smoke"], every=50)
     found = rounds.loop(RUN, "rtsm", sizes=sizes)
     assert {row["samples"] for row in found.rows} == {8}
     assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
@@ -290,7 +290,7 @@ def test_a_table_of_rounds_says_of_every_learner_what_judged_its_plans() -> None
 
 
 def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
-    path, sizes = tmp_path / "round-0.json", asdict(worlds.SIZES["smoke"])
+    path, sizes = tmp_path / "round-0.json", asdict(worlds.world(PENDULUM).sizes["smoke"])
     old = {name: value for name, value in sizes.items() if name not in ("judging", "screened")}
     path.write_text(json.dumps({"made from": {"sizes": old, "seed": 0}, "found": 1.0}))
     mode = {"sizes": sizes | {"judging": 0, "screened": 1.0}, "seed": 0}

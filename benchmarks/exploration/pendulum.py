@@ -40,7 +40,7 @@ def lines(word: str, sizes: worlds.Sizes) -> pd.DataFrame:
 
 
 def main() -> None:
-    default = worlds.SIZES["paper"]
+    default = worlds.world(PENDULUM).sizes["paper"]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", choices=worlds.WORLDS[PENDULUM].learners)
     for name in GIVEN:

@@ -67,7 +67,6 @@ NOTEBOOKS = {
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
-EMPTY = tables.frame([])
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -104,14 +103,19 @@ def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
 
 
+def shipped(name: str) -> pd.DataFrame:
+    """A table of data/results, without rows where there is none."""
+    path = RESULTS / f"{name}.csv"
+    return tables.load(path) if tables.stored(path) else tables.frame([])
+
+
 def publish(
     name: str, rows: pd.DataFrame | Iterable[Row], *, loops: bool = False,
     told: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
 ) -> None:  # fmt: skip
     """Merge rows into a table of data/results, and its new checksum into the manifest. loops: of whole loops of
     rounds, whose former rows go. told: what becomes of the whole table then."""
-    path, new = RESULTS / f"{name}.csv", tables.frame(rows)
-    known = tables.load(path) if tables.stored(path) else tables.frame([])
+    path, new, known = RESULTS / f"{name}.csv", tables.frame(rows), shipped(name)
     table = merged(without_loops(known, new) if loops else known, new)
     table = told(table) if told else table
     tables.ship(path, table)
@@ -303,11 +307,10 @@ def main() -> None:
         told = partial(with_plateaus, run=run, envs=given.envs)
         publish(notebook, study.policy_rows(run, policies), told=told)
     elif given.part == "early":
-        path = RESULTS / f"{notebook}.csv"
-        budget, published = Budget(given.copies, given.iterations), tables.load(path) if tables.stored(path) else EMPTY
+        budget, published = Budget(given.copies, given.iterations), shipped(notebook)
         latent = [way for way in zoo.policies(given.models) if way.search_space == "latent"]
         for env, way in product(given.envs, latent):
-            if not len(own_policies(published, run, [env]).query("model == @way.model and search_space == 'latent'")):
+            if select(own_policies(published, run, [env]), model=way.model, search_space="latent").empty:
                 parser.error(
                     f"{env}: no latent policy in {way.model} of seed {run.seed} is published; run policies first"
                 )

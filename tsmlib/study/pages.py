@@ -395,11 +395,12 @@ def exploration_page(rows: pd.DataFrame, free: pd.DataFrame | None = None) -> st
     if not len(rows):
         return ""
     seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    every = worlds.world(exploration_results.PENDULUM).sizes["paper"].every
     return f"""## Exploration and adaptation
 
 Written from the rows that `python -m tsmlib run explore --scale paper` or `python
 benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every
-{worlds.SIZES["paper"].every} steps, from n starts that no round trains on; steps count the random episodes before the
+{every} steps, from n starts that no round trains on; steps count the random episodes before the
 first round.
 
 ![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)

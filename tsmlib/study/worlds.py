@@ -65,13 +65,6 @@ class Sizes:
         return self if as_dynamics(model).stochastic else replace(self, judging=0, screened=1.0)
 
 
-SIZES = {  # of the pendulum, by scale
-    "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
-    "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
-    "paper": Sizes(6, 4, 4, 1000, 8, 64, 8, 5, 1500, 300, every=5),
-}
-
-
 @dataclass(frozen=True)
 class World:
     """What differs between the robots that explore.
@@ -96,7 +89,12 @@ class World:
 
 WORLDS = {
     PENDULUM: World(
-        SIZES, {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 128}},
+        {
+            "smoke": Sizes(4, 1, 2, 2, 2, 4, 2, 1),
+            "laptop": Sizes(6, 3, 4, 100, 4, 24, 5, 2),
+            "paper": Sizes(6, 4, 4, 1000, 8, 64, 8, 5, 1500, 300, every=5),
+        },
+        {"rtsm": {"hidden": 48}, "lstm": {"hidden": 48}, "ensemble+mse": {"gaussian": False, "hidden": 128}},
         tested=lambda n: pendulum.swing_up(n, seed=pendulum.TESTED), drawn=pendulum.swing_up,
         random=pendulum.random_episodes, first=pendulum.first_episodes,
         action_dim=1, rms=0.6, muon={},
