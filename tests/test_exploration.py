@@ -51,6 +51,10 @@ def options(**changes: Any) -> tsm.ExplorationOptions:
     return tsm.ExplorationOptions(**(usual | changes))
 
 
+def one_step(**changes: Any) -> tsm.ExplorationOptions:
+    return options(**({"model": replace(options().model, past_len=1)} | changes))
+
+
 def explored(model: Any, prior: Any, **given: Any) -> tsm.Exploration:
     usual = dict(options=options(), tasks=tasks, seed=3)
     train, held_out = data().take(slice(2, None)), data().take(slice(2))
@@ -386,19 +390,30 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
 
 
 @pytest.mark.parametrize(("given", "said"), [
-    (dict(options=options(bonus=1.0)), "OneStep is deterministic: its samples do not disagree. Take bonus=0"),
+    (dict(options=one_step(bonus=1.0)), "OneStep is deterministic: its samples do not disagree. Take bonus=0"),
     (dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)), "are of tsm/ReacherObstacle-v0, the data"),
-    (dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)), "states have 10 dimensions, those of tsm/Reacher-v0 6"),
+    (dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)), "states have 10 dimensions .* tsm/Reacher-v0 6"),
+    (dict(prior=None, model=tsm.LSTM(6, 2, angles=(0,), hidden=8)), r"angles \[0\], .*angles \[0, 1\]; expected"),
+    (dict(prior=tsm.ActionPrior.for_data(data("Pendulum-v1"))), "prior's actions have 1 dimensions, .*Reacher-v0 2"),
+    (dict(options=one_step(model=replace(options().model, past_len=7))), "past_len is 7, but OneStep is given"),
+    (dict(options=one_step(prior=replace(options().model, past_len=7))), "past_len is 7, but ActionPrior is given 10"),
     (dict(tasks=lambda k: tasks(k, n=1)), "round 1 has 1 task; expected at least 2"),
 ])  # fmt: skip
 def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> None:
-    usual = {"model": tsm.OneStep.for_data(data(), hidden=8), "prior": learners()[1]}
+    usual = {"model": tsm.OneStep.for_data(data(), hidden=8), "prior": learners()[1], "options": one_step()}
     with pytest.raises(ValueError, match=said):
         explored(**(usual | given))
 
 
+def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned() -> None:
+    model, prior = learners()
+    with pytest.raises(TrajectoryError, match=r"with env tsm/Reacher-v0 and Pendulum-v1 .*; expected one robot"):
+        tsm.explore(model, prior, data(), data("Pendulum-v1"), lambda k: pytest.fail("asked for tasks"), options())
+
+
 @pytest.mark.parametrize(("changes", "said"), [
-    ({"rounds": 0}, "at least 1 round"), ({"samples": 1}, "2 samples"), ({"noise": -1}, "zero or above"),
+    ({"rounds": 0}, "at least 1 round"), ({"rounds": 1.5}, "at least 1 round"), ({"bonus": math.nan}, "zero or above"),
+    ({"samples": 1}, "2 samples"), ({"noise": -1}, "zero or above"),
     ({"held_out": 1.0}, "a share between 0 and 1"), ({"judging": -1}, "0 samples"), ({"screened": 2.0}, "from 0 to 1"),
 ])  # fmt: skip
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:

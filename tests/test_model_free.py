@@ -23,8 +23,8 @@ from tsmlib.study.runs import ROOT
 
 FOLDER = ROOT / "benchmarks" / "model_free"
 needs_sb3 = pytest.mark.skipif(
-    not all(importlib.util.find_spec(name) for name in ("stable_baselines3", "sb3_contrib")),
-    reason="Stable-Baselines3 and sb3-contrib are not installed; benchmarks/model_free/README.md tells how",
+    not all(importlib.util.find_spec(name) for name in ("stable_baselines3", "sb3_contrib", "sbx")),
+    reason="Stable-Baselines3, sb3-contrib and SBX are not installed; benchmarks/model_free/README.md tells how",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
 import signal
@@ -151,12 +152,13 @@ def test_a_table_keeps_the_lines_of_checks_that_were_not_run(tmp_path: Path, mon
     assert changed() == [f"| {number} | {what} | 3 | 4 | a / b | 5 |"]
 
 
-def test_on_a_cluster_each_kind_is_killed_as_often() -> None:
+def test_on_a_cluster_each_kind_is_killed_as_often_and_in_every_order() -> None:
     found = cluster.strikes(20)
-    assert len(found) == 60
-    assert {found.count((kind,)) for kind in ("job", "node", "controller")} == {20}
-    assert cluster.strikes(2, ["workflow"]) == [("workflow",)] * 2
-    assert cluster.strikes(0) == [cluster.KILLED]
+    kinds = ("job", "node", "controller")
+    assert {sum(kind in killed for killed, _ in found) for kind in kinds} == {20}
+    assert {killed for killed, _ in found} == set(itertools.permutations(kinds))
+    assert {after for _, after in found} == set(range(cluster.STEPS))
+    assert cluster.strikes(0) == [(cluster.KILLED, 0)]
 
 
 def test_on_a_cluster_steps_are_counted_by_the_marks_of_a_workflow(tmp_path: Path) -> None:

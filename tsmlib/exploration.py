@@ -36,7 +36,7 @@ from tsmlib.rewards import Reward, rewarded
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
-from tsmlib.training.fit import Loss, TrainingOptions, fit
+from tsmlib.training.fit import Loss, TrainingOptions, fit, require_past
 from tsmlib.trajectory import Trajectories
 
 
@@ -87,11 +87,11 @@ class ExplorationOptions:
     screened: float = 0.25
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or self.samples < 2:
+        if not isinstance(self.rounds, int) or self.rounds < 1 or self.samples < 2:
             raise ValueError(f"rounds {self.rounds}, samples {self.samples}: expected at least 1 round and 2 samples")
         if self.rms <= 0:
             raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
-        if min(self.noise, self.bonus) < 0 or not 0 < self.held_out < 1:
+        if not (0 <= self.noise < math.inf and 0 <= self.bonus < math.inf and 0 < self.held_out < 1):
             raise ValueError(
                 f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
                 "a share between 0 and 1"
@@ -144,18 +144,17 @@ def explore(
 
     Both go on being trained, in place, on all data so far. prior=None: the actions themselves are searched. tasks(k):
     those of round k = 1, 2, ..., one episode each. Given a ``folder``, a loop that was killed goes on from there with
-    the same bits; StoreError for the folder of another loop. ValueError for a model or tasks of another robot than the
-    data's, and for a bonus where the model has no samples.
+    the same bits; StoreError for the folder of another loop. ValueError for a model, a prior or tasks of another robot
+    than the data's, windows with another past than the model's, and a bonus where the model has no samples;
+    TrajectoryError for held-out data of another robot.
 
     augmented: training data -> with their symmetric copies, say; held-out data stay as they are. episodes: what is
     learned from in each round where nothing is planned, or None for what is there already; ``tasks`` are not asked.
     """
-    features = getattr(model, "features", None)
-    if isinstance(features, Features) and len(features.step_std) != train.states.shape[2]:
-        raise ValueError(
-            f"the model's states have {len(features.step_std)} dimensions, those of {train.env} "
-            f"{train.states.shape[2]}; expected a model of the robot that explores"
-        )
+    _require_robot(model, prior, train, held_out)
+    require_past(cast(nn.Module, model), options.model)
+    if prior is not None and options.prior is not None:
+        require_past(prior, options.prior)
     if options.bonus and not as_dynamics(model).stochastic:
         raise ValueError(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
@@ -196,6 +195,19 @@ def explore(
             if callback is not None:
                 callback(Progress(k, time.process_time() - began, found.records[-1]))
     return found
+
+
+def _require_robot(model: Trainable, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories) -> None:
+    """Error unless all are of one robot, as far as their sizes and names tell."""
+    train.require_robot_of(held_out)
+    features, actions = getattr(model, "features", None), train.actions.shape[2]
+    if isinstance(features, Features):
+        features.require_robot(train, "a model of the robot that explores")
+    if prior is not None and len(prior.std) != actions:
+        raise ValueError(
+            f"the prior's actions have {len(prior.std)} dimensions, those of {train.env} {actions}; expected a prior "
+            "of the robot that explores"
+        )
 
 
 def _collected(

@@ -115,9 +115,4 @@ def _require_trained(model: nn.Module, data: Trajectories) -> None:
             f"this {type(model).__name__} was never trained: it knows no statistics of its data. Load a trained one, "
             "or train it with tsmlib.fit"
         )
-    expected, found = len(features.step_std), data.states.shape[2]
-    if expected != found or features.angles != list(data.angles):
-        raise ValueError(
-            f"the model's states have {expected} dimensions with angles {features.angles}, those of {data.env} {found} "
-            f"with angles {list(data.angles)}; expected data of the same robot, changed"
-        )
+    features.require_robot(data, "data of the same robot, changed")

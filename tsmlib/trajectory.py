@@ -151,9 +151,7 @@ class Trajectories:
 
     def joined(self, other: Trajectories) -> Trajectories:
         """The episodes of both, padded to the longest; TrajectoryError where they are not of one robot."""
-        for name in ("env", "dt", "names", "units", "angles"):
-            if (ours := getattr(self, name)) != (theirs := getattr(other, name)):
-                raise TrajectoryError(f"episodes with {name} {ours} and {theirs} cannot be joined; expected one robot")
+        self.require_robot_of(other)
         both, longest = (self, other), max(self.horizon, other.horizon)
         states = [np.pad(t.states, ((0, 0), (0, longest - t.horizon), (0, 0)), mode="edge") for t in both]
         actions = [np.pad(t.actions, ((0, 0), (0, longest - t.horizon), (0, 0))) for t in both]
@@ -162,6 +160,12 @@ class Trajectories:
             self, states=np.concatenate(states), actions=np.concatenate(actions), terminated=ended[0] + ended[1],
             lengths=tuple(np.concatenate([t.steps for t in both]).tolist()),
         )  # fmt: skip
+
+    def require_robot_of(self, other: Trajectories) -> None:
+        """TrajectoryError where the episodes of both are not of one robot."""
+        for name in ("env", "dt", "names", "units", "angles"):
+            if (ours := getattr(self, name)) != (theirs := getattr(other, name)):
+                raise TrajectoryError(f"episodes with {name} {ours} and {theirs} cannot be joined; expected one robot")
 
     def cut(self, steps: int) -> Trajectories:
         """The first ``steps`` steps of every episode that has as many; TrajectoryError where none has."""

@@ -180,18 +180,19 @@ def vectorised(episodes: Episodes) -> Any:
 def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
     """The library's algorithm with a configuration of the search; what is not named here is the library's default."""
     from sb3_contrib import TRPO
-    from stable_baselines3 import PPO, SAC
+    from sbx import SAC
+    from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
     special = {name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")}
-    network: dict[str, Any] = dict(net_arch=[64, 64], activation_fn=torch.nn.ReLU)
+    network: dict[str, Any] = dict(net_arch=[64, 64])
     arms = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
     if algorithm == "sac":
-        return SAC(
+        return SAC(  # ReLU is its default
             "MlpPolicy", VecNormalize(arms, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
             gradient_steps=max(1, round(setting["updates"] * setting["episodes"])), **special,
         )  # fmt: skip
-    network["log_std_init"] = math.log(setting["std"])
+    network |= dict(activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
         "MlpPolicy", VecNormalize(arms, gamma=GAMMA), n_steps=horizon(env), batch_size=MINIBATCH, gamma=GAMMA,
         policy_kwargs=network, seed=seed, device="cpu", **special,

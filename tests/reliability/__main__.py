@@ -2,8 +2,7 @@
 
 The line of each check is kept in ``runs/reliability``, and the table of docs/reliability.md is written from these; a
 line that was not measured here stays as it is. So the parts may be run one after another. Ends with status 1 where a
-trial went wrong. The part ``table`` runs nothing. A part may also be one check, and ``check=10`` is ten trials of it
-(of ``killed_on_a_cluster`` ten of each kind).
+trial went wrong. The part ``table`` runs nothing. A part may also be one check, and ``check=10`` is ten trials of it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """R1, R14 on a cluster: a Slurm of two nodes on this machine, in which jobs, nodes and controllers are killed.
 
-Needs the packages slurm-wlm and munge of Debian, root, and the extra ``cluster``. All lies in one temporary folder and
+Needs the packages slurm-wlm and munge of Debian, root, and the extra ``cluster``. All lies in temporary folders and
 listens on 127.0.0.1 alone; neither systemd nor cgroups are used. Two nodes are two slurmd, so what is not tried: a
 second machine, a network file system, accounting (slurmdbd), limits of memory.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import os
 import shutil
 import socket
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,13 +28,15 @@ from reliability.pipelines import numbers
 from reliability.world import Outcome, folder
 from tsmlib.study.runs import ROOT
 
-PORT = 16817  # of the controller; those of the nodes follow
+PORT = 16817  # of the first controller; those of its nodes follow
+CLUSTERS = 3  # side by side in the long form: most of a trial is spent waiting
 NODES = ("n1", "n2")
 SEEDS = "0,2"
 KILLED = ("job", "node", "controller", "workflow")
 IN_TURN = ("job", "node", "controller")
-STEPS = 9  # of the workflow's ten those after which one always runs
-CONFIGURATION = """ClusterName=test
+STEPS = 7  # of the workflow's ten: after none, one, ... six of them enough are left for three kills
+CONFIGURATION = """ClusterName=test{number}
+FirstJobId={first}
 SlurmctldHost={host}(127.0.0.1)
 SlurmUser=root
 SlurmdUser=root
@@ -88,9 +92,10 @@ def missing() -> str:
 
 @dataclass(frozen=True)
 class Slurm:
-    """A controller and two nodes in a folder."""
+    """A controller and two nodes in a folder. Clusters of different numbers share no port and no number of a job."""
 
     place: Path
+    number: int = 0
 
     @property
     def environment(self) -> dict[str, str]:
@@ -105,16 +110,20 @@ class Slurm:
     def start(self) -> None:
         for name in ("state", "log", "munge", "bin", *(f"spool-{node}" for node in NODES)):
             (self.place / name).mkdir(parents=True, exist_ok=True)
+        port = PORT + self.number * (1 + len(NODES))
         key, srun = self.place / "munge" / "key", self.place / "bin" / "srun"
         key.write_bytes(os.urandom(1024))
         key.chmod(0o600)
         (self.place / "munge").chmod(0o711)
         memory = psutil.virtual_memory().total // 2**21 - 512
         nodes = [
-            f"NodeName={node} NodeHostname={socket.gethostname()} NodeAddr=127.0.0.1 Port={PORT + 1 + i} CPUs=1 "
+            f"NodeName={node} NodeHostname={socket.gethostname()} NodeAddr=127.0.0.1 Port={port + 1 + i} CPUs=1 "
             f"RealMemory={memory} State=UNKNOWN" for i, node in enumerate(NODES)
         ]  # fmt: skip
-        conf = CONFIGURATION.format(host=socket.gethostname(), place=self.place, port=PORT, nodes="\n".join(nodes))
+        conf = CONFIGURATION.format(
+            number=self.number, first=1 + 100_000 * self.number, host=socket.gethostname(), place=self.place, port=port,
+            nodes="\n".join(nodes),
+        )  # fmt: skip
         (self.place / "slurm.conf").write_text(conf)
         srun.write_text(f'#!/bin/sh\nSLURM_CONF={self.place}/slurm.conf exec {shutil.which("srun")} "$@"\n')
         srun.chmod(0o755)
@@ -136,10 +145,10 @@ class Slurm:
         """Of slurmctld, slurmd-n1 or munge/pid."""
         return int((self.place / name).read_text())
 
-    def running(self) -> list[tuple[str, str]]:
-        """Job and node of those jobs whose step of tsmlib has begun."""
+    def running(self) -> list[tuple[str, str, psutil.Process]]:
+        """Job, node and process of those jobs whose step of tsmlib has begun."""
         jobs = [line.split() for line in self.command("squeue", "-h", "-t", "R", "-o", "%A %N").splitlines()]
-        return [(job, node) for job, node in jobs if any("step" in p.cmdline() for p in self.processes(job))]
+        return [(job, node, process) for job, node in jobs for process in self.processes(job) if is_step(process)]
 
     def processes(self, job: str) -> list[psutil.Process]:
         """Of a job: its steps' daemons, and all that they started."""
@@ -157,8 +166,9 @@ class Slurm:
             for process in self.processes(job):
                 kill(process)
         for process in psutil.Process().children():  # a workflow, where a trial went wrong
-            if "tsmlib" in process.cmdline():
-                kill(process)
+            with contextlib.suppress(psutil.Error):
+                if process.environ().get("SLURM_CONF") == self.environment["SLURM_CONF"]:
+                    kill(process)
         for name in (*(f"slurmd-{node}.pid" for node in NODES), "slurmctld.pid", "munge/pid"):
             with contextlib.suppress(OSError, ValueError, psutil.Error):
                 daemon = psutil.Process(self.pid(name))
@@ -167,9 +177,9 @@ class Slurm:
 
 
 @contextlib.contextmanager
-def slurm() -> Iterator[Slurm]:
+def slurm(number: int = 0) -> Iterator[Slurm]:
     with folder() as place:
-        cluster = Slurm(place)
+        cluster = Slurm(place, number)
         try:
             cluster.start()
             yield cluster
@@ -177,9 +187,19 @@ def slurm() -> Iterator[Slurm]:
             cluster.stop()
 
 
-def kill(process: psutil.Process) -> None:
+def kill(process: psutil.Process) -> bool:
+    """Whether it was there to be killed."""
     with contextlib.suppress(psutil.Error):
         process.kill()
+        return True
+    return False
+
+
+def is_step(process: psutil.Process) -> bool:
+    """Whether it is what makes a part of a run, and not the shells and daemons around it."""
+    with contextlib.suppress(psutil.Error):
+        return "step" in process.cmdline()
+    return False
 
 
 def wait_for(condition: object, seconds: float = 900) -> None:
@@ -225,19 +245,17 @@ def steps_done(place: Path) -> int:
 def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Path, *, after: int = 0) -> None:
     """Kill a job's process, a node with all it runs, the controller, or the workflow, while a job runs and at least
     so many steps are done."""
-    running = list[tuple[str, str]]()
+    running = list[tuple[str, str, psutil.Process]]()
 
     def ready() -> bool:
         running[:] = cluster.running() if steps_done(place) >= after else []
-        return bool(running)
+        return bool(running) and (how != "job" or kill(running[0][2]))  # it may have ended just now
 
     wait_for(lambda: ready() or process.poll() is not None)
     if not running:
         raise RuntimeError(f"the workflow ended with {steps_done(place)} steps, before a {how} was killed")
-    job, node = running[0]
-    if how == "job":
-        kill(next(p for p in cluster.processes(job) if "step" in p.cmdline()))
-    elif how == "node":
+    job, node, _ = running[0]
+    if how == "node":
         kill(psutil.Process(cluster.pid(f"slurmd-{node}.pid")))
         for each in cluster.processes(job):
             kill(each)
@@ -247,50 +265,63 @@ def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Pa
         kill(psutil.Process(cluster.pid("slurmctld.pid")))
         time.sleep(10)
         cluster.start_controller()
-    else:
+    elif how == "workflow":
         process.kill()
 
 
-def killed_on_a_cluster(each: int, kinds: Sequence[str] = IN_TURN) -> Outcome:
+def killed_on_a_cluster(each: int) -> Outcome:
     """R1, R14: jobs, nodes and controllers of a Slurm of two nodes killed, two seeds at smoke: the tables of the pool.
 
-    Each of ``kinds`` is killed in ``each`` runs of the workflow, one in a run, after none of its steps, one, ... in
-    turn; for 0 all of KILLED in one run, one after another.
+    ``each`` runs of the workflow, on CLUSTERS at once, in each of which a job, a node and the controller are killed
+    (``strikes``); for 0 one run, in which the workflow is killed too.
     """
     if lacking := missing():
         return Outcome(note=f"{lacking}: not done")
-    found = Outcome()
-    quick = ["--slurm-init-seconds-before-status-checks", "2", "--seconds-between-status-checks", "2"]
-    with folder() as place, slurm() as cluster:
+    clusters = CLUSTERS if each else 1
+    found, trials = Outcome(), iter(list(enumerate(strikes(each))))  # shared: the next goes to whoever is free
+    with folder() as place, ThreadPoolExecutor(clusters) as pool:
         assert workflow(place / "local", "--executor", "pool").wait(1800) == 0, (place / "local" / "log").read_text()
-        expected = made(place / "local")
-        for trial, killed in enumerate(strikes(each, kinds)):
-            there = place / f"trial{trial}"
-            options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
-            process = workflow(there, *options, environment=cluster.environment)
-            after = trial // len(kinds) % STEPS if each else 0
-            try:
-                for how in killed:
-                    strike(cluster, how, process, there, after=after)
-                    if how == "workflow":
-                        process.wait()
-                        process = workflow(there, *options, environment=cluster.environment)
-            except Exception as error:
-                process.kill()
-                process.wait()
-                cluster.command("scancel", "--user", "root")
-                found.count(False, f"{', '.join(killed)} after {after} steps: {error!r}")
-                continue
-            code, same = process.wait(1800), made(there) == expected
-            said = f"{', '.join(killed)} after {after} steps: exit {code}, same tables {same}"
-            told = (there / "log").read_text()
-            found.count(code == 0 and same, f"{said}: {told[-800:]}")
-            print(said, flush=True)
-    often = f"{each} times each" if each else "once each, in one run"
-    found.note = f"{', '.join(kinds if each else KILLED)} killed {often}; seeds {SEEDS}"
+
+        def of_one(number: int) -> Outcome:
+            mine = Outcome()
+            with slurm(number) as cluster:
+                for trial, (killed, after) in trials:
+                    mine.add(tried(cluster, killed, place / f"trial{trial}", made(place / "local"), after=after))
+            return mine
+
+        for outcome in pool.map(of_one, range(clusters)):
+            found.add(outcome)
+    kills = sum(len(killed) for killed, _ in strikes(each))
+    found.note = f"{kills} kills: in each run {', '.join(IN_TURN if each else KILLED)}, in turn; seeds {SEEDS}"
     return found
 
 
-def strikes(each: int, kinds: Sequence[str] = IN_TURN) -> list[tuple[str, ...]]:
-    """What is killed in each run of ``killed_on_a_cluster``."""
-    return [(kind,) for _ in range(each) for kind in kinds] or [KILLED]
+def tried(cluster: Slurm, killed: Sequence[str], place: Path, expected: object, *, after: int) -> Outcome:
+    """One run of the workflow in a folder, during which these are killed: whether it makes what is expected."""
+    quick = ["--slurm-init-seconds-before-status-checks", "2", "--seconds-between-status-checks", "2"]
+    options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
+    found, said = Outcome(), f"{', '.join(killed)} after {after} steps"
+    process = workflow(place, *options, environment=cluster.environment)
+    try:
+        for how in killed:
+            strike(cluster, how, process, place, after=after)
+            if how == "workflow":
+                process.wait()
+                process = workflow(place, *options, environment=cluster.environment)
+    except Exception as error:
+        process.kill()
+        process.wait()
+        cluster.command("scancel", "--user", "root")
+        found.count(False, f"{said}: {error!r}")
+    else:
+        code, same = process.wait(1800), made(place) == expected
+        said = f"{said}: exit {code}, same tables {same}"
+        found.count(code == 0 and same, f"{said}: {(place / 'log').read_text()[-800:]}")
+    print(said, flush=True)
+    return found
+
+
+def strikes(each: int) -> list[tuple[tuple[str, ...], int]]:
+    """What is killed in each run of ``killed_on_a_cluster``, in every order, and after how many steps the first."""
+    orders = itertools.cycle(itertools.permutations(IN_TURN))
+    return [(next(orders), i % STEPS) for i in range(each)] or [(KILLED, 0)]

@@ -50,6 +50,15 @@ class Features(nn.Module):
         self.step_std.copy_(torch.where(step_std > 1e-3 * step_rms, step_std, step_rms))  # a clock's steps are alike
         return self
 
+    def require_robot(self, data: Trajectories, expected: str) -> None:
+        """ValueError where the states of ``data`` have other dimensions or angles. expected: ends the message."""
+        states = data.states.shape[2]
+        if len(self.step_std) != states or self.angles != list(data.angles):
+            raise ValueError(
+                f"the model's states have {len(self.step_std)} dimensions with angles {self.angles}, those of "
+                f"{data.env} {states} with angles {list(data.angles)}; expected {expected}"
+            )
+
     @property
     def fitted(self) -> bool:
         """Whether there are statistics: data in which nothing moves have none. What is settled has them."""

@@ -74,6 +74,15 @@ class TrainingOptions:
             raise ValueError(f"span {self.span}: expected two numbers from 0 to 1, the first below the second")
 
 
+def require_past(model: nn.Module, options: TrainingOptions) -> None:
+    """ValueError where the windows have another past than ``model.past_len``."""
+    if (needed := getattr(model, "past_len", options.past_len)) != options.past_len:
+        raise ValueError(
+            f"past_len is {options.past_len}, but {type(model).__name__} is given {needed} steps of past in a rollout; "
+            "take TrainingOptions(past_len=model.past_len, ...)"
+        )
+
+
 @dataclass
 class TrainingHistory(Curve):
     """Record of a ``fit`` at each validation: optimiser step, training loss since the last one, validation loss.
@@ -109,11 +118,7 @@ def fit(
     A model of states whose features have no statistics yet takes those of ``train`` first. Parameters with
     ``requires_grad`` False stay as they are. ValueError where the windows have another past than ``model.past_len``.
     """
-    if (needed := getattr(model, "past_len", options.past_len)) != options.past_len:
-        raise ValueError(
-            f"past_len is {options.past_len}, but {type(model).__name__} is given {needed} steps of past in a rollout; "
-            "take TrainingOptions(past_len=model.past_len, ...)"
-        )
+    require_past(model, options)
     features = getattr(model, "features", None)
     if isinstance(features, Statistics) and not features.fitted:
         features.fit(torch.from_numpy(train.states), train.lengths)
