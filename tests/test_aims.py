@@ -38,6 +38,36 @@ def test_nothing_is_reached_by_what_was_not_measured() -> None:
     assert set(found["measured"]) == {"not measured"}
 
 
+def test_of_exploration_nothing_is_reached_without_rows_either() -> None:
+    none = tables.frame([])
+    found = aims.of_exploration(none, none)
+    assert not found["reached"].any()
+    assert set(found["measured"]) == {"not measured"}
+
+
+def test_aims_of_exploration_are_held_against_the_lower_end_of_an_interval_over_seeds() -> None:
+    row = dict(env=PUSH, execution="closed loop", planner="cem", model=OURS, scale="paper", n=1, subset="")
+    gained = {("own plans", 0): 0.1, ("own plans", 1): 0.5, ("no new episodes", 0): 0.1, ("no new episodes", 1): 0.1}
+    rows = [
+        row | dict(metric="success", configuration=data, iteration=k, env_steps=100 * k, seed=seed, value=value + more)
+        for (data, k), value in gained.items() for seed, more in ((0, 0.0), (1, 0.2 * k * (data == "own plans")))
+    ]  # fmt: skip
+    rows += [
+        row | dict(metric="return_true", configuration="own plans", iteration=k, env_steps=300 + 300 * k, seed=0,
+                   value=-k)
+        for k in (0, 1)
+    ]  # fmt: skip
+    free = tables.frame([
+        dict(env=PUSH, model=model, planner="policy", execution="policy", metric="return_true", env_steps=1000, seed=0,
+             value=end, subset="", scale="paper", n=1)
+        for model, end in (("ppo", 0.0), ("sac", 5.0))
+    ])  # fmt: skip
+    found = aims.of_exploration(tables.frame(rows), free)["measured"].tolist()
+    mean, half = aims.interval([40.0, 60.0])
+    assert found[:2] == [f"{mean - half:.1f}"] * 2
+    assert found[2:5] == ["30.0%", "not measured", "inf%"]
+
+
 def test_what_is_said_of_gaps_is_of_their_means_over_seeds_target_by_target() -> None:
     row = dict(env=PUSH, planner="cem", search_space="latent", execution="open loop", scale="paper", n=1)
     sizes = {OURS: [1.0, *[0.0] * 9], "lstm": [1.0] * 10}

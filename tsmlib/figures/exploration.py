@@ -19,6 +19,8 @@ from tsmlib.figures.style import DARK, GRID, WIDTH, entry, panels, styled, tint
 
 Rounds = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> method -> steps (R,), values (k, R)
 
+DENSE = 12  # marks of a line
+
 
 @styled
 def rounds(
@@ -30,37 +32,49 @@ def rounds(
     curves: title -> method -> environment steps (R,) and values (k, R); ylabel: one for all, or title -> text; yours:
     as curves, drawn over them as hollow diamonds; lowest: title -> where an axis ends, so that what falls below it does
     not squeeze the others (arrows and words say how far), unless most does. A line begins before the first round; a
-    method of one round is a large pale mark. Marks of methods at the same steps stand a little beside each other, so
-    that their bars part.
+    method of one round is a large pale mark, one of more than DENSE a line without marks, its bar at its end. Marks of
+    methods at the same steps stand a little beside each other, so that their bars part. Steps are on a logarithmic axis
+    where they span a factor of ten. Bars of what is never negative end at zero.
     """
     own, every = yours or {}, {title: {**(yours or {}).get(title, {}), **rows} for title, rows in curves.items()}
     look_of, ylabels = axes.looks(curves, own), per_panel("ylabel", ylabel, curves)
     for method in {method for rows in every.values() for method, (at, _) in rows.items() if len(at) == 1}:
         look_of[method] |= {"ls": "", "ms": 6.5, "mfc": tint(method.look.colour, 0.6)}
+    for method in {method for rows in every.values() for method, (at, _) in rows.items() if len(at) > DENSE}:
+        look_of[method] |= {"marker": ""}
     width = WIDTH if len(curves) > 1 else 3.8
     figure, grid = panels(len(curves), len(curves), 2.0, width=width, head=0)
-    barred, far = False, max(float(at.max()) for rows in every.values() for at, _ in rows.values())
+    barred, steps = False, np.concatenate([at for rows in every.values() for at, _ in rows.values()])
+    far, near = float(steps.max()), float(steps.min())
+    log = 0 < near < far / 10
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
         values = np.concatenate([np.ravel(found) for _, found in every[title].values()])
         low, high = axes.limits(values, values)
         floor = (lowest or {}).get(title, low)
-        ax.set_ylim(max(low, floor) if np.median(values) > floor else low, high)
+        low = max(low, floor) if np.median(values) > floor else low
+        ax.set_ylim(0 if values.min() >= 0 and low < high / 5 else low, high)
         notes = []
         for method, given in rows.items():
             at, found = _checked(f"{title}, {method.label}", *given)
             mean, half = axes.band(found)
-            beside = at + 0.012 * far * ([*look_of].index(method) - (len(look_of) - 1) / 2)
-            axes.bars(ax, beside, mean, half, method.look.colour)
-            ax.plot(
-                beside, mean, **look_of[method] | {"ms": 4.5 if len(at) > 1 else 6.5}, zorder=3 if len(at) > 1 else 4
-            )
+            dense, aside = len(at) > DENSE, [*look_of].index(method) - (len(look_of) - 1) / 2
+            beside = at if dense else at * 1.02**aside if log else at + 0.012 * far * aside
+            barred_at = slice(-1, None) if dense else slice(None)
+            below = np.maximum(mean - half, 0) if values.min() >= 0 else mean - half
+            axes.bars(ax, beside[barred_at], *_centred(below, mean + half)[:, barred_at], method.look.colour)
+            size = {"ms": 4.5 if len(at) > 1 else 6.5}
+            ax.plot(beside, mean, **look_of[method] | size, zorder=3 if len(at) > 1 else 4)
             notes += axes.outside(ax, beside, mean, method)
             barred |= bool(half.any())
         for method, given in own.get(title, {}).items():
             at, found = _checked(f"{title}, {method.label}, yours", *given)
             notes += axes.diamonds(ax, "y", at, found.mean(0), method)
-        ax.set_xlim(0, 1.05 * far)
-        ax.locator_params(axis="x", nbins=5)
+        if log:
+            axes.log_axis(ax, near, far, "x")
+            ax.set_xlim(near / 1.25, far * 1.25)
+        else:
+            ax.set_xlim(0, 1.05 * far)
+            ax.locator_params(axis="x", nbins=5)
         ax.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: f"{steps:,.0f}"))
         ax.grid(axis="y", color=GRID, lw=0.6)
         ax.set(title=title, ylabel=ylabels[title])
@@ -107,6 +121,11 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
     bars = [_bar()] * any(len(found) > 1 for found in every)
     handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
     return axes.finish(figure, [grid], handles, 4)
+
+
+def _centred(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Middles and half lengths (2, R) of intervals."""
+    return np.stack([(low + high) / 2, (high - low) / 2])
 
 
 def _bar() -> Line2D:

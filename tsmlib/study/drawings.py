@@ -169,16 +169,21 @@ def advantage_map(
 # 10_explore ----------------------------------------------------------------------------------------------------------
 
 
-def rounds(found: pd.DataFrame, env: str, titles: Sequence[str]) -> Iterator[Drawing]:
-    """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles."""
+def rounds(found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFrame | None = None) -> Iterator[Drawing]:
+    """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles. free:
+    learning curves of policies without a model, beside."""
     task, units = exploration.TASKS[env].capitalize(), exploration.UNITS[env]
     rows = table.select(found, execution=planning.CLOSED, env=env)
     curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env, alone=True))
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
+        policies = {} if free is None else exploration.policy_panels(free, titles, env)
+        fell = [{title: float(values.mean(0).min())} for title, part in policies.items() for _, values in part.values()]
+        curves = {title: part | policies.get(title, {}) for title, part in curves.items()}
         panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
         ylabels = {f"{task}: {title}": units[title] for title in curves}
-        lowest = {f"{task}: {title}": low for title, low in exploration.axis_ends(table.drawn(rows), env).items()}
+        ends = exploration.axis_ends(table.drawn(rows), env, fell)
+        lowest = {f"{task}: {title}": low for title, low in ends.items()}
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest), stem, rows)
 
 

@@ -402,7 +402,7 @@ Written from the rows that `python -m tsmlib run explore --scale paper` or `pyth
 benchmarks/settings/rows.py` made, seeds {seeds}. Plans of the pendulum are made anew every
 {every} steps, from n starts that no round trains on; steps count the random episodes before the
 first round.
-
+{_exploration_aims(rows, free)}
 ![Executed return and gap of the pendulum against environment steps](../figures/10_rounds.png)
 
 {exploration_results.rounds_table(rows)}
@@ -418,6 +418,16 @@ Seeds are of the few episodes and of the updates on them: all begin from one mod
 {_recovered(rows)}
 {exploration_results.sentences(rows)}
 {adaptation_results.sentences(rows)}"""
+
+
+def _exploration_aims(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
+    """The part of that page on what was aimed at."""
+    found = aims_results.of_exploration(rows, tables_storage.frame([]) if free is None else free)
+    return f"""
+What was aimed at before these rows were there; "not measured" has not been run, for want of hours:
+
+{table.markdown(found)}
+"""
 
 
 def _recovered(rows: pd.DataFrame) -> str:
@@ -442,7 +452,8 @@ same training on the first random episodes alone:
 
 ![Executed return and share within 5 cm of the arm that pushes against environment steps](../figures/10_pushing.png)
 
-Axes end a little below round 0; what training alone ends with is a pale mark at the steps of the first round.
+Steps are on a logarithmic axis. Axes end a little below the lowest of round 0 and of the policies; what training alone
+ends with is a pale mark at the steps of the first round.
 
 {found}
 """

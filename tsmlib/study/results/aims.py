@@ -1,4 +1,4 @@
-"""Aims of the study's own model and of the pushing task beside what the published rows say.
+"""Aims of the study's own model, of the pushing task and of exploration beside what the published rows say.
 
 They are ours, not the paper's, and were set before these rows were there. Each is held against the other model that is
 hardest to be ahead of, which is named.
@@ -17,11 +17,12 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.figures.method import Method
 from tsmlib.statistics import interval, random_effects
 from tsmlib.study import zoo
-from tsmlib.study.results import planning, policies, prediction, table
+from tsmlib.study.results import adaptation, exploration, planning, policies, prediction, table
 from tsmlib.study.results.planning import BASELINES, CLOSED, ORACLE, PUSH, REACH
 from tsmlib.study.zoo import OURS
 
 OBSTACLE = "tsm/ReacherObstacle-v0"
+WEAK, FEW = "tsm/Reacher-gain0.7-v0", 2000  # steps: 20 episodes
 ENERGY = "energy_score_noise"
 Line = tuple[str, str, float, float, str]  # of table.thresholds
 
@@ -40,6 +41,15 @@ def aims(predict: pd.DataFrame, plans: pd.DataFrame, targets: pd.DataFrame, lear
     without a model included. Means over training seeds; ratios and differences paired by seed, or by target.
     """
     return table.thresholds([*_of_plans(plans, targets), *_of_predictions(predict), *_of_policies(learned)])
+
+
+def of_exploration(rows: pd.DataFrame, free: pd.DataFrame) -> pd.DataFrame:
+    """Aims of 10_explore, as ``aims``: rows of it, and learning curves of model-free policies.
+
+    Of differences, paired by seed, the lower end of the 95 % interval over training seeds is held against an aim.
+    """
+    rows = rows if "configuration" in rows else rows.assign(configuration="")  # of other notebooks, or none
+    return table.thresholds([*_of_rounds(rows, free), *_of_adaptation(rows)])
 
 
 def missed(found: pd.DataFrame) -> str:
@@ -148,6 +158,72 @@ def _of_policies(learned: pd.DataFrame) -> list[Line]:
         for others in (inside, free)
         for worst in [_worst({zoo.look(model).name: end - ours for model, end in others.items()})]
     ]  # fmt: skip
+
+
+def _of_rounds(rows: pd.DataFrame, free: pd.DataFrame) -> list[Line]:
+    closed = table.select(rows, execution=CLOSED, configuration=exploration.PLANNED)
+    pushing = table.select(rows, env=PUSH, execution=CLOSED, model=OURS)
+    last = int(pushing["iteration"].max()) if len(pushing) else 0
+    before, alone = "round 0", exploration.NONE
+    won = table.select(pushing, metric="success")
+    gained = 100 * exploration.paired(won, last) if last else pd.DataFrame(columns=[before, alone], dtype=float)
+    lines: list[Line] = [
+        (f"points of success, pushing by `{OURS}`, after {last} rounds of own plans minus {what}, lower end",
+         "at least", 10.0, _lower(gained[what]), "{:.1f}")
+        for what in (before, alone)
+    ]  # fmt: skip
+    for policy in exploration.MODEL_FREE:
+        share = exploration.steps_share(closed, table.select(free, model=policy), PUSH, OURS)
+        lines.append((f"steps of `{OURS}` to what {zoo.look(policy).name} returns at its end, pushing, over its own",
+                      "at most", 0.1, share, "{:.1%}"))  # fmt: skip
+    for env, where in ((exploration.PENDULUM, "swinging up"), (PUSH, "pushing")):
+        ends = table.select(closed, env=env, metric="return_true", model=[OURS, "pets"])
+        wide = ends[ends["iteration"] == ends["iteration"].max()].pivot(index="seed", columns="model", values="value")
+        ahead = wide.get(OURS, pd.Series(dtype=float)) - wide.get("pets", pd.Series(dtype=float))
+        lines.append((f"return of `{OURS}` minus that of mbrl-lib's PETS after as many steps, {where}, lower end",
+                      "at least", 0.0, _lower(ahead), "{:.2f}"))  # fmt: skip
+    seconds = table.select(closed, env=PUSH, model=OURS, metric="wall_seconds")["value"]
+    return [
+        *lines,
+        ("iterations of a search in codes of the last prior over those in codes of the first, to the return that the "
+         "latter ends with; inf: not within ten", "at most", 0.5, _iterations(rows), "{:.2f}"),
+        (f"minutes of the longest round of pushing by `{OURS}`", "at most", 10.0, float(seconds.max()) / 60, "{:.1f}"),
+    ]  # fmt: skip
+
+
+def _iterations(rows: pd.DataFrame) -> float:
+    own = table.select(rows, env=PUSH, model=OURS, configuration=exploration.PLANNED, execution=planning.OPEN,
+                       metric="iterations_to_same_return")  # fmt: skip
+    wide = own.pivot(index="seed", columns="subset", values="value")
+    if exploration.FIRST_PRIOR not in wide:
+        return float("nan")
+    first, last = wide[exploration.FIRST_PRIOR], wide.get(exploration.LAST_PRIOR, pd.Series(index=wide.index))
+    return float((last.fillna(np.inf).astype(float) / first).mean())
+
+
+def _of_adaptation(rows: pd.DataFrame) -> list[Line]:
+    here = table.select(rows, env=WEAK, execution=planning.OPEN, planner="none", metric=ENERGY)
+    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
+    shares = dict[str, pd.Series]()
+    for word, own in table.groups(here, "model"):
+        found = adaptation.recovered(own)
+        if ("all", FEW) in found:
+            shares[word] = 100 * found["all", FEW]
+    none = pd.Series(dtype=float)
+    ours = shares.pop(OURS, none)
+    return [
+        (f"percent of its loss on a weak arm that `{OURS}` recovers from 20 episodes, all weights", "at least", 70.0,
+         float(ours.mean()), "{:.1f}"),
+        *((f"those minus those of `{word}` (points), lower end", "at least", 0.0, _lower(ours - shares.get(word, none)),
+           "{:.1f}") for word in ("lstm", "ensemble+mse")),
+    ]  # fmt: skip
+
+
+def _lower(values: pd.Series) -> float:
+    """The lower end of the 95 % interval of a mean; NaN of fewer than two values."""
+    known = values.dropna().to_numpy(float)
+    mean, half = interval(known) if len(known) > 1 else (float("nan"), 0.0)
+    return mean - half
 
 
 def _worst(found: Mapping[str, float]) -> Worst:

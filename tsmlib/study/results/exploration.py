@@ -128,7 +128,8 @@ def round_panels(
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM, NONE][: 2 + alone])
     for metric, title in ROUNDS[env].items():
-        for (word, data), own in table.groups(table.select(rounds, metric=metric), ["model", "configuration"]):
+        learners = table.groups(table.select(rounds, metric=metric), ["model", "configuration"])
+        for (word, data), own in sorted(learners, key=lambda of: (of[0][0], DATA.index(of[0][1]))):
             if title in titles:
                 wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
                 if wide.empty:
@@ -141,8 +142,23 @@ def round_panels(
     return found
 
 
-def axis_ends(rows: pd.DataFrame, env: str) -> dict[str, float]:
-    """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest 95 % interval of round 0."""
+def policy_panels(
+    free: pd.DataFrame, titles: Sequence[str], env: str
+) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
+    """Title of ROUNDS -> model-free learner -> environment steps (R,) and values (k, R), as ``round_panels``, from
+    learning curves of ``benchmarks/model_free``, without what was measured before learning."""
+    found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
+    for metric, title in ROUNDS[env].items():
+        own = table.select(free, env=env, planner="policy", subset="", metric=metric, model=MODEL_FREE)
+        for word, part in table.groups(own[own["env_steps"] > 0], "model") if title in titles else ():
+            wide = part.pivot(index="seed", columns="env_steps", values="value").dropna(axis=1)
+            found.setdefault(title, {})[zoo.method(word)] = wide.columns.to_numpy(float), wide.to_numpy(float)
+    return found
+
+
+def axis_ends(rows: pd.DataFrame, env: str, fell: Sequence[Mapping[str, float]] = ()) -> dict[str, float]:
+    """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest 95 % interval of round 0, and
+    below the lowest of policies without a model, ``fell``: of each title -> value."""
     ends = {}
     closed = table.select(rows, env=env, execution=CLOSED)
     for metric in ("return_true", "success"):
@@ -150,6 +166,7 @@ def axis_ends(rows: pd.DataFrame, env: str) -> dict[str, float]:
         before = [part["value"] for _, part in table.groups(table.select(found, iteration=0), learner)]
         if (title := ROUNDS[env][metric]) in DRAWN[env] and before:
             low = min(mean - half for mean, half in map(interval, before))
+            low = min([low, *(each[title] for each in fell if title in each)])
             ends[title] = low - 0.1 * abs(low)
     return ends
 
@@ -281,6 +298,19 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
     return table.markdown(pd.DataFrame(lines))
+
+
+def steps_share(rows: pd.DataFrame, free: pd.DataFrame, env: str, word: str) -> float:
+    """The share of a policy's environment steps after which rounds of a learner return as much as it at its end, means
+    over seeds: NaN without rows of both, inf where they never do."""
+    learned = table.select(free, env=env, planner="policy", subset="", metric="return_true")
+    rounds = table.select(rows, env=env, model=word, configuration=PLANNED, execution=CLOSED, metric="return_true")
+    if not (len(learned) and len(rounds)):
+        return math.nan
+    curve = learned.groupby("env_steps")["value"].mean()
+    own = rounds.groupby("iteration")[["env_steps", "value"]].mean()
+    k = _first(own["value"], curve.iloc[-1])
+    return math.inf if k is None else float(own["env_steps"][k]) / float(curve.index[-1])
 
 
 def _first(curve: pd.Series, level: float) -> float | None:
