@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import os
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,6 +24,7 @@ from tsmlib.study import needed, parameters, runs, workflow, zoo
 from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.policies import Budget
+from tsmlib.study.remote_jobs import ask_again
 from tsmlib.study.runs import RunError
 
 HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
@@ -322,6 +326,40 @@ def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
     again = cluster.workflow(place / "local", "--executor", "local")
     assert again.wait(600) == 0
     assert "Nothing to be done" in (place / "local" / "log").read_text()
+
+
+def test_jobs_of_which_a_check_says_nothing_are_asked_of_again() -> None:
+    class Executor:
+        """Of four jobs one succeeds, one fails, one runs; of the last nothing is known."""
+
+        def __init__(self) -> None:
+            self.reported = list[str]()
+
+        def report_job_success(self, job: SimpleNamespace) -> None:
+            self.reported.append(f"{job.external_jobid} succeeded")
+
+        def report_job_error(self, job: SimpleNamespace, msg: str) -> None:
+            self.reported.append(f"{job.external_jobid} {msg}")
+
+        async def check_active_jobs(self, jobs: list[SimpleNamespace]) -> AsyncIterator[SimpleNamespace]:
+            for job in jobs:
+                if job.external_jobid == "1":
+                    self.report_job_success(job)
+                elif job.external_jobid == "2":
+                    self.report_job_error(job, msg="failed")
+                elif job.external_jobid == "3":
+                    yield job
+
+    async def left(jobs: list[SimpleNamespace]) -> list[str]:
+        return [job.external_jobid async for job in executor.check_active_jobs(jobs)]
+
+    jobs = [SimpleNamespace(external_jobid=str(i)) for i in range(1, 5)]
+    executor = Executor()
+    assert asyncio.run(left(jobs)) == ["3"]
+    ask_again(Executor)
+    executor.reported.clear()
+    assert asyncio.run(left(jobs)) == ["3", "4"]
+    assert executor.reported == ["1 succeeded", "2 failed"]
 
 
 @pytest.mark.skipif(bool(cluster.missing()), reason=f"{cluster.missing()}: apt-get install slurm-wlm munge, as root")

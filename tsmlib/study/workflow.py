@@ -9,6 +9,7 @@ of each step, markers of those that are done, and the versions of the code that 
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import os
@@ -35,6 +36,7 @@ from tsmlib.study.needed import needs
 from tsmlib.study.notebooks import Execution, terminable
 from tsmlib.study.parallel import cores, precompute
 from tsmlib.study.parameters import ParameterError
+from tsmlib.study.remote_jobs import ask_again
 from tsmlib.study.runs import NOTEBOOKS, Notebook, Run, RunError
 
 SNAKEFILE = Path(__file__).with_name("Snakefile")
@@ -372,6 +374,8 @@ def _snakemake(
         options += ["--cores", str(jobs or cores()), "--resources", f"mem_mb={memory}"]
     else:
         options += ["--executor", executor, "--jobs", str(jobs or 100), "--latency-wait", "60"]
+        if executor == "slurm":
+            ask_again(importlib.import_module("snakemake_executor_plugin_slurm").Executor)
         if executor == "slurm" and "--slurm-status-command" not in more and not _accounting():
             print("this Slurm keeps no accounts: jobs are watched with squeue", file=sys.stderr)
             options += ["--slurm-status-command", "squeue"]
