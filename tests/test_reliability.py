@@ -146,10 +146,12 @@ def test_a_table_keeps_the_lines_of_checks_that_were_not_run(tmp_path: Path, mon
 
     long.write_table(tmp_path / "nothing was run")
     assert not changed()
-    manifest.write_json(tmp_path / "full_disk.json", {"right": 3, "of": 4, "note": "a | b", "seconds": 5})
+    manifest.write_json(
+        tmp_path / "full_disk.json", {"right": 3, "of": 4, "note": "a | b", "seconds": 5, "day": "2026-11-27"}
+    )
     long.write_table(tmp_path)
     number, what = said(training.full_disk)
-    assert changed() == [f"| {number} | {what} | 3 | 4 | a / b | 5 |"]
+    assert changed() == [f"| {number} | {what} | 3 | 4 | a / b | 5 | 2026-11-27 |"]
 
 
 def test_on_a_cluster_each_kind_is_killed_as_often_and_in_every_order() -> None:

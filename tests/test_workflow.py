@@ -20,7 +20,7 @@ from tsmlib.__main__ import main
 from tsmlib.figures.method import Method
 from tsmlib.storage import artifacts, files, manifest
 from tsmlib.storage.provenance import provenance
-from tsmlib.study import needed, parameters, runs, workflow, zoo
+from tsmlib.study import needed, notebooks, parameters, runs, workflow, zoo
 from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.policies import Budget
@@ -68,8 +68,9 @@ def test_other_words_for_seeds_are_refused(text: str, place: Path) -> None:
 def test_seeds_of_held_out_episodes_and_targets_are_refused(
     seed: int, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["run", "all", "--scale", "smoke", "--seeds", f"{seed - 1}-{seed}"]) == 2
-    assert "draws held-out episodes or targets" in capsys.readouterr().err
+    for asked in (["--seeds", f"{seed - 1}-{seed}"], ["--seed", f"{seed}"]):
+        assert main(["run", "all", "--scale", "smoke", *asked]) == 2
+        assert "draws held-out episodes or targets" in capsys.readouterr().err
     assert not list(place.iterdir())
     with pytest.raises(ParameterError, match="draws held-out episodes or targets"):  # without a workflow
         dataset(runs.resolve("01_collect", scale="smoke", seed=seed), "tsm/Reacher-v0", "train")
@@ -221,6 +222,25 @@ def test_an_executor_without_its_package_is_refused_naming_what_to_install(
     assert "pip install snakemake-executor-plugin-kubernetes" in capsys.readouterr().err
     assert dry("--executor", "../x") == 2
     assert not list(place.iterdir())
+
+
+def test_options_that_would_be_ignored_are_refused(capsys: pytest.CaptureFixture[str], place: Path) -> None:
+    assert dry("--executor", "pool", "--jobs=-3") == 2
+    assert "--jobs is -3, expected 1 or more" in capsys.readouterr().err
+    assert dry("--executor", "pool", "--", "--cores", "3") == 2
+    assert "--cores 3 are options of Snakemake's" in capsys.readouterr().err
+    assert not list(place.iterdir())
+
+
+def test_a_notebook_beside_those_of_another_version_of_the_code_is_executed_and_that_is_said(place: Path) -> None:
+    run, now = runs.resolve("02_train", scale="smoke"), provenance()["code"]
+    assert notebooks.other_code(run) == ""
+    for code, said in ((now, False), ("0.1.0+bbb", True)):
+        entry = {"state": "complete", "provenance": {"code": code}}
+        manifest.write_json(run.dir / "01_collect.status.json", manifest.sealed(entry))
+        told = notebooks.other_code(run)
+        assert bool(told) == said
+    assert f"01_collect in {run.dir} was made by tsmlib 0.1.0+bbb, this is {now}" in told
 
 
 def test_a_workflow_that_another_process_holds_is_refused_naming_it(

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import tsmlib
 from tsmlib.storage import files
@@ -158,7 +159,9 @@ def _given(arguments: argparse.Namespace) -> dict[str, str]:
 def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
     chosen, given = _chosen(arguments.notebook), _given(arguments)
     notebooks.require_tools()
-    scale, seed, device = arguments.scale, parameters.convert("seed", arguments.seed), arguments.device
+    from tsmlib.study.data import require_other_seed
+
+    scale, seed, device = arguments.scale, cast(int, parameters.convert("seed", arguments.seed)), arguments.device
     if arguments.seeds or arguments.executor or arguments.dry_run or arguments.jobs or arguments.any_code or more:
         from tsmlib.study import workflow
 
@@ -170,7 +173,10 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
             prepared, given, executor=arguments.executor, jobs=arguments.jobs, dry_run=arguments.dry_run,
             any_code=arguments.any_code, more=more,
         )  # fmt: skip
+    require_other_seed(seed)
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
+    if said := notebooks.other_code(executions[0].run):
+        print(said, file=sys.stderr)
     for execution in executions:  # all of them are checked before the first one starts
         print(notebooks.execute(execution))
     return 0

@@ -121,16 +121,16 @@ def write_table(place: Path) -> None:
     before, _, rest = DOCS.read_text().partition(MARKS[0])
     table, _, after = rest.partition(MARKS[1])
     written = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
-    kept = {tuple(cells[:2]): cells[2:] for cells in written if len(cells) == 6}
-    lines = ["| test | what | right | of | measured | CPU s |", "|---|---|---|---|---|---|"]
+    kept = {tuple(cells[:2]): cells[2:] for cells in written if len(cells) == 7}
+    lines = ["| test | what | right | of | measured | CPU s | day |", "|---|---|---|---|---|---|---|"]
     for part in CHECKS.values():
         for check, _, _ in part:
             path = place / f"{check.__name__}.json"
             told, found = _cells(*said(check)), kept.get(_cells(*said(check)))
             if path.exists():
                 entry = manifest.read_own_json(path)
-                found = [*_cells(*(entry.get(name, "") for name in ("right", "of", "note", "seconds")))]
-            lines.append("| " + " | ".join([*told, *(found or ["", "", "not yet run at full length", ""])]) + " |")
+                found = [*_cells(*(entry.get(name, "") for name in ("right", "of", "note", "seconds", "day")))]
+            lines.append("| " + " | ".join([*told, *(found or ["", "", "not yet run at full length", "", ""])]) + " |")
     lines += ["", f"Python {platform.python_version()}, torch {torch.__version__}, {platform.system()}."]
     files_storage.write_bytes(DOCS, "\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]).encode())
 

@@ -60,8 +60,9 @@ def rounds(
             dense, aside = len(at) > DENSE, [*look_of].index(method) - (len(look_of) - 1) / 2
             beside = at if dense else at * 1.02**aside if log else at + 0.012 * far * aside
             barred_at = slice(-1, None) if dense else slice(None)
-            below = np.maximum(mean - half, 0) if values.min() >= 0 else mean - half
-            axes.bars(ax, beside[barred_at], *_centred(below, mean + half)[:, barred_at], method.look.colour)
+            bottom = np.maximum(mean - half, 0) if values.min() >= 0 else mean - half
+            middle, length = (bottom + mean + half) / 2, (mean + half - bottom) / 2
+            axes.bars(ax, beside[barred_at], middle[barred_at], length[barred_at], method.look.colour)
             size = {"ms": 4.5 if len(at) > 1 else 6.5}
             ax.plot(beside, mean, **look_of[method] | size, zorder=3 if len(at) > 1 else 4)
             notes += axes.outside(ax, beside, mean, method)
@@ -121,11 +122,6 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
     bars = [_bar()] * any(len(found) > 1 for found in every)
     handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
     return axes.finish(figure, [grid], handles, 4)
-
-
-def _centred(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Middles and half lengths (2, R) of intervals."""
-    return np.stack([(low + high) / 2, (high - low) / 2])
 
 
 def _bar() -> Line2D:

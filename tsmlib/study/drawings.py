@@ -179,11 +179,15 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFr
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         policies = {} if free is None else exploration.policy_panels(free, titles, env)
         fell = [{title: float(values.mean(0).min())} for title, part in policies.items() for _, values in part.values()]
-        curves = {title: part | policies.get(title, {}) for title, part in curves.items()}
+        curves = {title: {**part, **policies.get(title, {})} for title, part in curves.items()}
         panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
         ylabels = {f"{task}: {title}": units[title] for title in curves}
         ends = exploration.axis_ends(table.drawn(rows), env, fell)
         lowest = {f"{task}: {title}": low for title, low in ends.items()}
+        if policies and free is not None:
+            source = table.PUBLISHED if table.PUBLISHED in set(rows["source"]) else table.YOURS
+            beside = table.select(free, env=env, planner="policy", subset="", model=exploration.MODEL_FREE)
+            rows = pd.concat([rows, beside.assign(source=source)])
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest), stem, rows)
 
 

@@ -45,6 +45,22 @@ def prepare(
     return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
 
 
+def other_code(run: Run) -> str:
+    """A sentence where another version of the code made what a run holds; empty otherwise."""
+    from tsmlib.storage import manifest
+    from tsmlib.storage.provenance import provenance
+
+    now = provenance()["code"]
+    for name, entry in manifest.statuses(run.dir).items():
+        code = entry.get("provenance", {}).get("code") if isinstance(entry, dict) else None
+        if code not in (None, now):
+            return (
+                f"note: {name} in {run.dir} was made by tsmlib {code}, this is {now}; TSM_RUN_DIR names another "
+                "folder, and every file states the version that made it"
+            )
+    return ""
+
+
 def require_tools() -> None:
     """RunError naming what the notebooks need and a plain installation lacks."""
     missing = [name for name in TOOLS if importlib.util.find_spec(name) is None]

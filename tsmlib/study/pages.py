@@ -156,7 +156,7 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
         for verdict in named
     )
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
-With `{OURS}` in its place, {claims_report.counts(ours)}.
+With `{OURS}` in its place, {claims_report.counts(ours)}. {claims_report.seeds_told(papers)}
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
 
 

@@ -29,8 +29,7 @@ from tsmlib.study.models import TrainedModel, load_or_train, load_prior
 from tsmlib.study.results.policies import (
     EARLY,
     EPISODES,
-    GRADIENTS,
-    finished,
+    gradients,
     learning_curves,
     learning_rows,
     plateau_rows,
@@ -256,7 +255,7 @@ def plateaus(run: Run, tasks: Iterable[Task], learned: pd.DataFrame) -> list[Row
     at scale laptop, whose policies come to no plateau."""
     if run.scale == "laptop":
         return []
-    free = finished(select(table(run, "model_free"), model=GRADIENTS).drop(columns="source"))
+    free = gradients(table(run, "model_free").drop(columns="source"))
     both, rows = tables.frame(pd.concat([learned, free[free["seed"] == run.seed]])), list[Row]()
     for task in {task.env: task for task in tasks}.values():
         own = select(both, env=task.env, noise=None, delay=None)  # none of an imperfect arm, whose id is no row's env

@@ -204,8 +204,8 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield drawings.figure6(control, by_target, tasks)
     yield drawings.predicted_and_executed(by_target, tasks)
     yield drawings.closed_loop(control, by_target, tasks[-1])
-    free = policies_results.finished(published("model_free")).assign(source=table.YOURS)
-    yield drawings.figure7(tables_storage.frame(pd.concat([control, free])), control)
+    free = published("model_free").assign(source=table.YOURS)
+    yield drawings.figure7(tables_storage.frame(pd.concat([control, policies_results.gradients(free)])), control)
     asked = needed.robustness(Run("06_robustness", "paper", 0, ROOT))
     words = [word for word in zoo.words("dynamics", "ablation") if word in set(imperfect["model"])]
     yield drawings.filtering(imperfect, asked.worlds["noise"], words)

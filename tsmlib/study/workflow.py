@@ -189,9 +189,14 @@ def run_all(
     executor: a plugin of Snakemake's, 'local' (this machine), or 'pool' (this machine without Snakemake); '' is local
     where Snakemake is installed, else pool. jobs: at a time; 0 is one for each core here, 100 elsewhere. dry_run: list
     the steps, and do nothing. any_code: go on with what another version of the code made. more: options of Snakemake.
-    Raises RunError where another process holds the workflow, the code changed or something is not installed.
+    Raises ParameterError for a negative number of jobs and for options of Snakemake's without it, RunError where
+    another process holds the workflow, the code changed or something is not installed.
     """
     executor = executor or ("local" if importlib.util.find_spec("snakemake") else POOL)
+    if jobs < 0:
+        raise ParameterError(f"--jobs is {jobs}, expected 1 or more, or 0 for as many as there are cores.")
+    if more and executor == POOL:
+        raise ParameterError(f"{' '.join(more)!r:.80} are options of Snakemake's, which the pool does without.")
     _require_executor(executor)
     table, folder = steps(executions, given), executions[0].run.dir.parent / "workflow"
     runs = list({execution.run.dir: execution.run for execution in executions}.values())

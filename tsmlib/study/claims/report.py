@@ -78,6 +78,13 @@ def seeds_table(verdicts: Sequence[Verdict]) -> str:
     return markdown(pd.DataFrame(lines))
 
 
+def seeds_told(verdicts: Sequence[Verdict]) -> str:
+    """How many training seeds claims rest on, in a sentence."""
+    seeds = [verdict.seeds for verdict in verdicts if verdict.word != DEFINITIONAL]
+    told = ", ".join(f"{seeds.count(n)} on {n}" for n in sorted(set(seeds)))
+    return f"Claims rest on few training seeds: {told}."
+
+
 def _resting(verdict: Verdict) -> str:
     checks, fewest = len(verdict.checks), sum(effect.seeds == verdict.seeds for effect in verdict.checks)
     some = f"{fewest} of {checks} checks" * (fewest + verdict.without_rows < checks)

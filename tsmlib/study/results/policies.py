@@ -220,6 +220,11 @@ def finished(found: pd.DataFrame) -> pd.DataFrame:
     return found.loc[own.index[(last == last.groupby(method, sort=False).transform("max")).to_numpy(dtype=bool)]]
 
 
+def gradients(free: pd.DataFrame) -> pd.DataFrame:
+    """``finished`` rows of the policy gradients among model-free learners, which are those of figure 7."""
+    return finished(table.select(free, model=GRADIENTS))
+
+
 def references(found: pd.DataFrame) -> dict[str, dict[Method, float]]:
     """Task -> method -> mean true return of the oracle's plans and of no torque, from rows of 05_control.csv.
 
