@@ -88,8 +88,11 @@ class ExplorationOptions:
 
     def __post_init__(self) -> None:
         if not isinstance(self.rounds, int) or self.rounds < 1 or self.samples < 2:
-            raise ValueError(f"rounds {self.rounds}, samples {self.samples}: expected at least 1 round and 2 samples")
-        if self.rms <= 0:
+            raise ValueError(
+                f"rounds {self.rounds}, samples {self.samples}: expected a whole number of at least 1 round, and "
+                "at least 2 samples"
+            )
+        if not 0 < self.rms < math.inf:
             raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
         if not (0 <= self.noise < math.inf and 0 <= self.bonus < math.inf and 0 < self.held_out < 1):
             raise ValueError(

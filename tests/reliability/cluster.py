@@ -249,7 +249,9 @@ def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Pa
 
     def ready() -> bool:
         running[:] = cluster.running() if steps_done(place) >= after else []
-        return bool(running) and (how != "job" or kill(running[0][2]))  # it may have ended just now
+        if how == "job" and running and not kill(running[0][2]):  # it ended just now
+            running.clear()
+        return bool(running)
 
     wait_for(lambda: ready() or process.poll() is not None)
     if not running:
@@ -292,7 +294,8 @@ def killed_on_a_cluster(each: int) -> Outcome:
         for outcome in pool.map(of_one, range(clusters)):
             found.add(outcome)
     kills = sum(len(killed) for killed, _ in strikes(each))
-    found.note = f"{kills} kills: in each run {', '.join(IN_TURN if each else KILLED)}, in turn; seeds {SEEDS}"
+    which = f"{', '.join(IN_TURN)}, in any order" if each else ", ".join(KILLED)
+    found.note = f"{kills} kills: in each run {which}; seeds {SEEDS}"
     return found
 
 
@@ -308,13 +311,14 @@ def tried(cluster: Slurm, killed: Sequence[str], place: Path, expected: object, 
             if how == "workflow":
                 process.wait()
                 process = workflow(place, *options, environment=cluster.environment)
+        code, same = process.wait(1800), made(place) == expected
     except Exception as error:
         process.kill()
         process.wait()
         cluster.command("scancel", "--user", "root")
+        wait_for(lambda: not cluster.command("squeue", "-h"))
         found.count(False, f"{said}: {error!r}")
     else:
-        code, same = process.wait(1800), made(place) == expected
         said = f"{said}: exit {code}, same tables {same}"
         found.count(code == 0 and same, f"{said}: {(place / 'log').read_text()[-800:]}")
     print(said, flush=True)

@@ -156,7 +156,8 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
         for verdict in named
     )
     return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}.
-With `{OURS}` in its place, {claims_report.counts(ours)}. {claims_report.seeds_told(papers)}
+{claims_report.seeds_told(papers)}
+With `{OURS}` in its place, {claims_report.counts(ours)}.
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
 
 
@@ -424,7 +425,7 @@ def _exploration_aims(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
     """The part of that page on what was aimed at."""
     found = aims_results.of_exploration(rows, tables_storage.frame([]) if free is None else free)
     return f"""
-What was aimed at before these rows were there; "not measured" has not been run, for want of hours:
+What this study aims at; "not measured" has not been run, for want of hours:
 
 {table.markdown(found)}
 """

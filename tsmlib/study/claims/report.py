@@ -82,7 +82,7 @@ def seeds_told(verdicts: Sequence[Verdict]) -> str:
     """How many training seeds claims rest on, in a sentence."""
     seeds = [verdict.seeds for verdict in verdicts if verdict.word != DEFINITIONAL]
     told = ", ".join(f"{seeds.count(n)} on {n}" for n in sorted(set(seeds)))
-    return f"Claims rest on few training seeds: {told}."
+    return f"These claims rest on few training seeds: {told}."
 
 
 def _resting(verdict: Verdict) -> str:

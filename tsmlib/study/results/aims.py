@@ -147,16 +147,17 @@ def _over_others(predict: pd.DataFrame, env: str, steps: int | None) -> Worst:
 def _of_policies(learned: pd.DataFrame) -> list[Line]:
     curves: Mapping[Method, Mapping[str, np.ndarray]] = policies.learning_curves(learned).get("push", {})
     inside, free = dict[str, float](), dict[str, float]()  # returns at the end; of two search spaces the larger
-    seeds = max((int(own["seeds"]) for method, own in curves.items() if method.model == OURS), default=0)
+    seeds = {method.model: int(own["seeds"]) for method, own in curves.items()}
     for method, own in curves.items():
         ends, end = inside if method.search_space else free, float(own["return_true"][:, -1].mean())
         ends[method.model] = max(end, ends.get(method.model, end))
     ours = inside.pop(OURS, float("nan"))
+    names = {"": "others"} | {word: zoo.look(word).name for word in seeds}
     return [
-        (f"return of the best policy inside `{OURS}` ({seeds} seed{'s' * (seeds != 1)}) minus that of {worst.against}",
-         "at least", 0.0, -worst.value, "{:.2f}")
+        (f"return of the best policy inside `{OURS}` minus that of {names[worst.against]} "
+         f"({seeds.get(OURS, 0)} and {seeds.get(worst.against, 0)} seeds)", "at least", 0.0, -worst.value, "{:.2f}")
         for others in (inside, free)
-        for worst in [_worst({zoo.look(model).name: end - ours for model, end in others.items()})]
+        for worst in [_worst({model: end - ours for model, end in others.items()})]
     ]  # fmt: skip
 
 
@@ -186,7 +187,7 @@ def _of_rounds(rows: pd.DataFrame, free: pd.DataFrame) -> list[Line]:
     return [
         *lines,
         ("iterations of a search in codes of the last prior over those in codes of the first, to the return that the "
-         "latter ends with; inf: not within ten", "at most", 0.5, _iterations(rows), "{:.2f}"),
+         "latter ends with; inf: in some seed not within ten", "at most", 0.5, _iterations(rows), "{:.2f}"),
         (f"minutes of the longest round of pushing by `{OURS}`", "at most", 10.0, float(seconds.max()) / 60, "{:.1f}"),
     ]  # fmt: skip
 
@@ -195,10 +196,11 @@ def _iterations(rows: pd.DataFrame) -> float:
     own = table.select(rows, env=PUSH, model=OURS, configuration=exploration.PLANNED, execution=planning.OPEN,
                        metric="iterations_to_same_return")  # fmt: skip
     wide = own.pivot(index="seed", columns="subset", values="value")
-    if exploration.FIRST_PRIOR not in wide:
-        return float("nan")
-    first, last = wide[exploration.FIRST_PRIOR], wide.get(exploration.LAST_PRIOR, pd.Series(index=wide.index))
-    return float((last.fillna(np.inf).astype(float) / first).mean())
+    searched = table.select(rows, env=PUSH, model=OURS, configuration=exploration.PLANNED, execution=planning.OPEN,
+                            metric="return_true", subset=exploration.LAST_PRIOR)  # fmt: skip
+    wide = wide[wide.index.isin(searched["seed"])].reindex(columns=[exploration.FIRST_PRIOR, exploration.LAST_PRIOR])
+    first, last = (wide[which].astype(float) for which in wide)
+    return float((last.fillna(np.inf) / first).mean())
 
 
 def _of_adaptation(rows: pd.DataFrame) -> list[Line]:
