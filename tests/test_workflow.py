@@ -228,7 +228,7 @@ def test_options_that_would_be_ignored_are_refused(capsys: pytest.CaptureFixture
     assert dry("--executor", "pool", "--jobs=-3") == 2
     assert "--jobs is -3, expected 1 or more" in capsys.readouterr().err
     assert dry("--executor", "pool", "--", "--cores", "3") == 2
-    assert "--cores 3 are options of Snakemake's" in capsys.readouterr().err
+    assert "'--cores 3' are options of Snakemake's" in capsys.readouterr().err
     assert not list(place.iterdir())
 
 
