@@ -159,8 +159,6 @@ def _given(arguments: argparse.Namespace) -> dict[str, str]:
 def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
     chosen, given = _chosen(arguments.notebook), _given(arguments)
     notebooks.require_tools()
-    from tsmlib.study.data import require_other_seed
-
     scale, seed, device = arguments.scale, cast(int, parameters.convert("seed", arguments.seed)), arguments.device
     if arguments.seeds or arguments.executor or arguments.dry_run or arguments.jobs or arguments.any_code or more:
         from tsmlib.study import workflow
@@ -173,8 +171,10 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
             prepared, given, executor=arguments.executor, jobs=arguments.jobs, dry_run=arguments.dry_run,
             any_code=arguments.any_code, more=more,
         )  # fmt: skip
-    require_other_seed(seed)
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
+    from tsmlib.study.data import require_other_seed  # heavy, and not needed to refuse a parameter
+
+    require_other_seed(seed)
     if said := notebooks.other_code(executions[0].run):
         print(said, file=sys.stderr)
     for execution in executions:  # all of them are checked before the first one starts

@@ -178,7 +178,9 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFr
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         policies = {} if free is None else exploration.policy_panels(free, titles, env)
-        fell = [{title: float(values.mean(0).min())} for title, part in policies.items() for _, values in part.values()]
+        fell = {
+            title: min(float(values.mean(0).min()) for _, values in part.values()) for title, part in policies.items()
+        }
         curves = {title: {**part, **policies.get(title, {})} for title, part in curves.items()}
         panels, own = ({f"{task}: {title}": part[title] for title in part} for part in (curves, yours))
         ylabels = {f"{task}: {title}": units[title] for title in curves}

@@ -45,15 +45,24 @@ def prepare(
     return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
 
 
+def codes(run: Run) -> dict[str, str]:
+    """Notebook -> the version of the code that made what a run holds of it, where its status states one."""
+    from tsmlib.storage import manifest
+
+    made = {
+        name: entry.get("provenance", {}).get("code")
+        for name, entry in manifest.statuses(run.dir).items() if isinstance(entry, dict)
+    }  # fmt: skip
+    return {name: str(code) for name, code in made.items() if code is not None}
+
+
 def other_code(run: Run) -> str:
     """A sentence where another version of the code made what a run holds; empty otherwise."""
-    from tsmlib.storage import manifest
     from tsmlib.storage.provenance import provenance
 
     now = provenance()["code"]
-    for name, entry in manifest.statuses(run.dir).items():
-        code = entry.get("provenance", {}).get("code") if isinstance(entry, dict) else None
-        if code not in (None, now):
+    for name, code in codes(run).items():
+        if code != now:
             return (
                 f"note: {name} in {run.dir} was made by tsmlib {code}, this is {now}; TSM_RUN_DIR names another "
                 "folder, and every file states the version that made it"

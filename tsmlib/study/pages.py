@@ -155,7 +155,8 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
         f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" + _leaning(verdict)
         for verdict in named
     )
-    return f"""**What replicated.** With the paper's model, {claims_report.counts(papers)}. {claims_report.seeds_told(papers)}
+    theirs = f"{claims_report.counts(papers)}. {claims_report.seeds_told(papers)}"
+    return f"""**What replicated.** With the paper's model, {theirs}
 With `{OURS}` in its place, {claims_report.counts(ours)}.
 Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
 

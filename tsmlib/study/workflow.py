@@ -314,10 +314,9 @@ def _require_code(folder: Path, runs: Sequence[Run], *, any_code: bool) -> list[
     now, accepted = str(provenance()["code"]), _codes(folder)
     others = {code: f"{folder}" for code in accepted[-1:] if code != now}
     for run in runs:
-        for name, entry in manifest.statuses(run.dir).items():
-            code = entry.get("provenance", {}).get("code") if isinstance(entry, dict) else None
-            if code not in (None, now, *accepted):
-                others[str(code)] = f"{name} in {run.dir}"
+        for name, code in notebooks.codes(run).items():
+            if code not in (now, *accepted):
+                others[code] = f"{name} in {run.dir}"
     if others and not any_code:
         code, where = next(iter(others.items()))
         raise RunError(
@@ -381,9 +380,9 @@ def _snakemake(
         options += ["--executor", executor, "--jobs", str(jobs or 100), "--latency-wait", "60"]
         if executor == "slurm":
             ask_again(importlib.import_module("snakemake_executor_plugin_slurm").Executor)
-        if executor == "slurm" and "--slurm-status-command" not in more and not _accounting():
-            print("this Slurm keeps no accounts: jobs are watched with squeue", file=sys.stderr)
-            options += ["--slurm-status-command", "squeue"]
+            if "--slurm-status-command" not in more and not _accounting():
+                print("this Slurm keeps no accounts: jobs are watched with squeue", file=sys.stderr)
+                options += ["--slurm-status-command", "squeue"]
     try:
         snakemake([*options, *more])
     except SystemExit as end:

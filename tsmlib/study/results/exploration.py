@@ -156,9 +156,9 @@ def policy_panels(
     return found
 
 
-def axis_ends(rows: pd.DataFrame, env: str, fell: Sequence[Mapping[str, float]] = ()) -> dict[str, float]:
+def axis_ends(rows: pd.DataFrame, env: str, also: Mapping[str, float] | None = None) -> dict[str, float]:
     """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest 95 % interval of round 0, and
-    below the lowest of policies without a model, ``fell``: of each title -> value."""
+    below what is ``also`` drawn, title -> its lowest value."""
     ends = {}
     closed = table.select(rows, env=env, execution=CLOSED)
     for metric in ("return_true", "success"):
@@ -166,7 +166,7 @@ def axis_ends(rows: pd.DataFrame, env: str, fell: Sequence[Mapping[str, float]] 
         before = [part["value"] for _, part in table.groups(table.select(found, iteration=0), learner)]
         if (title := ROUNDS[env][metric]) in DRAWN[env] and before:
             low = min(mean - half for mean, half in map(interval, before))
-            low = min([low, *(each[title] for each in fell if title in each)])
+            low = min(low, (also or {}).get(title, low))
             ends[title] = low - 0.1 * abs(low)
     return ends
 
@@ -284,17 +284,15 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
     learned = table.select(free, env=env, planner="policy", subset="", metric="return_true")
     lines = []
     for policy, theirs in table.groups(table.select(learned, model=MODEL_FREE), "model"):
-        curve = theirs.groupby("env_steps")["value"].mean()
+        end, level = _end(theirs)
         for word, ours in table.groups(rounds, "model"):
-            own = ours.groupby("iteration")[["env_steps", "value"]].mean()
-            k, end = _first(own["value"], curve.iloc[-1]), float(curve.index[-1])
-            taken = None if k is None else float(own["env_steps"][k])
+            own, k, taken = _there(ours, level)
             lines.append({
-                "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{curve.iloc[-1]:.2f}",
-                "rounds of": f"`{word}`", "steps to that return": "-" if taken is None else f"{taken:,.0f}",
-                "share": "-" if taken is None else f"{taken / end:.1%}",
+                "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{level:.2f}",
+                "rounds of": f"`{word}`", "steps to that return": "-" if k is None else f"{taken:,.0f}",
+                "share": "-" if k is None else f"{taken / end:.1%}",
                 "when": "never" if k is None else f"in round {k:.0f}" if k else "before the first round",
-                "return after the last": f"{own['value'].iloc[-1]:.2f}",
+                "return after the last": f"{own.iloc[-1]:.2f}",
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
     return table.markdown(pd.DataFrame(lines))
@@ -307,16 +305,22 @@ def steps_share(rows: pd.DataFrame, free: pd.DataFrame, env: str, word: str) -> 
     rounds = table.select(rows, env=env, model=word, configuration=PLANNED, execution=CLOSED, metric="return_true")
     if not (len(learned) and len(rounds)):
         return math.nan
+    end, level = _end(learned)
+    return _there(rounds, level)[2] / end
+
+
+def _end(learned: pd.DataFrame) -> tuple[float, float]:
+    """Environment steps of a learner without a model, and the return that it ends with."""
     curve = learned.groupby("env_steps")["value"].mean()
+    return float(curve.index[-1]), float(curve.iloc[-1])
+
+
+def _there(rounds: pd.DataFrame, level: float) -> tuple[pd.Series, float | None, float]:
+    """Returns of a learner by round, the first round that returns as much as ``level``, None if none does, and the
+    environment steps until then, inf if none does."""
     own = rounds.groupby("iteration")[["env_steps", "value"]].mean()
-    k = _first(own["value"], curve.iloc[-1])
-    return math.inf if k is None else float(own["env_steps"][k]) / float(curve.index[-1])
-
-
-def _first(curve: pd.Series, level: float) -> float | None:
-    """The first round at which a curve has come to a level, None if it never does."""
-    there = curve.index[curve >= level]
-    return float(there[0]) if len(there) else None
+    k = next((float(k) for k in own.index[own["value"] >= level]), None)
+    return own["value"], k, math.inf if k is None else float(own["env_steps"][k])
 
 
 @table.told
