@@ -186,24 +186,24 @@ def adapted(run: runs.Run, models: list[str], envs: list[str], ways: list[str], 
     return rows
 
 
-def wanted_rounds(parser: argparse.ArgumentParser, given: argparse.Namespace) -> list[tuple[str, str, str]]:
+def wanted_rounds(options: argparse.ArgumentParser, given: argparse.Namespace) -> list[tuple[str, str, str]]:
     """Environment, model and data of every loop; ends the command where a model does not explore there."""
     for env, word in (pairs := list(product(given.envs or [PENDULUM], given.models))):
         try:
             worlds.require(env, word)
         except ValueError as error:
-            parser.error(str(error))
+            options.error(str(error))
     return [(env, word, data) for env, word in pairs for data in given.data]
 
 
-def wanted_arms(parser: argparse.ArgumentParser, given: argparse.Namespace) -> list[str]:
+def wanted_arms(options: argparse.ArgumentParser, given: argparse.Namespace) -> list[str]:
     """Changed arms; ends the command where an arm has nothing to change, or a model does not ship or adapt."""
     try:
         arms = [adaptation.changed(arm, word) for arm in given.envs or [WEAK[0]] for word in given.variants]
         for arm, word in product(arms, given.models):
             adaptation.require(arm, word)
     except ValueError as error:
-        parser.error(str(error))
+        options.error(str(error))
     return arms
 
 
@@ -234,48 +234,54 @@ def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: li
     return found[found["env"].isin(envs) & (found["seed"] == run.seed)]
 
 
+def parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", "peers"))
+    found.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
+    found.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, PENDULUM), metavar="ENV")
+    found.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
+                       help="of control and torques also oracle, the true simulator")  # fmt: skip
+    found.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL")
+    found.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
+    found.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
+    found.add_argument("--data", nargs="+", default=exploration.DATA[:2], choices=exploration.DATA, help="of rounds")
+    found.add_argument("--variants", nargs="+", default=[WEAK[1]], choices=adaptation.VARIANTS, metavar="VARIANT",
+                       help=f"of the arm that is adapted to (default {WEAK[1]})")  # fmt: skip
+    found.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="of adaptation (default all)")
+    found.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
+    found.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
+    found.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
+    found.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
+    found.add_argument("--seed", type=int, default=0)
+    return found
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", "peers"))
-    parser.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
-    parser.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, PENDULUM), metavar="ENV")
-    parser.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
-                        help="of control and torques also oracle, the true simulator")  # fmt: skip
-    parser.add_argument("--closed", nargs="*", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL")
-    parser.add_argument("--spaces", nargs="+", default=SEARCH_SPACES, choices=SEARCH_SPACES, help="default both")
-    parser.add_argument("--planners", nargs="+", default=["cem"], choices=PLANNERS, help="default cem")
-    parser.add_argument("--data", nargs="+", default=exploration.DATA[:2], choices=exploration.DATA, help="of rounds")
-    parser.add_argument("--variants", nargs="+", default=[WEAK[1]], choices=adaptation.VARIANTS, metavar="VARIANT",
-                        help=f"of the arm that is adapted to (default {WEAK[1]})")  # fmt: skip
-    parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="of adaptation (default all)")
-    parser.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
-    parser.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
-    parser.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
-    parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    options = parser()
+    given = options.parse_args()
     if bool(given.files) != (given.part == "peers") or not all(path.is_file() for path in given.files):
         missing = [str(path) for path in given.files if not path.is_file()]
-        parser.error(f"peers, and nothing else, takes tables that are there; got {missing or given.files or 'none'}")
+        options.error(f"peers, and nothing else, takes tables that are there; got {missing or given.files or 'none'}")
     if given.part == "peers":
         published_peers(given.files)
         return
     if not given.models and given.part != "collect":
-        parser.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
+        options.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
     if SIMULATOR in given.models and given.part not in ("control", "torques"):
-        parser.error(f"{given.part} takes no {SIMULATOR}; --models are some of {', '.join(zoo.words())}")
+        options.error(f"{given.part} takes no {SIMULATOR}; --models are some of {', '.join(zoo.words())}")
     if SIMULATOR in given.models and not set(given.planners) <= {"cem", "mppi"}:
-        parser.error(f"the simulator has no gradient; --planners of {SIMULATOR} are cem and mppi")
+        options.error(f"the simulator has no gradient; --planners of {SIMULATOR} are cem and mppi")
     if not given.envs and NOTEBOOKS.get(given.part) != "10_explore":
-        parser.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
+        options.error(f"{given.part} needs --envs, some of {', '.join(ENV_IDS)}")
     if PENDULUM in given.envs and given.part != "rounds":
-        parser.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
+        options.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
-        parser.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
+        options.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "convergence" and not needed.control(run).converging:
-        parser.error(f"nothing converges at scale {run.scale}; --scale of convergence is paper or smoke")
+        options.error(f"nothing converges at scale {run.scale}; --scale of convergence is paper or smoke")
     if given.part in ("predict", "ablations"):
         pairs = list(product(given.envs, given.models))
         wanted: list[Job] = [Scores(env, word, segments) for env, word in pairs for segments in (False, True)]
@@ -286,11 +292,11 @@ def main() -> None:
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":
-        for env, word, data in wanted_rounds(parser, given):
+        for env, word, data in wanted_rounds(options, given):
             loop = rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds"))
             publish(notebook, [*loop.rows, *loop.seconds], loops=True)
     elif given.part == "adaptation":
-        for env in wanted_arms(parser, given):
+        for env in wanted_arms(options, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))
     elif given.part == "gradients":
         starts = [study.load_task(env).take(2) for env in given.envs]
@@ -311,7 +317,7 @@ def main() -> None:
         latent = [way for way in zoo.policies(given.models) if way.search_space == "latent"]
         for env, way in product(given.envs, latent):
             if select(own_policies(published, run, [env]), model=way.model, search_space="latent").empty:
-                parser.error(
+                options.error(
                     f"{env}: no latent policy in {way.model} of seed {run.seed} is published; run policies first"
                 )
         rows = study.early_rows(run, [(study.load_task(env), way, budget) for env, way in product(given.envs, latent)])

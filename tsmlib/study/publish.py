@@ -121,12 +121,12 @@ def publish_claims() -> None:
     papers, ours = pages.shipped_verdicts(PAPERS), pages.shipped_verdicts(OURS)
     tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
     manifest.write_manifest(ROOT / "data")
-    _between(README, AIM_MARKS, pages.readme_aims())
-    _between(README, MARKS, pages.readme_results())
-    _between(RESULTS_PAGE, MARKS, pages.results_page())
-    _between(README, CLAIM_MARKS, pages.readme_claims(papers, ours))
-    _between(CLAIMS_PAGE, CLAIM_MARKS, pages.claims_page(papers, ours))
-    _between(FULL_PAGE, CLAIM_MARKS, pages.full_page(papers, ours))
+    between(README, AIM_MARKS, pages.readme_aims())
+    between(README, MARKS, pages.readme_results())
+    between(RESULTS_PAGE, MARKS, pages.results_page())
+    between(README, CLAIM_MARKS, pages.readme_claims(papers, ours))
+    between(CLAIMS_PAGE, CLAIM_MARKS, pages.claims_page(papers, ours))
+    between(FULL_PAGE, CLAIM_MARKS, pages.full_page(papers, ours))
     draw_claims(papers)
 
 
@@ -142,7 +142,7 @@ def compress() -> None:
         tables_storage.ship_bytes(path, manifest.read_text(path).encode())
 
 
-def _between(page: Path, marks: tuple[str, str], written: str) -> None:
+def between(page: Path, marks: tuple[str, str], written: str) -> None:
     """Put ``written`` between two marks of a page."""
     text = page.read_text()
     if any(text.count(mark) != 1 for mark in marks):

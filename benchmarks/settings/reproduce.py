@@ -1,0 +1,345 @@
+"""Published rows, made again by one command: those of a table, those that a claim asks for, or all.
+
+    python benchmarks/settings/reproduce.py 05_control --seeds 0
+    python benchmarks/settings/reproduce.py C46
+    python benchmarks/settings/reproduce.py all --list
+
+RECIPES has a command for every row that ships; run are those with the environments, models and seeds of the rows that
+are wanted. Models, scores, plans and policies that are missing in runs/paper/seed<k> are made first, here, one after
+another: hours, or days (docs/claims.md says how many). What was made stays there, so that a command that was stopped
+goes on. --list prints the commands, to run some of them, or side by side.
+
+The new rows take the place of those in data/results, claims are judged and pages written anew, and a table says how far
+new values lie from those before. ``git checkout data docs README.md`` takes it back.
+
+    python benchmarks/settings/reproduce.py --page
+
+writes the commands, and the seeds of the rows that ship, into docs/reproducing.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import pandas as pd
+
+from tsmlib.storage import tables
+from tsmlib.study import adaptation
+from tsmlib.study.claims import evaluate
+from tsmlib.study.claims.claim import Claim
+from tsmlib.study.claims.ledger import claims, questions
+from tsmlib.study.publish import between
+from tsmlib.study.results import policies
+from tsmlib.study.results.table import select
+from tsmlib.study.runs import RESULTS, ROOT
+from tsmlib.study.zoo import OURS, PAPERS
+
+PAGE, MARKS = ROOT / "docs" / "reproducing.md", ("<!-- commands -->", "<!-- end of commands -->")
+ROWS, PETS = "benchmarks/settings/rows.py", "build/peers/bin/python benchmarks/peers"
+REACH, OBSTACLE, PUSH, PENDULUM = "tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v1", "Pendulum-v1"
+PYMUNK = ("tsm/PymunkReacher-v0", "tsm/PymunkObstacle-v0", "tsm/PymunkPush-v1")
+OUR, FIVE = (PAPERS, OURS), (PAPERS, OURS, "onestep", "multistep", "lstm")
+ENSEMBLES, FREE, FLOORS = ("ensemble", "ensemble+mse"), ("ppo", "trpo"), ("oracle", "none")
+VARIANTS = ("tsm+plain", "tsm+full", "tsm+h1", "tsm+h20", "tsm+z4", "tsm+z16")
+OPEN, CLOSED = {"execution": ("open loop",)}, {"execution": ("closed loop",)}
+POLICY, EARLY = {"planner": ("policy",)}, {"subset": (policies.EARLY,)}
+CONTROL, CONVERGED = ("05_control", "05_control_rows"), {"metric": ("iterations_to_95",)}
+CEM, ADAM = {"planner": ("cem", "zero", "random")}, {"planner": ("adam",)}
+JUDGED = "08_claims"  # the table that ``publish --claims`` writes, whatever was made before
+CLAIMS = "python -m tsmlib publish --claims"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Rows of ``tables``, and the command that makes them: ``rows.py part``, or ``script`` with {seed} in it.
+
+    envs, models: of the rows, as the command takes them; along: models of rows that come with them. only, apart:
+    column -> values that the rows have, and do not have. variant: what was changed of the environments in the rows.
+    whole: the command takes all of ``models``, whatever rows are wanted.
+    """
+
+    tables: tuple[str, ...]
+    part: str
+    envs: tuple[str, ...]
+    models: tuple[str, ...] = ()
+    along: tuple[str, ...] = ()
+    options: str = ""
+    only: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    apart: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    variant: str = ""
+    script: tuple[str, ...] = ()
+    whole: bool = False
+
+    def env_of_rows(self, env: str) -> str:
+        """What the column ``env`` says."""
+        return adaptation.changed(env, self.variant) if self.variant else env
+
+    def made(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Those of the rows of one of ``tables`` that the command makes."""
+        envs = [self.env_of_rows(env) for env in self.envs]
+        found = select(table, env=envs, model=[*self.models, *self.along], **self.only)
+        for column, values in self.apart.items():
+            found = found.drop(select(found, **{column: values}).index)
+        return found
+
+    def commands(self, rows: pd.DataFrame, seed: str) -> list[str]:
+        """As many as make these rows, all of one seed; more than one where environments have rows of other models."""
+        if self.script:
+            return [line.format(seed=seed) for line in self.script]
+        pairs = set(zip(rows["env"], rows["model"], strict=True))
+        there = [env for env in self.envs if self.env_of_rows(env) in set(rows["env"])]
+        asked = {
+            env: tuple(word for word in self.models if self.whole or (self.env_of_rows(env), word) in pairs)
+            for env in there
+        }
+        return [
+            " ".join([
+                f"python {ROWS} {self.part} --scale paper --seed {seed} --envs", *envs,
+                *(("--models", *(models or self.models[:1])) if self.models else ()),
+                *(("--variants", self.variant) if self.variant else ()), *self.options.split(),
+            ])
+            for models, envs in groupby(there, lambda env: asked[env])
+        ]  # fmt: skip
+
+
+def _rounds(envs: tuple[str, ...], models: tuple[str, ...], data: str) -> Recipe:
+    """Of exploration."""
+    only = {"configuration": (data,)}
+    return Recipe(("10_explore",), "rounds", envs, models, options=f"--data '{data}'", only=only)
+
+
+def _adapted(env: str, variant: str, options: str) -> Recipe:
+    """Models adapted to a changed arm."""
+    models = (OURS, "lstm", "ensemble+mse")
+    return Recipe(
+        ("10_explore",), "adaptation", (env,), models, options=f"{options} --episodes 5 20 80", variant=variant
+    )
+
+
+def _loop(env: str) -> Recipe:
+    """mbrl-lib's own."""
+    made = f"runs/paper/seed{{seed}}/metrics/peers_loop-{env.rpartition('/')[2]}.csv"
+    lines = (f"{PETS}/loop.py --env {env} --scale paper --seed {{seed}}", f"python {ROWS} peers {made}")
+    return Recipe(("10_explore",), "", (env,), ("pets",), script=lines)
+
+
+def _free(envs: tuple[str, ...], models: tuple[str, ...], options: str) -> Recipe:
+    """Policies without a model."""
+    made = f"runs/paper/seed0/metrics/model_free_{'_'.join(models)}.csv"
+    command = f"build/model_free/bin/python benchmarks/model_free/model_free.py {options} --out {made}"
+    return Recipe(("model_free",), "", envs, models, script=(command, f"python {ROWS} peers {made}"))
+
+
+ARMS = [arm for arm in adaptation.VARIANTS if arm != "standard"]
+ROBOTS = ("Hopper-v5", "HalfCheetah-v5", PENDULUM)
+PREDICTED = "runs/paper/seed0/metrics/peers_pets.csv"
+RECIPES = (  # in the order in which they are run: policies without a model before those that are compared with them
+    Recipe(("01_collect",), "collect", (REACH, OBSTACLE, PUSH, *PYMUNK), along=("none",)),
+    Recipe(("02_train",), "gradients", (PUSH,), OUR),
+    Recipe(("03_predict",), "predict", (REACH, OBSTACLE, PUSH), (*FIVE, *ENSEMBLES)),
+    Recipe(
+        ("peers_pets",), "", (PUSH,), ("pets",),
+        script=(f"{PETS}/pets.py --env {PUSH} --form gaussian --seconds 2320", f"python {ROWS} peers {PREDICTED}"),
+    ),
+    Recipe(("03_ablation",), "ablations", (PUSH,), ("onestep", PAPERS, *VARIANTS)),
+    Recipe(("03_samples",), "", (PUSH,), (OURS,), script=(
+        "python benchmarks/settings/samples.py --out data/results/03_samples.csv",
+    )),
+    Recipe(("04_latent",), "latent", (REACH, OBSTACLE, PUSH), OUR),
+    _free((REACH, PUSH), FREE, "--seeds 5"),
+    _free((PUSH,), ("sac",), f"--env {PUSH} --algorithm sac"),
+    Recipe(CONTROL, "control", (REACH, PUSH), (*FIVE, "ensemble+mse"), FLOORS, only={**CEM, **OPEN}),
+    Recipe(CONTROL, "control", (REACH,), ("oracle",), only={"search_space": ("direct",)}),
+    Recipe(CONTROL, "control", (PUSH,), FIVE, options=f"--closed {' '.join(FIVE)}", only=CLOSED),
+    Recipe(CONTROL, "control", (REACH, PUSH), FIVE, options="--planners adam", only=ADAM, apart=CONVERGED),
+    Recipe(CONTROL[:1], "policies", (REACH,), (PAPERS,), FREE, "--iterations 880", POLICY, EARLY),
+    Recipe(CONTROL[:1], "policies", (REACH,), (*FIVE[1:], "ensemble+mse"), FREE, "--iterations 2200", POLICY, EARLY),
+    Recipe(CONTROL[:1], "policies", (PUSH,), FIVE, FREE, "--iterations 880", POLICY),
+    Recipe(CONTROL[:1], "early", (REACH,), OUR, options="--iterations 220", only=EARLY),
+    Recipe(CONTROL[1:], "convergence", (REACH, PUSH), OUR, only=CONVERGED),
+    Recipe(("06_robustness",), "robustness", (REACH, OBSTACLE), FIVE, ("none", "filter", "exponential"), whole=True),
+    Recipe(("07_action_prior",), "torques", (REACH, PUSH), OUR, ("prior", "none"), "--planners cem adam"),
+    Recipe(("07_action_prior",), "torques", (REACH,), ("oracle",)),
+    Recipe(("07_starts",), "", (REACH,), (PAPERS,), script=(
+        "python benchmarks/settings/starts.py --out data/results/07_starts.csv",
+    )),
+    Recipe(("09_your_own",), "", ROBOTS, (OURS, "onestep", "lstm", "ensemble+mse"), FLOORS, script=(
+        "python -m tsmlib run your_own --scale paper", "python -m tsmlib publish --table your_own",
+    )),
+    _rounds((PENDULUM, PUSH), (OURS, "lstm", "ensemble+mse"), "own plans"),
+    _rounds((PENDULUM, PUSH), (OURS, "lstm"), "random episodes"),
+    _rounds((PUSH,), (OURS, "lstm"), "no new episodes"),
+    *map(_loop, (PENDULUM, PUSH)),
+    _adapted(REACH, "gain0.7", ""),
+    *(_adapted(PUSH, arm, "--ways zero-shot all head codes scratch") for arm in ARMS),
+)  # fmt: skip
+
+
+# Wanted rows and their commands --------------------------------------------------------------------------------------
+
+
+def shipped() -> dict[str, pd.DataFrame]:
+    """Every table of data/results that a recipe makes."""
+    names = sorted({name for recipe in RECIPES for name in recipe.tables})
+    return {name: tables.load(path) for name in names if (path := tables.stored(RESULTS / f"{name}.csv"))}
+
+
+def asked(some: Iterable[Claim], rows: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """The rows that the checks of claims ask for, under every reading."""
+    checks = [check for one in some for found in one.checks.values() for check in found]
+    terms = {
+        (name, term) for check in checks for term in check.number.terms for name in (term.table, f"{term.table}_rows")
+    }
+    of = {name: dict(iter(rows[name].groupby(["metric", "model"]))) for name in {name for name, _ in terms} & set(rows)}
+    found: dict[str, pd.Index] = {}
+    for name, term in terms:
+        if name in of and (part := of[name].get((term.metric, term.model))) is not None:
+            wanted = {column: value for column, value in term.wanted.items() if column in part}
+            found[name] = select(part, **wanted).index.union(found.get(name, part.index[:0]))
+    return {name: rows[name].loc[index] for name, index in sorted(found.items())}
+
+
+def commands(wanted: Mapping[str, pd.DataFrame]) -> list[str]:
+    """That make these rows, recipe by recipe, seed by seed, each command once."""
+    found = list[str]()
+    for recipe in RECIPES:
+        made = [recipe.made(wanted[name]) for name in recipe.tables if name in wanted]
+        rows = pd.concat(made) if made else pd.DataFrame({"seed": []})
+        for seed, part in rows.groupby("seed"):
+            found += recipe.commands(part, str(seed))
+    return list(dict.fromkeys(found))
+
+
+def far(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Of each table and metric: rows, those made again, and how far their values then lie from those before, as a
+    share of the metric's standard deviation before."""
+    lines = []
+    for name, old in before.items():
+        about = [column for column in old if column not in ("value", "n")]
+        both = old.merge(after[name], on=about, suffixes=("", "_again"), how="left")
+        for metric, part in both.groupby("metric"):
+            off = (part["value_again"] - part["value"]).abs()
+            unit = part["value"].std() or 1.0
+            lines.append({
+                "table": name, "metric": metric, "rows": len(part), "there again": int(off.notna().sum()),
+                "equal": int((off == 0).sum()), "mean difference": off.mean() / unit, "largest": off.max() / unit,
+            })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+
+def words(line: str) -> list[str]:
+    """A command's words, with this interpreter in place of ``python``."""
+    found = shlex.split(line)
+    return [sys.executable if found[0] == "python" else str(ROOT / found[0]), *found[1:]]
+
+
+def missing(lines: Sequence[str]) -> dict[str, str]:
+    """Interpreters of other environments that are not there, and the page that tells how to install them."""
+    others = {shlex.split(line)[0] for line in lines} - {"python"}
+    pages = {name: f"benchmarks/{name.split('/')[1]}/README.md" for name in others}
+    return {name: page for name, page in sorted(pages.items()) if not (ROOT / name).exists()}
+
+
+def page() -> str:
+    """Every command as docs/reproducing.md has it, with the seeds of the rows that ship."""
+    rows, lines = shipped(), ['rows="python benchmarks/settings/rows.py" seed=0']
+    for recipe in RECIPES:
+        made = pd.concat([recipe.made(rows[name]) for name in recipe.tables if name in rows])
+        lines += ["", f"# {', '.join(recipe.tables)}: {_seeds(recipe, made)}"]
+        for line in recipe.commands(made, "$seed"):
+            lines.append(line.replace(f"python {ROWS}", "$rows"))
+    return "\n".join(
+        ["```{code-block} bash", *lines, "", f"# {JUDGED}, the pages, and the checksums of all", CLAIMS, "```"]
+    )
+
+
+def _seeds(recipe: Recipe, rows: pd.DataFrame) -> str:
+    """Of which seeds a recipe has rows: of all environments and models alike, or of each."""
+    told = {}
+    for env in recipe.envs:
+        of = rows[rows["env"] == recipe.env_of_rows(env)]
+        models: dict[str, list[str]] = {}
+        for word in (*recipe.models, *recipe.along[:1] * (not recipe.models)):
+            if there := sorted(set(of["seed"][of["model"] == word])):
+                models.setdefault(span(there), []).append(word)
+        most = max(models, key=lambda seeds: len(models[seeds]), default="no rows ship")
+        told[env] = "; ".join([most, *(f"{', '.join(models[one])}: {one}" for one in models if one != most)])
+    if len(set(told.values())) == 1:
+        return told[recipe.envs[0]]
+    return "; ".join(f"{env} ({text})" for env, text in told.items())
+
+
+def span(seeds: Sequence[int]) -> str:
+    """seed 0; seeds 0 to 4; seeds 0, 2."""
+    if len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"seeds {seeds[0]} to {seeds[-1]}"
+    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+
+
+def verdict(one: Claim) -> str:
+    """Of a claim, by the rows that are there."""
+    found = evaluate.judge(one, evaluate.tables([one]))
+    return f"{one.id} {found.word}: {found.key.check.text}: {found.key.text}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", help="tables of data/results, claims (C46), questions, or all")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="default: all that have such rows")
+    parser.add_argument(
+        "--subject", default=PAPERS, choices=(PAPERS, OURS), help=f"model that a claim is about (default {PAPERS})"
+    )
+    parser.add_argument("--list", action="store_true", help="print the commands, and run none")
+    parser.add_argument("--page", action="store_true", help="write the commands into docs/reproducing.md")
+    given = parser.parse_args()
+    if given.page:
+        between(PAGE, MARKS, page())
+        return
+    rows, known = shipped(), {one.id: one for one in (*claims(given.subject), *questions())}
+    if unknown := [name for name in given.what if name not in (*rows, *known, "all")]:
+        parser.error(
+            f"no table or claim is called {', '.join(unknown)}; there are {', '.join(rows)}; claims C01 to C54; all"
+        )
+    if not given.what:
+        parser.error("name a table of data/results, a claim, or all")
+    chosen = [known[name] for name in given.what if name in known]
+    parts = [asked(chosen, rows), {name: rows[name] for name in rows if name in given.what or "all" in given.what}]
+    wanted = {
+        name: (found := pd.concat(some))[~found.index.duplicated()].sort_index()
+        for name in rows if (some := [part[name] for part in parts if name in part])
+    }  # fmt: skip
+    if given.seeds:
+        there = sorted({int(seed) for table in wanted.values() for seed in table["seed"]})
+        wanted = {name: select(table, seed=given.seeds) for name, table in wanted.items()}
+        if lacking := sorted(set(given.seeds) - set(there)):
+            parser.error(f"no rows of seed {', '.join(map(str, lacking))} ship; there are {span(there)}")
+    lines = commands(wanted)
+    if given.list:
+        print("\n".join([*lines, CLAIMS]))
+        return
+    if others := missing(lines):
+        told = "; ".join(f"{name} (how to install it: {where})" for name, where in others.items())
+        parser.error(f"these commands need another environment: {told}; --list prints the commands")
+    before = [verdict(one) for one in chosen]
+    for i, line in enumerate([*lines, CLAIMS], 1):
+        print(f"[{i} of {len(lines) + 1}] {line}", flush=True)
+        if code := subprocess.run(words(line), cwd=ROOT, check=False).returncode:
+            raise SystemExit(
+                f"{line}\nended with status {code}; what was made before it stays, and the same command goes on"
+            )
+    print(far(wanted, shipped()).to_string(index=False, float_format="{:.3g}".format))
+    for old, new in zip(before, map(verdict, chosen), strict=True):
+        print(f"before  {old}\nagain   {new}")
+
+
+if __name__ == "__main__":
+    main()
