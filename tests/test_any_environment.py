@@ -26,6 +26,10 @@ from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import stepping
 from tsmlib.envs.snapshots import abilities
 from tsmlib.envs.stepping import Stepping, UnsupportedEnvironment, Vectorised, make_simulation, simulation
+from tsmlib.envs.unstable import SimulationUnstable
+from tsmlib.exploration import ExplorationOptions, explore
+from tsmlib.models.baselines import OneStep
+from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task
 from tsmlib.policies.networks import Policy, controller
 from tsmlib.training.fit import TrainingOptions
@@ -355,6 +359,51 @@ class Fragile(gymnasium.Env):
 
     def close(self) -> None:
         Fragile.open -= 1
+
+
+class BlowsUp(gymnasium.Env):
+    """A point that is pushed; from every third reset its speed is not a number at the fourth step."""
+
+    observation_space, action_space = Box(-np.inf, np.inf, (2,)), Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.state, self.taken = np.array([seed or 0, 0.0]) / 100, 0
+        self.fails = (seed or 0) % 3 == 1
+        return self.state.astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.taken += 1
+        self.state += np.array([self.state[1], 0.1 * float(action[0])])
+        if self.fails and self.taken == 4:
+            self.state[1] = np.nan
+        return self.state.astype(np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("vectorised", [False, True])
+def test_an_episode_that_is_not_finite_is_told_with_its_step_since_reset(made: Made, vectorised: bool) -> None:
+    env_id = made(BlowsUp)
+    copies = [lambda: gymnasium.make(env_id)] * 3
+    run = simulation(AsyncVectorEnv(copies, context="fork") if vectorised else SyncVectorEnv(copies))
+    with closing(run):
+        run.reset(seed=0)
+        run.rollout(np.zeros((3, 2, 1)))
+        with pytest.raises(SimulationUnstable, match=r"episode 1 at step 3: x1 is nan") as caught:
+            run.rollout(np.zeros((3, 5, 1)))
+        assert (caught.value.env, caught.value.episode, caught.value.step) == (run.id, 1, 3)
+
+
+def test_exploring_leaves_out_the_episodes_in_which_an_environment_blows_up(made: Made) -> None:
+    env_id = made(BlowsUp, max_episode_steps=20)
+    sound = Task.from_env(env_id, n=6, horizon=8, reward=still, seed=100).take([1, 2, 4, 5])
+    data = execute(sound, 0.3 * torch.randn(4, 8, 1, generator=torch.Generator().manual_seed(0))).seen
+    assert data is not None
+    once = TrainingOptions(past_len=1, future_len=4, steps=2, batch_size=4, validate_every=1)
+    options = ExplorationOptions(once, rounds=1, every=4, candidates=4, elites=2, iterations=1)
+    model = OneStep.for_data(data, hidden=4)
+    asked = Task.from_env(env_id, n=6, horizon=8, reward=still, seed=200)  # 202 and 205 fail
+    found = explore(model, None, data.take([0, 1, 2]), data.take([3]), lambda k: asked, options)
+    assert (found.records[0]["lost"], len(found.episodes[0] or ())) == (2, 4)
+    assert found.records[0]["env_steps"] == 4 * 6 + 4 * 5 + 8 * 4
 
 
 def test_environments_are_closed_where_collecting_or_executing_raises(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 import tsmlib as tsm
 from tsmlib import exploration
-from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.storage import artifacts
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import StoreError
@@ -394,6 +394,7 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
     (dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)), "are of tsm/ReacherObstacle-v0, the data"),
     (dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)), "states have 10 dimensions .* tsm/Reacher-v0 6"),
     (dict(prior=None, model=tsm.LSTM(6, 2, angles=(0,), hidden=8)), r"angles \[0\], .*angles \[0, 1\]; expected"),
+    (dict(prior=None, model=tsm.LSTM(6, 3, angles=(0, 1), hidden=8)), "actions have 3 dimensions, .*Reacher-v0 2"),
     (dict(prior=tsm.ActionPrior.for_data(data("Pendulum-v1"))), "prior's actions have 1 dimensions, .*Reacher-v0 2"),
     (dict(options=one_step(model=replace(options().model, past_len=7))), "past_len is 7, but OneStep is given"),
     (dict(options=one_step(prior=replace(options().model, past_len=7))), "past_len is 7, but ActionPrior is given 10"),
@@ -412,13 +413,20 @@ def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned()
 
 
 @pytest.mark.parametrize(("changes", "said"), [
-    ({"rounds": 0}, "at least 1 round"), ({"rounds": 1.5}, "at least 1 round"), ({"bonus": math.nan}, "zero or above"),
-    ({"samples": 1}, "2 samples"), ({"noise": -1}, "zero or above"),
-    ({"held_out": 1.0}, "a share between 0 and 1"), ({"judging": -1}, "0 samples"), ({"screened": 2.0}, "from 0 to 1"),
+    ({"rounds": 0}, "rounds is 0; expected a whole number of at least 1"), ({"rounds": 1.5}, "rounds is 1.5"),
+    ({"rounds": True}, "rounds is True"), ({"every": 0}, "every is 0; .*at least 1"), ({"iterations": 2.5}, "is 2.5"),
+    ({"candidates": 1}, "at least 2"), ({"elites": 5}, "elites is 5, of 4 candidates"), ({"judging": 1.5}, "is 1.5"),
+    ({"samples": 1}, "samples is 1; .*at least 2"), ({"samples": 2.5}, "is 2.5"), ({"noise": -1}, "zero or above"),
+    ({"bonus": math.nan}, "zero or above"), ({"held_out": 1.0}, "a share between 0 and 1"),
+    ({"judging": -1}, "judging is -1; .*at least 0"), ({"screened": 2.0}, "from 0 to 1"),
 ])  # fmt: skip
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         options(**changes)
+
+
+def test_a_whole_number_of_rounds_may_be_one_of_numpy() -> None:
+    assert len(explored(*learners(), options=options(rounds=np.int64(1))).records) == 1
 
 
 def test_episodes_are_joined_whatever_their_lengths_and_never_those_of_two_robots() -> None:

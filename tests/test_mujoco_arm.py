@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tsmlib.envs import mujoco_arm
-from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.envs.geometry import (
     ARM_RADIUS,
     BLOCK_DECAY,
@@ -27,6 +26,7 @@ from tsmlib.envs.geometry import (
 )
 from tsmlib.envs.mujoco_arm import MujocoArm, load_model
 from tsmlib.envs.spec import MUJOCO_IDS
+from tsmlib.envs.unstable import SimulationUnstable
 
 REACHER, OBSTACLE, PUSH = MUJOCO_IDS
 DATA_RMS = 0.05  # rms of the torques that data are collected with

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.geometry import (
     BLOCK_DECAY,
     BLOCK_MASS,
@@ -22,6 +22,7 @@ from tsmlib.envs.geometry import (
 )
 from tsmlib.envs.pymunk_arm import ARMATURE, DAMPING, ELBOW_MASS
 from tsmlib.envs.spec import PYMUNK_IDS
+from tsmlib.envs.unstable import SimulationUnstable
 
 REACHER, OBSTACLE, PUSH = PYMUNK_IDS
 N, T = 40, 100

@@ -15,7 +15,7 @@ from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
-from tsmlib.envs.arm import SimulationUnstable
+from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables

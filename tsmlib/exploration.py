@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -25,7 +26,7 @@ from tqdm.auto import tqdm
 
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics
-from tsmlib.models.features import Features
+from tsmlib.models.features import require_robot
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, mpc, without_unstable
 from tsmlib.planning.planners import cem
@@ -87,11 +88,13 @@ class ExplorationOptions:
     screened: float = 0.25
 
     def __post_init__(self) -> None:
-        if not isinstance(self.rounds, int) or self.rounds < 1 or self.samples < 2:
-            raise ValueError(
-                f"rounds {self.rounds}, samples {self.samples}: expected a whole number of at least 1 round, and "
-                "at least 2 samples"
-            )
+        least = {"rounds": 1, "every": 1, "candidates": 2, "elites": 1, "iterations": 1, "samples": 2, "judging": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+                raise ValueError(f"{name} is {value!r:.80}; expected a whole number of at least {low}")
+        if self.elites > self.candidates:
+            raise ValueError(f"elites is {self.elites}, of {self.candidates} candidates; expected no more than these")
         if not 0 < self.rms < math.inf:
             raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
         if not (0 <= self.noise < math.inf and 0 <= self.bonus < math.inf and 0 < self.held_out < 1):
@@ -99,11 +102,8 @@ class ExplorationOptions:
                 f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
                 "a share between 0 and 1"
             )
-        if self.judging < 0 or not 0 <= self.screened <= 1:
-            raise ValueError(
-                f"judging {self.judging}, screened {self.screened}: expected 0 samples (the mode) or more, and a share "
-                "from 0 to 1"
-            )
+        if not 0 <= self.screened <= 1:
+            raise ValueError(f"screened is {self.screened}; expected a share from 0 to 1")
 
 
 @dataclass
@@ -203,9 +203,8 @@ def explore(
 def _require_robot(model: Trainable, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories) -> None:
     """Error unless all are of one robot, as far as their sizes and names tell."""
     train.require_robot_of(held_out)
-    features, actions = getattr(model, "features", None), train.actions.shape[2]
-    if isinstance(features, Features):
-        features.require_robot(train, "a model of the robot that explores")
+    require_robot(model, train, "a model of the robot that explores")
+    actions = train.actions.shape[2]
     if prior is not None and len(prior.std) != actions:
         raise ValueError(
             f"the prior's actions have {len(prior.std)} dimensions, those of {train.env} {actions}; expected a prior "

@@ -16,7 +16,7 @@ from typing import Literal, Protocol, runtime_checkable
 from torch import nn
 
 from tsmlib.models.codes import CodeLayers, learned_codes
-from tsmlib.models.features import Features
+from tsmlib.models.features import Features, require_robot
 from tsmlib.training.callbacks import Callback
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.training.fit import Loss, TrainingHistory, TrainingOptions, fit, fixed_windows, validate
@@ -51,8 +51,8 @@ def fine_tune(
 
     It begins with the model's weights and keeps the statistics of its features, for which they were made. The weights
     with the best validation loss are left in ``model``, those it began with among them, also where TrainingStopped is
-    raised; no part stays frozen. ValueError for a model that was never trained, has other states or angles than the
-    data, or lacks the part.
+    raised; no part stays frozen. ValueError for a model that was never trained, has other states, angles or actions
+    than the data, or lacks the part.
     """
     _require_trained(model, train)
     first = {name: weight.detach().clone() for name, weight in model.state_dict().items()}
@@ -115,4 +115,4 @@ def _require_trained(model: nn.Module, data: Trajectories) -> None:
             f"this {type(model).__name__} was never trained: it knows no statistics of its data. Load a trained one, "
             "or train it with tsmlib.fit"
         )
-    features.require_robot(data, "data of the same robot, changed")
+    require_robot(model, data, "data of the same robot, changed")

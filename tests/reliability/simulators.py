@@ -9,9 +9,10 @@ import gymnasium
 import numpy as np
 
 from reliability.world import Outcome, refusal, rng
-from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.geometry import DT, closest_gap
 from tsmlib.envs.spec import MUJOCO_IDS, PYMUNK_IDS
+from tsmlib.envs.unstable import SimulationUnstable
 
 PUSH, PYMUNK_PUSH = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 

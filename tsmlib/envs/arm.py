@@ -20,19 +20,9 @@ from tsmlib.envs import geometry
 from tsmlib.envs.geometry import DT, MAX_OVERLAP, closest_gap, fingertip
 from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.unstable import SimulationUnstable
 
 Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
-
-
-class SimulationUnstable(RuntimeError):
-    """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` since reset (from 0), ``reason``."""
-
-    def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
-        super().__init__(
-            f"the simulation of {env} became unstable in episode {episode} at step {step}: {reason}. "
-            "Check the state this episode started from; the other episodes of this call were not returned."
-        )
-        self.env, self.episode, self.step, self.reason = env, episode, step, reason
 
 
 class ArmVectorEnv(VectorEnv, ABC):

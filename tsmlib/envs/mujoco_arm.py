@@ -25,7 +25,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.geometry import (
     BLOCK_DECAY,
     BLOCK_MASS,
@@ -40,6 +40,7 @@ from tsmlib.envs.mujoco_bulk import without_log
 from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.unstable import SimulationUnstable
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move

@@ -18,11 +18,12 @@ import numpy as np
 import pymunk
 
 from tsmlib.envs import geometry
-from tsmlib.envs.arm import ArmVectorEnv, SimulationUnstable
+from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_DECAY, BLOCK_MASS, DT, ELBOW_LIMIT, WALL, capsule_length
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.unstable import SimulationUnstable
 
 SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies
 ITERATIONS = 20

@@ -25,6 +25,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from tsmlib.envs.mujoco_bulk import CHUNK, Mismatch, without_log
 from tsmlib.envs.snapshots import Snapshot, Step, abilities, play, restore, save
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.unstable import SimulationUnstable
 
 Seeds = int | Sequence[int] | None  # of the first episode, those after it following; or of each
 
@@ -63,7 +64,10 @@ class Simulation(Protocol):
         ...
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
-        """Go on by ``actions`` (N, T, du) in [-1, 1]: the states (N, T, dx) after each."""
+        """Go on by ``actions`` (N, T, du) in [-1, 1]: the states (N, T, dx) after each.
+
+        SimulationUnstable where one of them is not finite, or, for the arms, not possible.
+        """
         ...
 
     def close(self) -> None:
@@ -205,6 +209,13 @@ class _Described:
             raise ValueError(f"an action for {self.id} is not finite; nothing was simulated")
         return within_bounds(actions, self.actions)
 
+    def _require_finite(self, states: np.ndarray, i: int) -> None:
+        """SimulationUnstable unless all that episode i came to (T, dx) is finite."""
+        wrong = ~np.isfinite(states)
+        if wrong.any():
+            t, d = np.argwhere(wrong)[0].tolist()
+            raise SimulationUnstable(self.id, i, int(self.steps[i]) + t, f"{self.names[d]} is {states[t, d]}")
+
     def _checked(self, observation: object) -> np.ndarray:
         found = np.asarray(observation)
         if found.shape != self.space.shape:
@@ -249,6 +260,7 @@ class Stepping(_Described):
             running.tolist(), self._simulated(running, commands[running], self.keeps_returns), strict=True
         ):
             self._fill(states[i], steps)
+            self._require_finite(states[i, : len(steps)], i)
             self._count(i, steps)
             self._leave(i)
         self.last = states[:, -1].copy() if actions.shape[1] else self.last
@@ -369,6 +381,7 @@ class Vectorised(_Described):
                 if over[i] and self.mode == AutoresetMode.SAME_STEP:
                     seen = info["final_obs"][i]  # what was observed is the next episode's first state
                 states[i, t:] = self._checked(seen)
+                self._require_finite(states[i, t : t + 1], int(i))
                 self.returns[i] += rewards[i]
                 self.steps[i] += 1
                 self.terminated[i], self.ended[i] = terminated[i], over[i]

@@ -8,7 +8,7 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-from tsmlib.models.config import weights_from
+from tsmlib.models.config import Configured, weights_from
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Trajectories, real_steps
 
@@ -50,7 +50,7 @@ class Features(nn.Module):
         self.step_std.copy_(torch.where(step_std > 1e-3 * step_rms, step_std, step_rms))  # a clock's steps are alike
         return self
 
-    def require_robot(self, data: Trajectories, expected: str) -> None:
+    def require_states(self, data: Trajectories, expected: str) -> None:
         """ValueError where the states of ``data`` have other dimensions or angles. expected: ends the message."""
         states = data.states.shape[2]
         if len(self.step_std) != states or self.angles != list(data.angles):
@@ -140,3 +140,16 @@ def _columns(index: list[int]) -> slice | list[int]:
     """An index of columns, as a slice where they lie side by side: a view, and no scattered gradient."""
     side_by_side = bool(index) and index == list(range(index[0], index[-1] + 1))
     return slice(index[0], index[-1] + 1) if side_by_side else index
+
+
+def require_robot(model: object, data: Trajectories, expected: str) -> None:
+    """ValueError where a model's states or actions are not those of ``data``, as far as it knows its own."""
+    features = getattr(model, "features", None)
+    if isinstance(features, Features):
+        features.require_states(data, expected)
+    known = model.config().get("action_dim") if isinstance(model, Configured) else None
+    if known is not None and known != data.actions.shape[2]:
+        raise ValueError(
+            f"the model's actions have {known} dimensions, those of {data.env} {data.actions.shape[2]}; "
+            f"expected {expected}"
+        )

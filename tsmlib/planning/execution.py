@@ -16,8 +16,8 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from tsmlib.collection import Controller, collect, open_loop
-from tsmlib.envs.arm import SimulationUnstable
 from tsmlib.envs.stepping import Arms, Simulation, make_simulation
+from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.envs.wrappers import ImperfectArms
 from tsmlib.models.base import Model, as_dynamics
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
