@@ -212,3 +212,43 @@ def test_the_benchmark_predicts_returns_by_samples_that_neither_planner_nor_judg
     assert drawn["fresh_predictor"] not in {*judges, drawn["cem"]}
     assert float(found["gap"]) >= 0
     assert int(found["targets"]) == len(task)
+
+
+def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> None:
+    common = dict(env=WEAK, model="lstm", planner="none", execution="open loop", metric="energy_score_noise",
+                  steps_ahead=10, scale="paper")  # fmt: skip
+    rows = tables.frame(
+        common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, steps, values in (
+            ("zero-shot", 0, [1.0, 2.0]), ("all", 2000, [0.5, 1.5]), ("all", 500, [9.0, 9.0]), ("head", 2000, [2.0]),
+            ("scratch", 2000, [3.0, 3.0]),
+        )
+        for seed, value in enumerate(values)
+    )  # fmt: skip
+    ((title, robots),) = adaptation_results.shares_left(rows, 20).items()
+    assert (title, list(robots)) == ("LSTM, 10 steps", ["reach, torque x 0.7"])
+    assert {way.model: share.tolist() for way, share in robots["reach, torque x 0.7"].items()} == {
+        "all": [0.5, 0.75], "head": [2.0],
+    }  # fmt: skip
+
+
+def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() -> None:
+    shares = adaptation_results.shares_left(published("10_explore"), 20)
+    in_vain, of_use = ("push, mass x 0.5", "push, mass x 2", "push, upper link x 1.2"), ("damping", "torque")
+    means = {
+        (title, name, way.model): share.mean() for title, robots in shares.items() if title.endswith("80 steps")
+        for name, ways in robots.items() for way, share in ways.items()
+    }  # fmt: skip
+    harmed = [mean for (_, name, _), mean in means.items() if name in in_vain]
+    assert min(harmed) >= 0.93
+    assert np.mean([mean > 1 for mean in harmed]) > 0.5
+    assert all(mean < 1 for (_, name, way), mean in means.items() if way != "codes" and any(w in name for w in of_use))
+
+
+def test_shares_left_are_drawn_with_a_mark_for_the_mean_and_a_dot_for_each_seed() -> None:
+    ((_, robots),) = list(adaptation_results.shares_left(published("10_explore"), 20).items())[:1]
+    (ax,) = figures.shares_left({"LSTM": robots}, "share").axes
+    ways = next(iter(robots.values()))
+    dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
+    assert [share.tolist() for share in ways.values()] == dots[: len(ways)]
+    assert [text.get_text() for text in ax.get_yticklabels()] == [*robots]

@@ -509,7 +509,7 @@ def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_
     assert (pushed.groupby("iteration")["value"].mean().diff().iloc[1:] < 0).all()
 
 
-def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> None:
+def test_rounds_are_drawn_with_their_task_their_units_and_single_seeds() -> None:
     common = dict(env=PUSH, model="lstm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=9)
     rows = tables.frame([
         common | dict(metric=metric, env_steps=20_000 * k, iteration=k, value=low + 0.01 * seed + k / 5, seed=seed,
@@ -518,12 +518,29 @@ def test_rounds_are_drawn_with_their_task_their_units_and_their_intervals() -> N
     ]).assign(source=table.YOURS)  # fmt: skip
     (drawing,) = drawings.rounds(rows, PUSH, results.DRAWN[PUSH])
     first, second = drawing.figure.axes
+    single = [line.get_ydata().tolist() for line in first.lines if line.get_lw() < 1]
+    assert single == [pytest.approx([-9 + 0.01 * seed + k / 5 for k in range(3)]) for seed in range(3)]
     assert [ax.get_title(loc="left") for ax in (first, second)] == ["Push: executed return", "Push: share within 5 cm"]
     assert [ax.get_ylabel() for ax in (first, second)] == ["return (m)", "share of targets"]
     assert first.xaxis.get_major_formatter()(20_000) == "20,000"
-    (bars,) = first.collections
-    mean, half = interval([-8.8, -8.79, -8.78])
-    assert bars.get_segments()[1][:, 1].tolist() == pytest.approx([mean - half, mean + half])
+    mean = next(line.get_ydata() for line in first.lines if line.get_marker() == "v")
+    assert mean.tolist() == pytest.approx([-8.99, -8.79, -8.59])
+
+
+def test_training_alone_and_the_oracle_are_lines_across_with_their_seeds() -> None:
+    plans = tables.frame([
+        dict(env=PUSH, model="oracle", search_space="latent", planner="cem", execution="open loop", seed=seed,
+             metric="return_true", value=-8.0 - seed)
+        for seed in range(2)
+    ]).assign(source=table.YOURS)  # fmt: skip
+    (drawing,) = drawings.rounds(pushing_rows(-15.0), PUSH, results.DRAWN[PUSH], plans=plans)
+    (ax,) = drawing.figure.axes
+    level = sorted(float(line.get_ydata()[0]) for line in ax.lines if [*line.get_xdata()] == [0, 1])
+    assert level == [pytest.approx(-12.9), pytest.approx(-8.5)]
+    shades = sorted((patch.get_y(), patch.get_y() + patch.get_height()) for patch in ax.patches)
+    assert shades == [pytest.approx((-13.0, -12.8)), pytest.approx((-9.0, -8.0))]
+    told = {text.get_text() for text in drawing.figure.legends[0].texts}
+    assert {"recurrent TSM, no new episodes, round 2", "oracle, open loop, 2 seeds", "single seeds"} <= told
 
 
 def pushing_rows(low: float) -> pd.DataFrame:
@@ -541,9 +558,8 @@ def pushing_rows(low: float) -> pd.DataFrame:
 def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> None:
     (drawing,) = drawings.rounds(pushing_rows(-30.0), PUSH, results.DRAWN[PUSH])
     (ax,) = drawing.figure.axes
-    before = interval([-12.0, -11.9, -11.8])
     low = results.axis_ends(pushing_rows(-30.0), PUSH)["executed return"]
-    assert low == pytest.approx(1.1 * (before[0] - before[1]))
+    assert low == pytest.approx(1.1 * -12.0)
     assert ax.get_ylim()[0] == low
     assert "outside: LSTM, own plans to −29.9" in ax.get_xlabel()
     all_below = pushing_rows(-30.0).assign(value=-25.0)

@@ -18,6 +18,7 @@ from tsmlib.figures.method import Method
 from tsmlib.figures.style import DARK, GRID, WIDTH, entry, panels, styled, tint
 
 Rounds = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> method -> steps (R,), values (k, R)
+Levels = Mapping[str, Mapping[Method, np.ndarray]]  # title -> method -> values (k,)
 
 DENSE = 12  # marks of a line
 
@@ -25,16 +26,16 @@ DENSE = 12  # marks of a line
 @styled
 def rounds(
     curves: Rounds, ylabel: str | Mapping[str, str], yours: Rounds | None = None,
-    lowest: Mapping[str, float] | None = None,
+    lowest: Mapping[str, float] | None = None, levels: Levels | None = None,
 ) -> Figure:  # fmt: skip
-    """What was measured after each round, against environment steps: mean over seeds, bars for the 95 % t interval.
+    """What was measured after each round, against environment steps: mean over seeds, and thin lines of single seeds.
 
     curves: title -> method -> environment steps (R,) and values (k, R); ylabel: one for all, or title -> text; yours:
     as curves, drawn over them as hollow diamonds; lowest: title -> where an axis ends, so that what falls below it does
-    not squeeze the others (arrows and words say how far), unless most does. A line begins before the first round; a
-    method of one round is a large pale mark, one of more than DENSE a line without marks, its bar at its end. Marks of
-    methods at the same steps stand a little beside each other, so that their bars part. Steps are on a logarithmic axis
-    where they span a factor of ten. Bars of what is never negative end at zero.
+    not squeeze the others (arrows and words say how far), unless most does; levels: title -> method -> values (k,), of
+    what takes no rounds, as a line across with all seeds within its shade. A line begins before the first round; a
+    method of one round is a large pale mark, one of more than DENSE a line without marks, its seeds at its end. Steps
+    are on a logarithmic axis where they span a factor of ten.
     """
     own, every = yours or {}, {title: {**(yours or {}).get(title, {}), **rows} for title, rows in curves.items()}
     look_of, ylabels = axes.looks(curves, own), per_panel("ylabel", ylabel, curves)
@@ -42,36 +43,46 @@ def rounds(
         look_of[method] |= {"ls": "", "ms": 6.5, "mfc": tint(method.look.colour, 0.6)}
     for method in {method for rows in every.values() for method, (at, _) in rows.items() if len(at) > DENSE}:
         look_of[method] |= {"marker": ""}
+    across = levels or {}
+    level_of = axes.looks(across, {}) if across else {}
+    for look in level_of.values():
+        look |= {"marker": "", "lw": 1.1, "ls": (0, (1, 1))}
     width = WIDTH if len(curves) > 1 else 3.8
     figure, grid = panels(len(curves), len(curves), 2.0, width=width, head=0)
-    barred, steps = False, np.concatenate([at for rows in every.values() for at, _ in rows.values()])
-    far, near = float(steps.max()), float(steps.min())
-    log = 0 < near < far / 10
+    steps = np.concatenate([at for rows in every.values() for at, _ in rows.values()])
+    log, single = 0 < steps.min() < steps.max() / 10, False
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
         values = np.concatenate([np.ravel(found) for _, found in every[title].values()])
+        steps = np.concatenate([at for at, _ in every[title].values()])
+        near, far = float(steps.min()), float(steps.max())
+        beyond = [finite(f"{title}, {method.label}", at, "k") for method, at in across.get(title, {}).items()]
+        values = np.concatenate([values, *beyond])
         low, high = axes.limits(values, values)
         floor = (lowest or {}).get(title, low)
         low = max(low, floor) if np.median(values) > floor else low
         ax.set_ylim(0 if values.min() >= 0 and low < high / 5 else low, high)
         notes = []
+        for method, seeds in zip(across.get(title, {}), beyond, strict=True):
+            ax.axhspan(seeds.min(), seeds.max(), color=tint(method.look.colour, 0.2), lw=0, zorder=1)
+            ax.axhline(float(seeds.mean()), **level_of[method], zorder=2)
         for method, given in rows.items():
             at, found = _checked(f"{title}, {method.label}", *given)
-            mean, half = axes.band(found)
-            dense, aside = len(at) > DENSE, [*look_of].index(method) - (len(look_of) - 1) / 2
-            beside = at if dense else at * 1.02**aside if log else at + 0.012 * far * aside
-            barred_at = slice(-1, None) if dense else slice(None)
-            bottom = np.maximum(mean - half, 0) if values.min() >= 0 else mean - half
-            middle, length = (bottom + mean + half) / 2, (mean + half - bottom) / 2
-            axes.bars(ax, beside[barred_at], middle[barred_at], length[barred_at], method.look.colour)
+            mean, thin = found.mean(0), tint(method.look.colour, 0.5)
+            if len(at) > DENSE or len(at) == 1:
+                ax.plot(np.full(len(found), at[-1]), found[:, -1], "_", color=thin, ms=5, mew=0.9, zorder=3)
+            else:
+                ax.plot(at, found.T, color=thin, ls=look_of[method]["ls"], lw=0.6, zorder=2)
             size = {"ms": 4.5 if len(at) > 1 else 6.5}
-            ax.plot(beside, mean, **look_of[method] | size, zorder=3 if len(at) > 1 else 4)
-            notes += axes.outside(ax, beside, mean, method)
-            barred |= bool(half.any())
+            ax.plot(at, mean, **look_of[method] | size, zorder=3 if len(at) > 1 else 4)
+            notes += axes.outside(ax, at, mean, method)
+            single |= len(found) > 1
         for method, given in own.get(title, {}).items():
             at, found = _checked(f"{title}, {method.label}, yours", *given)
             notes += axes.diamonds(ax, "y", at, found.mean(0), method)
         if log:
             axes.log_axis(ax, near, far, "x")
+            if len(curves) > 2 and near < far / 10:  # narrow panels
+                ax.xaxis.set_major_locator(LogLocator())
             ax.set_xlim(near / 1.25, far * 1.25)
         else:
             ax.set_xlim(0, 1.05 * far)
@@ -80,9 +91,9 @@ def rounds(
         ax.grid(axis="y", color=GRID, lw=0.6)
         ax.set(title=title, ylabel=ylabels[title])
         axes.foot(ax, "environment steps", notes, width / len(curves) - 0.5)
-    handles = axes.entries(look_of)
-    if barred:
-        handles.append(_bar())
+    handles = [*axes.entries(look_of), *axes.entries(level_of)]
+    if single:
+        handles.append(entry("single seeds", color=tint(DARK, 0.5), lw=0.6))
     return axes.finish(figure, [grid], [*handles, *axes.yours_entry(*own.values())], 3 if len(curves) > 1 else 2)
 
 
@@ -122,6 +133,36 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
     bars = [_bar()] * any(len(found) > 1 for found in every)
     handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
     return axes.finish(figure, [grid], handles, 4)
+
+
+@styled
+def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]], xlabel: str) -> Figure:
+    """What is left of an error, as a share of what it was, on a logarithmic axis: a mark for the mean over seeds, a dot
+    for each seed; left of the line at 1 is better than before.
+
+    shares: title -> name of a robot, a line each -> way -> shares (k,), all above 0.
+    """
+    names = [*dict.fromkeys(name for robots in shares.values() for name in robots)]
+    look_of = axes.looks(*shares.values())
+    figure, grid = panels(len(shares), len(shares), 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
+    every = np.concatenate([
+        np.ravel(finite(f"{title}, {name}", values, "k"))
+        for title, robots in shares.items() for name, ways in robots.items() for values in ways.values()
+    ])  # fmt: skip
+    low, high = axes.limits(every, every, log=True)
+    for ax, (title, robots) in zip(grid, shares.items(), strict=True):
+        axes.log_axis(ax, low, high, "x")
+        ax.axvline(1, color=DARK, lw=0.8, zorder=1)
+        for name, ways in robots.items():
+            for way, seeds in ways.items():
+                at = names.index(name) + 0.22 * ([*look_of].index(way) - (len(look_of) - 1) / 2)
+                ax.plot(seeds, np.full(len(seeds), at), ".", color=tint(way.look.colour, 0.6), ms=3, mew=0, zorder=2)
+                ax.plot(seeds.mean(), at, **look_of[way] | {"ls": "", "ms": 5, "mew": 1}, zorder=3)
+        ax.set(title=title, xlabel=xlabel, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
+        ax.set_yticks(range(len(names)), names)
+        ax.grid(axis="x", color=GRID, lw=0.6)
+    dots = entry("single seeds", color=tint(DARK, 0.5), ls="", marker=".", ms=3)
+    return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), dots], 4)
 
 
 def _bar() -> Line2D:

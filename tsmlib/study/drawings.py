@@ -169,12 +169,17 @@ def advantage_map(
 # 10_explore ----------------------------------------------------------------------------------------------------------
 
 
-def rounds(found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFrame | None = None) -> Iterator[Drawing]:
+def rounds(
+    found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFrame | None = None,
+    plans: pd.DataFrame | None = None,
+) -> Iterator[Drawing]:  # fmt: skip
     """What rounds of exploration bring on an environment: numbers of ``exploration.ROUNDS``, by their titles. free:
-    learning curves of policies without a model, beside."""
+    learning curves of policies without a model, beside; plans: rows of 05_control, of which the oracle's are."""
     task, units = exploration.TASKS[env].capitalize(), exploration.UNITS[env]
     rows = table.select(found, execution=planning.CLOSED, env=env)
-    curves, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env, alone=True))
+    every, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env, alone=True))
+    curves, _ = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
+    across = exploration.levels(every, curves, found[:0] if plans is None else plans, env)
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         policies = {} if free is None else exploration.policy_panels(free, titles, env)
@@ -190,7 +195,18 @@ def rounds(found: pd.DataFrame, env: str, titles: Sequence[str], free: pd.DataFr
             source = table.PUBLISHED if table.PUBLISHED in set(rows["source"]) else table.YOURS
             beside = table.select(free, env=env, planner="policy", subset="", model=exploration.MODEL_FREE)
             rows = pd.concat([rows, beside.assign(source=source)])
-        yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest), stem, rows)
+        levels = {f"{task}: {title}": values for title, values in across.items()}
+        yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest, levels=levels), stem, rows)
+
+
+def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:
+    """What adapting leaves of the zero-shot energy score, arm by arm, by the models that ship rows of several arms."""
+    rows = table.select(table.drawn(found), execution=planning.OPEN, planner="none")
+    several = [word for word, part in table.groups(rows, "model") if part["env"].nunique() > 1]
+    rows = table.select(rows, model=several)
+    if shares := adaptation.shares_left(rows, episodes):
+        what = f"share left by {episodes} episodes"
+        yield Drawing(figures.shares_left(shares, what), "10_arms", rows)
 
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:

@@ -212,5 +212,6 @@ def drawings_of_rows() -> Iterator[Drawing]:
     yield from drawings.figure8(imperfect, drawings.floors(tasks[0]))
     yield from drawings.advantage_map(imperfect, predict, asked.subject, asked.rivals, asked.noises, asked.delays)
     for env, titles in exploration.DRAWN.items():
-        yield from drawings.rounds(explored, env, titles, free)
+        yield from drawings.rounds(explored, env, titles, free, control)
     yield from drawings.ways(explored, WEAK_MOTORS.env)
+    yield from drawings.shares_left(explored)

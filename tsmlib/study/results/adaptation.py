@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import Scores
 from tsmlib.figures.method import Look, Method
@@ -63,6 +64,38 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
         model: dict(sorted(ways.items(), key=lambda item: [*WAYS].index(item[0].model)))
         for model, ways in found.items()
     }
+
+
+def shares_left(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
+    """Model and steps ahead -> arm -> way -> the share of the zero-shot energy score that is left (k,), paired by seed,
+    for ``figures.shares_left``. What is adapted alone, not what is trained anew."""
+    found: dict[str, dict[str, dict[Method, np.ndarray]]] = {}
+    here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
+    for (word, ahead, env), own in table.groups(here, ["model", "steps_ahead", "env"]):
+        before = table.select(own, configuration="zero-shot").set_index("seed")["value"]
+        ways = {}
+        for way in ("all", "head", "codes"):
+            after = table.select(own, configuration=way, env_steps=100 * episodes).set_index("seed")["value"]
+            if len(share := (after / before).dropna()):
+                ways[Method(way, look=WAYS[way])] = share.to_numpy(float)
+        if ways:
+            found.setdefault(f"{zoo.look(word).name}, {ahead} steps", {})[changes_of(env)] = ways
+    return {title: found[title] for title in sorted(found)}
+
+
+def changes_of(env: str) -> str:
+    """What has changed of an arm, in words: ``"push, mass x 0.5"``."""
+    spec, usual = EnvSpec.parse(env), Physics()
+    told = [
+        f"{name} x {value / of:g}"
+        for name, value, of in (
+            ("mass", spec.physics.mass, usual.mass), ("damping", spec.physics.damping, usual.damping),
+            ("upper link", spec.physics.link_lengths[0], usual.link_lengths[0]),
+            ("torque", spec.physics.torque_gain, usual.torque_gain),
+        )
+        if value != of
+    ]  # fmt: skip
+    return ", ".join([spec.task, *told])
 
 
 @table.sourced

@@ -16,17 +16,16 @@ import pandas as pd
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.figures.method import Method
-from tsmlib.statistics import interval
 from tsmlib.study import zoo
 from tsmlib.study.results import table
-from tsmlib.study.results.planning import CLOSED, OPEN
+from tsmlib.study.results.planning import CLOSED, OPEN, ORACLE
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 
 PENDULUM, PUSH, HORIZON = "Pendulum-v1", "tsm/ReacherPush-v1", 100
 DRAWN = {
-    PENDULUM: ("executed return", "size of the first plan's gap"),
-    PUSH: ("executed return", "share within 5 cm"),
+    PENDULUM: ("executed return", "the first plan's gap open loop"),
+    PUSH: ("executed return", "share within 5 cm", "the first plan's gap open loop"),
 }  # of ROUNDS
 TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
@@ -43,12 +42,17 @@ SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, with
 EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
+Panels = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> learner -> steps (R,), values (k, R)
 UNITS = {  # of DRAWN, as a figure's axes say them
     PENDULUM: {
         "executed return": "return (sum of 100 rewards)",
-        "size of the first plan's gap": "gap (sum of 100 rewards)",
+        "the first plan's gap open loop": "gap (sum of 100 rewards)",
     },
-    PUSH: {"executed return": "return (m)", "share within 5 cm": "share of targets"},
+    PUSH: {
+        "executed return": "return (m)",
+        "share within 5 cm": "share of targets",
+        "the first plan's gap open loop": "gap (m)",
+    },
 }
 
 
@@ -156,16 +160,35 @@ def policy_panels(
     return found
 
 
+def levels(alone: Panels, planned: Panels, plans: pd.DataFrame, env: str) -> dict[str, dict[Method, np.ndarray]]:
+    """Title of ROUNDS -> training alone, and the oracle open loop -> values (k,), for ``figures.rounds``.
+
+    alone, planned: ``round_panels`` with training alone and without it; plans: rows of 05_control.
+    """
+    found: dict[str, dict[Method, np.ndarray]] = {}
+    for metric, title in ROUNDS[env].items():
+        beyond = {way: values[:, -1] for way, (_, values) in alone.get(title, {}).items()
+                  if way not in planned.get(title, {})}  # fmt: skip
+        oracle = table.select(plans, env=env, model=ORACLE.model, search_space=ORACLE.search_space,
+                              planner=ORACLE.planner, execution=OPEN, metric=metric)  # fmt: skip
+        if title in planned and len(oracle) and metric in ("return_true", "success"):
+            seeds = oracle["value"].to_numpy(float)
+            beyond[zoo.method(ORACLE.model, variant=f"{OPEN}, {len(seeds)} seeds")] = seeds
+        if beyond:
+            found[title] = beyond
+    return found
+
+
 def axis_ends(rows: pd.DataFrame, env: str, also: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest 95 % interval of round 0, and
-    below what is ``also`` drawn, title -> its lowest value."""
+    """Title of DRAWN -> where an axis of what should rise ends: a tenth below the lowest seed of round 0, and below
+    what is ``also`` drawn, title -> its lowest value."""
     ends = {}
     closed = table.select(rows, env=env, execution=CLOSED)
     for metric in ("return_true", "success"):
         found, learner = table.select(closed, metric=metric), ["model", "configuration"]
         before = [part["value"] for _, part in table.groups(table.select(found, iteration=0), learner)]
         if (title := ROUNDS[env][metric]) in DRAWN[env] and before:
-            low = min(mean - half for mean, half in map(interval, before))
+            low = min(float(values.min()) for values in before)
             low = min(low, (also or {}).get(title, low))
             ends[title] = low - 0.1 * abs(low)
     return ends
