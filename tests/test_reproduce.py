@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,18 +19,18 @@ sys.path.insert(0, str(ROOT / "benchmarks" / "settings"))
 import reproduce
 import rows as rows_script
 
-PAGE = ROOT / "docs" / "reproducing.md"
+SHIPPED, PAGE = reproduce.shipped, ROOT / "docs" / "reproducing.md"
 
 
 @pytest.fixture(scope="module")
 def read() -> dict[str, pd.DataFrame]:
-    return reproduce.shipped()
+    return SHIPPED()
 
 
 @pytest.fixture(autouse=True)
 def shipped(read: dict[str, pd.DataFrame], monkeypatch: pytest.MonkeyPatch) -> dict[str, pd.DataFrame]:
     """The tables, read once for all tests."""
-    monkeypatch.setattr(reproduce, "shipped", lambda: read)
+    monkeypatch.setattr(reproduce, "shipped", lambda folder=None: read)
     return read
 
 
@@ -85,6 +86,68 @@ def test_a_claim_asks_for_fewer_rows_than_its_tables_have(shipped: dict[str, pd.
     assert 0 < len(found) < len(shipped[name]) / 10
 
 
+def test_a_plateau_is_told_anew_with_all_that_it_is_told_from(shipped: dict[str, pd.DataFrame]) -> None:
+    (one,) = (claim for claim in claims() if claim.id == "C39")  # of tsm alone
+    lines = reproduce.commands(reproduce.with_sources(reproduce.asked([one], shipped), shipped))
+    free, first, early = "model_free.py --seeds 5", "policies --scale paper --seed 0", "early --scale paper --seed 0"
+    at = [next(i for i, line in enumerate(lines) if what in line) for what in (free, first, early)]
+    assert at == sorted(at)
+    learned = [line for line in lines if first in line and reproduce.REACH in line]
+    assert {word for line in learned for word in shlex.split(line)} >= {"tsm", "rtsm"}
+
+
+def test_the_first_records_of_a_policy_are_made_again_with_it(shipped: dict[str, pd.DataFrame]) -> None:
+    for one in claims():
+        found = reproduce.with_sources(reproduce.asked([one], shipped), shipped).get("05_control", pd.DataFrame())
+        if found.empty:
+            continue
+        first = "policies --scale paper --seed 0 --envs tsm/Reacher-v0 --models tsm"
+        lines = reproduce.commands({"05_control": found})
+        assert any(first in line for line in lines) == any("early --scale paper --seed 0" in line for line in lines)
+
+
+def test_a_stopped_command_keeps_the_rows_before_and_says_at_its_end_how_far_the_new_ones_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["reproduce.py", "02_train", "C46", "--seeds", "0"])
+    ran, codes = [], iter([0, 1, 0, 0, 0])
+
+    def run(line: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        ran.append(line)
+        return subprocess.CompletedProcess(line, next(codes))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    with pytest.raises(SystemExit, match="ended with status 1; what was made before it stays"):
+        reproduce.main()
+    kept = tmp_path / "reproduce"
+    assert {path.name for path in kept.iterdir()} == {path.name for path in Path(reproduce.RESULTS).iterdir()}
+    reproduce.main()
+    assert [line[2] for line in ran] == ["gradients", "latent", "gradients", "latent", "tsmlib"]
+    said = capsys.readouterr().out
+    assert f"compared with the tables in {kept}" in said
+    assert "C46: REPLICATED, again REPLICATED" in said
+    assert "rows are equal" in said
+    assert not kept.exists()
+
+
+def test_a_table_of_a_script_is_published_as_a_whole_and_no_other(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    results = tmp_path / "data" / "results"
+    results.mkdir(parents=True)
+    monkeypatch.setattr(rows_script, "RESULTS", results)
+    table = Path(reproduce.RESULTS) / "07_starts.csv"
+    monkeypatch.setattr(sys, "argv", ["rows.py", "whole", str(table)])
+    rows_script.main()
+    assert (results / table.name).read_bytes() == table.read_bytes()
+    assert "07_starts" in (tmp_path / "data" / "MANIFEST.json").read_text()
+    monkeypatch.setattr(sys, "argv", ["rows.py", "whole", str(table.with_name("09_your_own.csv"))])
+    with pytest.raises(SystemExit):
+        rows_script.main()
+    assert "whole takes 03_samples.csv and 07_starts.csv; got 09_your_own.csv" in capsys.readouterr().err
+
+
 def test_a_table_of_one_seed_has_no_commands_of_another(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -115,13 +178,14 @@ def test_rows_that_came_out_the_same_are_no_difference_and_others_are_told(shipp
     before = {"02_train": shipped["02_train"]}
     same = reproduce.far(before, before)
     assert (same["equal"] == same["rows"]).all()
-    assert (same["largest"] == 0).all()
+    assert (same["largest difference"] == 0).all()
     moved = before["02_train"].copy()
     unit = moved["value"].std()
     moved.loc[moved.index[0], "value"] += 2 * unit
     found = reproduce.far(before, {"02_train": moved.iloc[:-1]}).iloc[0]
     assert found["equal"] == found["there again"] - 1 == found["rows"] - 2
-    assert np.isclose(found["largest"], 2)
+    assert np.isclose(found["largest difference"], 2 * unit)
+    assert np.isclose(found["mean / deviation"], 2 / found["there again"])
 
 
 def test_the_page_on_reproducing_has_the_commands_and_the_seeds_of_the_rows_that_ship() -> None:

@@ -6,11 +6,13 @@
 
 RECIPES has a command for every row that ships; run are those with the environments, models and seeds of the rows that
 are wanted. Models, scores, plans and policies that are missing in runs/paper/seed<k> are made first, here, one after
-another: hours, or days (docs/claims.md says how many). What was made stays there, so that a command that was stopped
-goes on. --list prints the commands, to run some of them, or side by side.
+another: hours, or days (docs/claims.md says how many). What is there is used: name an empty TSM_RUN_DIR to make all
+anew. What was made stays, so that a command that was stopped goes on; those of other libraries begin again. --list
+prints the commands, to run some of them, or side by side.
 
-The new rows take the place of those in data/results, claims are judged and pages written anew, and a table says how far
-new values lie from those before. ``git checkout data docs README.md`` takes it back.
+The new rows take the place of those in data/results, claims are judged, pages and their figure made anew; then it says
+how far new values lie from those before, which are kept in runs/reproduce until then. ``git checkout data docs figures
+README.md`` takes it back, with whatever else you changed there.
 
     python benchmarks/settings/reproduce.py --page
 
@@ -20,17 +22,21 @@ writes the commands, and the seeds of the rows that ship, into docs/reproducing.
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from tsmlib.storage import tables
-from tsmlib.study import adaptation
+from tsmlib.study import adaptation, runs
 from tsmlib.study.claims import evaluate
 from tsmlib.study.claims.claim import Claim
 from tsmlib.study.claims.ledger import claims, questions
@@ -53,11 +59,12 @@ CONTROL, CONVERGED = ("05_control", "05_control_rows"), {"metric": ("iterations_
 CEM, ADAM = {"planner": ("cem", "zero", "random")}, {"planner": ("adam",)}
 JUDGED = "08_claims"  # the table that ``publish --claims`` writes, whatever was made before
 CLAIMS = "python -m tsmlib publish --claims"
+FURTHEST = 20  # metrics that are printed
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Rows of ``tables``, and the command that makes them: ``rows.py part``, or ``script`` with {seed} in it.
+    """Rows of ``tables``, and what makes them: ``rows.py part``, or ``script``, {seed} and {runs} in it.
 
     envs, models: of the rows, as the command takes them; along: models of rows that come with them. only, apart:
     column -> values that the rows have, and do not have. variant: what was changed of the environments in the rows.
@@ -88,10 +95,13 @@ class Recipe:
             found = found.drop(select(found, **{column: values}).index)
         return found
 
-    def commands(self, rows: pd.DataFrame, seed: str) -> list[str]:
-        """As many as make these rows, all of one seed; more than one where environments have rows of other models."""
+    def commands(self, rows: pd.DataFrame, seed: str, folder: str = "runs") -> list[str]:
+        """As many as make these rows, all of one seed; more than one where environments have rows of other models.
+
+        folder: of all runs.
+        """
         if self.script:
-            return [line.format(seed=seed) for line in self.script]
+            return [line.format(seed=seed, runs=folder) for line in self.script]
         pairs = set(zip(rows["env"], rows["model"], strict=True))
         there = [env for env in self.envs if self.env_of_rows(env) in set(rows["env"])]
         asked = {
@@ -124,32 +134,35 @@ def _adapted(env: str, variant: str, options: str) -> Recipe:
 
 def _loop(env: str) -> Recipe:
     """mbrl-lib's own."""
-    made = f"runs/paper/seed{{seed}}/metrics/peers_loop-{env.rpartition('/')[2]}.csv"
+    made = f"{{runs}}/paper/seed{{seed}}/metrics/peers_loop-{env.rpartition('/')[2]}.csv"
     lines = (f"{PETS}/loop.py --env {env} --scale paper --seed {{seed}}", f"python {ROWS} peers {made}")
     return Recipe(("10_explore",), "", (env,), ("pets",), script=lines)
 
 
 def _free(envs: tuple[str, ...], models: tuple[str, ...], options: str) -> Recipe:
     """Policies without a model."""
-    made = f"runs/paper/seed0/metrics/model_free_{'_'.join(models)}.csv"
+    made = f"{{runs}}/paper/seed0/metrics/model_free_{'_'.join(models)}.csv"
     command = f"build/model_free/bin/python benchmarks/model_free/model_free.py {options} --out {made}"
     return Recipe(("model_free",), "", envs, models, script=(command, f"python {ROWS} peers {made}"))
 
 
 ARMS = [arm for arm in adaptation.VARIANTS if arm != "standard"]
 ROBOTS = ("Hopper-v5", "HalfCheetah-v5", PENDULUM)
-PREDICTED = "runs/paper/seed0/metrics/peers_pets.csv"
+METRICS = "{runs}/paper/seed0/metrics"
 RECIPES = (  # in the order in which they are run: policies without a model before those that are compared with them
     Recipe(("01_collect",), "collect", (REACH, OBSTACLE, PUSH, *PYMUNK), along=("none",)),
     Recipe(("02_train",), "gradients", (PUSH,), OUR),
     Recipe(("03_predict",), "predict", (REACH, OBSTACLE, PUSH), (*FIVE, *ENSEMBLES)),
     Recipe(
         ("peers_pets",), "", (PUSH,), ("pets",),
-        script=(f"{PETS}/pets.py --env {PUSH} --form gaussian --seconds 2320", f"python {ROWS} peers {PREDICTED}"),
+        script=(
+            f"{PETS}/pets.py --env {PUSH} --form gaussian --seconds 2320",
+            f"python {ROWS} peers {METRICS}/peers_pets.csv",
+        ),
     ),
     Recipe(("03_ablation",), "ablations", (PUSH,), ("onestep", PAPERS, *VARIANTS)),
     Recipe(("03_samples",), "", (PUSH,), (OURS,), script=(
-        "python benchmarks/settings/samples.py --out data/results/03_samples.csv",
+        "python benchmarks/settings/samples.py", f"python {ROWS} whole {METRICS}/03_samples.csv",
     )),
     Recipe(("04_latent",), "latent", (REACH, OBSTACLE, PUSH), OUR),
     _free((REACH, PUSH), FREE, "--seeds 5"),
@@ -167,14 +180,14 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(("07_action_prior",), "torques", (REACH, PUSH), OUR, ("prior", "none"), "--planners cem adam"),
     Recipe(("07_action_prior",), "torques", (REACH,), ("oracle",)),
     Recipe(("07_starts",), "", (REACH,), (PAPERS,), script=(
-        "python benchmarks/settings/starts.py --out data/results/07_starts.csv",
+        "python benchmarks/settings/starts.py", f"python {ROWS} whole {METRICS}/07_starts.csv",
     )),
     Recipe(("09_your_own",), "", ROBOTS, (OURS, "onestep", "lstm", "ensemble+mse"), FLOORS, script=(
         "python -m tsmlib run your_own --scale paper", "python -m tsmlib publish --table your_own",
     )),
     _rounds((PENDULUM, PUSH), (OURS, "lstm", "ensemble+mse"), "own plans"),
-    _rounds((PENDULUM, PUSH), (OURS, "lstm"), "random episodes"),
-    _rounds((PUSH,), (OURS, "lstm"), "no new episodes"),
+    _rounds((PENDULUM, PUSH), (OURS,), "random episodes"),
+    _rounds((PUSH,), (OURS,), "no new episodes"),
     *map(_loop, (PENDULUM, PUSH)),
     _adapted(REACH, "gain0.7", ""),
     *(_adapted(PUSH, arm, "--ways zero-shot all head codes scratch") for arm in ARMS),
@@ -184,10 +197,10 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
 # Wanted rows and their commands --------------------------------------------------------------------------------------
 
 
-def shipped() -> dict[str, pd.DataFrame]:
-    """Every table of data/results that a recipe makes."""
+def shipped(folder: Path = RESULTS) -> dict[str, pd.DataFrame]:
+    """Every table of data/results that a recipe makes. folder: of a copy."""
     names = sorted({name for recipe in RECIPES for name in recipe.tables})
-    return {name: tables.load(path) for name in names if (path := tables.stored(RESULTS / f"{name}.csv"))}
+    return {name: tables.load(path) for name in names if (path := tables.stored(folder / f"{name}.csv"))}
 
 
 def asked(some: Iterable[Claim], rows: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -205,32 +218,59 @@ def asked(some: Iterable[Claim], rows: Mapping[str, pd.DataFrame]) -> dict[str, 
     return {name: rows[name].loc[index] for name, index in sorted(found.items())}
 
 
-def commands(wanted: Mapping[str, pd.DataFrame]) -> list[str]:
-    """That make these rows, recipe by recipe, seed by seed, each command once."""
+def with_sources(wanted: Mapping[str, pd.DataFrame], rows: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """The rows that a claim asks for, and those that they are told from or that their commands would drop.
+
+    When a policy came to a plateau is told from all latent policies of its arm and seed, and from the learners without
+    a model; and the first records of a policy of reaching go when it is learned again.
+    """
+    learned, found = rows["05_control"], dict(wanted)
+    if "05_control" not in wanted:
+        return found
+    asked = select(wanted["05_control"], planner="policy")
+    told = select(asked, metric=list(policies.SOONEST))
+    latent = select(learned, planner="policy", search_space="latent")
+    of = {tuple(key) for key in told[["env", "seed"]].to_numpy().tolist()}
+    again = latent[[tuple(key) in of for key in latent[["env", "seed"]].to_numpy().tolist()]]
+    first = pd.concat([asked, again])
+    of = {tuple(key) for key in first[["env", "seed", "model"]].to_numpy().tolist()}
+    early = select(latent, subset=policies.EARLY)
+    early = early[[tuple(key) in of for key in early[["env", "seed", "model"]].to_numpy().tolist()]]
+    index = wanted["05_control"].index.union(again.index).union(early.index)
+    found["05_control"] = learned.loc[index]
+    if len(told):
+        free = select(rows["model_free"], env=[*told["env"].unique()], model=FREE)
+        found["model_free"] = rows["model_free"].loc[free.index.union(found.get("model_free", free[:0]).index)]
+    return found
+
+
+def commands(wanted: Mapping[str, pd.DataFrame], folder: str = "runs") -> list[str]:
+    """That make these rows, recipe by recipe, seed by seed, each command once. folder: of all runs."""
     found = list[str]()
     for recipe in RECIPES:
         made = [recipe.made(wanted[name]) for name in recipe.tables if name in wanted]
         rows = pd.concat(made) if made else pd.DataFrame({"seed": []})
         for seed, part in rows.groupby("seed"):
-            found += recipe.commands(part, str(seed))
+            found += recipe.commands(part, str(seed), folder)
     return list(dict.fromkeys(found))
 
 
 def far(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Of each table and metric: rows, those made again, and how far their values then lie from those before, as a
-    share of the metric's standard deviation before."""
+    """Of each table and metric: rows, those that are there again, and how far their values then lie from those before,
+    in units and as a share of the metric's standard deviation before, where it has one; the furthest first."""
     lines = []
     for name, old in before.items():
         about = [column for column in old if column not in ("value", "n")]
         both = old.merge(after[name], on=about, suffixes=("", "_again"), how="left")
         for metric, part in both.groupby("metric"):
             off = (part["value_again"] - part["value"]).abs()
-            unit = part["value"].std() or 1.0
+            spread = part["value"].std()
             lines.append({
                 "table": name, "metric": metric, "rows": len(part), "there again": int(off.notna().sum()),
-                "equal": int((off == 0).sum()), "mean difference": off.mean() / unit, "largest": off.max() / unit,
+                "equal": int((off == 0).sum()), "largest difference": off.max(),
+                "mean / deviation": off.mean() / (spread if spread > 0 else np.nan),
             })  # fmt: skip
-    return pd.DataFrame(lines)
+    return pd.DataFrame(lines).sort_values("mean / deviation", ascending=False, ignore_index=True)
 
 
 # The command ---------------------------------------------------------------------------------------------------------
@@ -254,7 +294,8 @@ def page() -> str:
     rows, lines = shipped(), ['rows="python benchmarks/settings/rows.py" seed=0']
     for recipe in RECIPES:
         made = pd.concat([recipe.made(rows[name]) for name in recipe.tables if name in rows])
-        lines += ["", f"# {', '.join(recipe.tables)}: {_seeds(recipe, made)}"]
+        part = f" ({recipe.part})" if recipe.part else ""
+        lines += ["", f"# {', '.join(recipe.tables)}{part}: {_seeds(recipe, made)}"]
         for line in recipe.commands(made, "$seed"):
             lines.append(line.replace(f"python {ROWS}", "$rows"))
     return "\n".join(
@@ -285,15 +326,33 @@ def span(seeds: Sequence[int]) -> str:
     return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
 
 
-def verdict(one: Claim) -> str:
-    """Of a claim, by the rows that are there."""
-    found = evaluate.judge(one, evaluate.tables([one]))
-    return f"{one.id} {found.word}: {found.key.check.text}: {found.key.text}"
+def verdict(one: Claim, rows: Mapping[str, pd.DataFrame]) -> evaluate.Verdict:
+    """Of a claim, by some rows."""
+    return evaluate.judge(one, evaluate.Tables(rows))
+
+
+def told(one: Claim, before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> str:
+    """Both verdicts on a claim, and the check that decided the first, then and now."""
+    old, new = verdict(one, before), verdict(one, after)
+    (again,) = (effect for effect in new.effects[""] if effect.check.text == old.key.check.text)
+    return f"{one.id}: {old.word}, again {new.word}\n  {old.key.check.text}\n  {old.key.text}\n  again {again.text}"
+
+
+def folder() -> Path:
+    """Of all runs."""
+    return runs.home() / (os.environ.get("TSM_RUN_DIR") or "runs")
+
+
+def keep(place: Path) -> None:
+    """Copy the tables to ``place``, as a whole or not at all."""
+    made = Path(f"{place}.partial")
+    shutil.copytree(RESULTS, made, dirs_exist_ok=True)
+    made.rename(place)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", help="tables of data/results, claims (C46), questions, or all")
+    parser.add_argument("what", nargs="*", help="tables of data/results, claims (C46), questions (Q1), or all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[], help="default: all that have such rows")
     parser.add_argument(
         "--subject", default=PAPERS, choices=(PAPERS, OURS), help=f"model that a claim is about (default {PAPERS})"
@@ -304,41 +363,52 @@ def main() -> None:
     if given.page:
         between(PAGE, MARKS, page())
         return
-    rows, known = shipped(), {one.id: one for one in (*claims(given.subject), *questions())}
-    if unknown := [name for name in given.what if name not in (*rows, *known, "all")]:
-        parser.error(
-            f"no table or claim is called {', '.join(unknown)}; there are {', '.join(rows)}; claims C01 to C54; all"
-        )
-    if not given.what:
-        parser.error("name a table of data/results, a claim, or all")
+    place = folder() / "reproduce"
+    if place.is_dir():
+        print(f"compared with the tables in {place}, kept by a command that was stopped; delete it to begin anew")
+    rows = shipped(place) if place.is_dir() else shipped()
+    known = {one.id: one for one in (*claims(given.subject), *questions())}
+    if not given.what or (unknown := [name for name in given.what if name not in (*rows, *known, "all")]):
+        which = f"no table or claim is called {', '.join(unknown)}" if given.what else "nothing is named"
+        parser.error(f"{which}; there are {', '.join(rows)}; claims C01 to C54; questions Q1 to Q7; all")
     chosen = [known[name] for name in given.what if name in known]
-    parts = [asked(chosen, rows), {name: rows[name] for name in rows if name in given.what or "all" in given.what}]
+    parts = [with_sources(asked(chosen, rows), rows)]
+    parts += [{name: rows[name] for name in rows if name in given.what or "all" in given.what}]
     wanted = {
         name: (found := pd.concat(some))[~found.index.duplicated()].sort_index()
         for name in rows if (some := [part[name] for part in parts if name in part])
     }  # fmt: skip
+    seeds = sorted({int(seed) for table in wanted.values() for seed in table["seed"]})
+    if not seeds:
+        parser.error(f"{', '.join(given.what)} has no rows that ship")
     if given.seeds:
-        there = sorted({int(seed) for table in wanted.values() for seed in table["seed"]})
         wanted = {name: select(table, seed=given.seeds) for name, table in wanted.items()}
-        if lacking := sorted(set(given.seeds) - set(there)):
-            parser.error(f"no rows of seed {', '.join(map(str, lacking))} ship; there are {span(there)}")
-    lines = commands(wanted)
+        if lacking := sorted(set(given.seeds) - set(seeds)):
+            parser.error(f"no rows of seed {', '.join(map(str, lacking))} ship; there are {span(seeds)}")
+    lines = commands(wanted, shlex.quote(os.path.relpath(folder(), ROOT)))
     if given.list:
         print("\n".join([*lines, CLAIMS]))
         return
     if others := missing(lines):
-        told = "; ".join(f"{name} (how to install it: {where})" for name, where in others.items())
-        parser.error(f"these commands need another environment: {told}; --list prints the commands")
-    before = [verdict(one) for one in chosen]
+        how = "; ".join(f"{name} (how to install it: {where})" for name, where in others.items())
+        parser.error(f"these commands need another environment: {how}; --list prints the commands")
+    if not place.is_dir():
+        keep(place)
     for i, line in enumerate([*lines, CLAIMS], 1):
         print(f"[{i} of {len(lines) + 1}] {line}", flush=True)
         if code := subprocess.run(words(line), cwd=ROOT, check=False).returncode:
             raise SystemExit(
                 f"{line}\nended with status {code}; what was made before it stays, and the same command goes on"
             )
-    print(far(wanted, shipped()).to_string(index=False, float_format="{:.3g}".format))
-    for old, new in zip(before, map(verdict, chosen), strict=True):
-        print(f"before  {old}\nagain   {new}")
+    after = shipped()
+    found = far({name: table for name, table in wanted.items() if len(table)}, after)
+    print(found.head(FURTHEST).to_string(index=False, float_format="{:.3g}".format))
+    print(f"{len(found)} metrics, the furthest first; {found['equal'].sum()} of {found['rows'].sum()} rows are equal")
+    for name in rows:
+        if more := len(after[name]) - len(rows[name]):
+            print(f"{name} has {more:+} rows")
+    print("\n".join(told(one, rows, after) for one in chosen))
+    shutil.rmtree(place)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
 reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
 beside them, in the files that are named: of benchmarks/peers mbrl-lib's loop in 10_explore and the scores of its models
-in peers_pets, of benchmarks/model_free policies without a model in model_free.
+in peers_pets, of benchmarks/model_free policies without a model in model_free. whole publishes tables of scripts beside
+this one, starts.py and samples.py, in place of all their rows.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
 those of all seeds of the same environment and algorithm; all others stay. Rounds take the place of all rows of the
@@ -67,6 +68,7 @@ NOTEBOOKS = {
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
+WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -224,6 +226,14 @@ def published_peers(files: list[Path]) -> None:
         manifest.write_manifest(Path(RESULTS).parent)
 
 
+def published_whole(files: list[Path]) -> None:
+    """Tables of WHOLE as they are."""
+    for path in files:
+        tables.load(path)  # StoreError where it is damaged
+        tables.ship_bytes(RESULTS / path.name, path.read_bytes())
+    manifest.write_manifest(Path(RESULTS).parent)
+
+
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
     """The table that a notebook leaves in the run's folder, for these environments and models."""
     asked = {"env": ",".join(envs), "models": ",".join(models)}
@@ -234,11 +244,14 @@ def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: li
     return found[found["env"].isin(envs) & (found["seed"] == run.seed)]
 
 
+FILES = {"peers": published_peers, "whole": published_whole}  # parts that take files
+
+
 def parser() -> argparse.ArgumentParser:
     """The command's options."""
     found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", "peers"))
-    found.add_argument("files", nargs="*", type=Path, help="tables that peers publishes")
+    found.add_argument("part", choices=(*NOTEBOOKS, "control", "policies", "early", *FILES))
+    found.add_argument("files", nargs="*", type=Path, help="tables that peers and whole publish")
     found.add_argument("--envs", nargs="+", default=[], choices=(*ENV_IDS, PENDULUM), metavar="ENV")
     found.add_argument("--models", nargs="+", default=[], choices=(*zoo.words(), SIMULATOR), metavar="MODEL",
                        help="of control and torques also oracle, the true simulator")  # fmt: skip
@@ -260,11 +273,16 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     options = parser()
     given = options.parse_args()
-    if bool(given.files) != (given.part == "peers") or not all(path.is_file() for path in given.files):
+    if bool(given.files) != (given.part in FILES) or not all(path.is_file() for path in given.files):
         missing = [str(path) for path in given.files if not path.is_file()]
-        options.error(f"peers, and nothing else, takes tables that are there; got {missing or given.files or 'none'}")
-    if given.part == "peers":
-        published_peers(given.files)
+        options.error(
+            f"{' and '.join(FILES)}, and nothing else, take tables that are there; got "
+            f"{missing or [str(path) for path in given.files] or 'none'}"
+        )
+    if given.part == "whole" and (other := [path.name for path in given.files if path.stem not in WHOLE]):
+        options.error(f"whole takes {' and '.join(f'{name}.csv' for name in WHOLE)}; got {', '.join(other)}")
+    if given.part in FILES:
+        FILES[given.part](given.files)
         return
     if not given.models and given.part != "collect":
         options.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
