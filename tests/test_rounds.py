@@ -81,7 +81,7 @@ def _check_episodes(rows: pd.DataFrame, loops: list[rounds.Loop], steps: list[in
         own = table.select(contacts, configuration=data)
         assert own["env_steps"].tolist() == at
         assert own["value"].tolist() == [
-            rounds.contacts(each)["contacts_per_episode"] for each in loop.episodes if each
+            rounds.of_pushes(each)["contacts_per_episode"] for each in loop.episodes if each
         ]
         assert own["n"].tolist() == [len(each) for each in loop.episodes if each]
     assert "contacts per episode" in results.rounds_table(rows, PUSH)
@@ -105,7 +105,18 @@ def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_on
     better = {results.FIRST_PRIOR: [-9, -5, -5], results.LAST_PRIOR: [-4, -3, -2]}
     worse = {results.FIRST_PRIOR: [-9, -6, -5], results.LAST_PRIOR: [-9, -8, -7]}
     for curves, needed, said in ((better, [1, 0], "0.0"), (worse, [2], "> 2")):
-        rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, env_steps=900, env=PUSH, data=results.PLANNED))
+        rows = tables.frame(
+            results.prior_rows(
+                RUN,
+                "rtsm",
+                curves,
+                25,
+                torques=dict.fromkeys(curves, 0.1),
+                env_steps=900,
+                env=PUSH,
+                data=results.PLANNED,
+            )
+        )
         assert table.select(rows, metric="iterations_to_same_return")["value"].tolist() == needed
         cells = [cell.strip() for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")]
         assert cells[4:] == [f"{needed[0]:.1f}", said, "25"]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
+import torch
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.data import contact_counts, shares
@@ -55,12 +56,22 @@ def divided(data: Trajectories) -> tuple[Trajectories, Trajectories]:
     return data.take(slice(n, None)), data.take(slice(n))
 
 
-def contacts(data: Trajectories) -> dict[str, float]:
-    """Contacts of arm and object, ``results.EPISODES``: share of the episodes that have one, and mean number."""
+def of_pushes(data: Trajectories) -> dict[str, float]:
+    """Of pushes, ``results.EPISODES``: share of the episodes in which arm and object meet, mean number of contacts, and
+    root mean square of the torques."""
     return {
         "contact_share": shares(data.states, data.env)["contact_share"],
         "contacts_per_episode": float(contact_counts(data.states, data.env).mean()),
+        "torque_rms": float(np.sqrt(np.square(data.actions, dtype=np.float64).mean())),
     }
+
+
+def torques_of(prior: ActionPrior, n: int = 256) -> float:
+    """Root mean square of the torques that ``n`` random codes give."""
+    space = LatentActions(prior, HORIZON)
+    with torch.no_grad():
+        actions = space.decode(space.noise(1, n, torch.Generator().manual_seed(0)))
+    return float(actions.square().mean().sqrt())
 
 
 def places(seen: Mapping[str, Trajectories], n: int = 24) -> dict[str, np.ndarray]:
@@ -234,6 +245,7 @@ def loop(
     zero = _once(own and own / "round-0.json", made_from, lambda: dict(measured(model, prior)))
     if prior and sizes.searches:
         curves[FIRST_PRIOR] = _once(own and own / "prior-0.json", made_from, lambda: search(prior, sizes, seed, env))
+    torques = {FIRST_PRIOR: torques_of(prior)} if prior else {}
     found = explore(
         model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
         options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
@@ -251,13 +263,14 @@ def loop(
     ])  # fmt: skip
     episodes = [train.joined(held_out), *found.episodes]
     if env == PUSH:
-        counted = [(k, len(each), contacts(each)) for k, each in enumerate(episodes) if each is not None]
+        counted = [(k, len(each), of_pushes(each)) for k, each in enumerate(episodes) if each is not None]
         rows += results.episode_rows(run, word, counted, env=env, data=data)
     if prior and sizes.searches:
         last = own and own / f"{slug}.prior.json"
         curves[LAST_PRIOR] = _once(last, made_from, lambda: search(prior, sizes, seed, env))
         n, steps = min(sizes.starts, SEARCHED), began * HORIZON + int(records[-1]["env_steps"])
-        rows += results.prior_rows(run, word, curves, n, env_steps=steps, env=env, data=data)
+        torques[LAST_PRIOR] = torques_of(prior)
+        rows += results.prior_rows(run, word, curves, n, torques=torques, env_steps=steps, env=env, data=data)
     return Loop(rows, episodes, seconds)
 
 

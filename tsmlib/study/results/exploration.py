@@ -39,7 +39,10 @@ ROUNDS = {
     PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
 }
 SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, without what is measured after it
-EPISODES = {"contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode"}
+EPISODES = {
+    "contact_share": "episodes with contact", "contacts_per_episode": "contacts per episode",
+    "torque_rms": "rms torque",
+}  # fmt: skip
 FIRST_PRIOR, LAST_PRIOR = "first prior", "last prior"  # before round 1, after the last; a subset
 MODEL_FREE = ("ppo", "trpo", "sac")
 Panels = Mapping[str, Mapping[Method, tuple[np.ndarray, np.ndarray]]]  # title -> learner -> steps (R,), values (k, R)
@@ -93,10 +96,11 @@ def episode_rows(
 
 
 def prior_rows(
-    run: Run, word: str, curves: Mapping[str, Sequence[float]], n: int, *, env_steps: int, env: str, data: str
-) -> list[Row]:
+    run: Run, word: str, curves: Mapping[str, Sequence[float]], n: int, *, torques: Mapping[str, float], env_steps: int,
+    env: str, data: str,
+) -> list[Row]:  # fmt: skip
     """Return after each iteration of the search in codes of both priors, and of each the iterations to the return that
-    the first prior's search ends with; none where that is not reached."""
+    the first prior's search ends with; none where that is not reached. torques: root mean square of each prior's."""
     common = _of_loop(run, word, env, data) | dict(
         planner="cem", execution=OPEN, search_space="latent", env_steps=env_steps, n=n
     )  # fmt: skip
@@ -104,6 +108,7 @@ def prior_rows(
     for which, curve in curves.items():
         each = common | dict(subset=which)
         rows += [each | dict(iteration=i, metric="return_true", value=value) for i, value in enumerate(curve)]
+        rows.append(each | dict(metric="torque_rms", value=torques[which]))
         there = next((i for i, value in enumerate(curve) if value >= level), None)
         rows += [] if there is None else [each | dict(metric="iterations_to_same_return", value=float(there))]
     return rows
@@ -218,7 +223,8 @@ def rounds_table(rows: pd.DataFrame, env: str = PENDULUM) -> pd.DataFrame:
             line[title] = table.spell(values, "{:.0f}" if metric in SECONDS else form) if len(values) else ""
         for metric, title in EPISODES.items() if len(collected) else ():
             values = table.select(collected, model=word, configuration=data, iteration=k, metric=metric)["value"]
-            line[title] = table.spell(values, "{:.2f} ± {:.2f}") if len(values) else ""
+            form = "{:.3f} ± {:.3f}" if metric == "torque_rms" else "{:.2f} ± {:.2f}"
+            line[title] = table.spell(values, form) if len(values) else ""
         lines.append({**line, "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
@@ -276,7 +282,8 @@ def paired(rows: pd.DataFrame, k: int) -> pd.DataFrame:
 @table.sourced
 def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
     """A line for each learner: returns that a search through the true simulator ends with in codes of the first prior
-    and of the last, and the iterations of both to the former, "> 10" where a seed's search of ten does not reach it."""
+    and of the last, the iterations of both to the former, "> 10" where a seed's search of ten does not reach it, and
+    the root mean square of the torques that random codes of each give."""
     lines = []
     here = table.select(rows, env=env, execution=OPEN, subset=[FIRST_PRIOR, LAST_PRIOR])
     for (word, data), own in table.groups(here, ["model", "configuration"]):
@@ -291,6 +298,9 @@ def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
             line[f"iterations of the {which}"] = (
                 table.spell(found, "{:.1f} ± {:.1f}") if len(found) == own["seed"].nunique() else f"> {last}"
             )
+        for which in (FIRST_PRIOR, LAST_PRIOR):
+            found = table.select(own, metric="torque_rms", subset=which)["value"]
+            line[f"rms torque of the {which}"] = table.spell(found, "{:.4f} ± {:.4f}") if len(found) else "-"
         lines.append({**line, "n": int(own["n"].max())})
     return pd.DataFrame(lines)
 
