@@ -105,21 +105,11 @@ def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_on
     better = {results.FIRST_PRIOR: [-9, -5, -5], results.LAST_PRIOR: [-4, -3, -2]}
     worse = {results.FIRST_PRIOR: [-9, -6, -5], results.LAST_PRIOR: [-9, -8, -7]}
     for curves, needed, said in ((better, [1, 0], "0.0"), (worse, [2], "> 2")):
-        rows = tables.frame(
-            results.prior_rows(
-                RUN,
-                "rtsm",
-                curves,
-                25,
-                torques=dict.fromkeys(curves, 0.1),
-                env_steps=900,
-                env=PUSH,
-                data=results.PLANNED,
-            )
-        )
+        about = dict(env_steps=900, env=PUSH, data=results.PLANNED, torques=dict(zip(curves, (0.1, 0.07), strict=True)))
+        rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, **about))  # type: ignore[arg-type]
         assert table.select(rows, metric="iterations_to_same_return")["value"].tolist() == needed
         cells = [cell.strip() for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")]
-        assert cells[4:] == [f"{needed[0]:.1f}", said, "25"]
+        assert cells[4:] == [f"{needed[0]:.1f}", said, "0.1000", "0.0700", "25"]
 
 
 def test_the_map_has_as_many_episodes_of_each_source() -> None:
@@ -506,6 +496,18 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     assert mean + half < 0
     mean, half = ends[results.NONE]
     assert mean + half > 0  # not shown
+
+
+def test_the_notebook_says_of_torques_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PUSH, model="rtsm", metric="torque_rms")
+    last = table.select(rows, subset=results.LAST_PRIOR).pivot(index="seed", columns="configuration", values="value")
+    executed = table.select(rows, subset="data", configuration=results.PLANNED)
+    plans = executed[executed["iteration"] > 0].groupby("seed")["value"].mean()
+    assert (plans < last[results.PLANNED]).all()
+    assert (last[results.PLANNED] < last[[results.RANDOM, results.NONE]].min(axis=1)).all()
+    assert [round(float(part.mean()), 3) for part in (plans, last[results.PLANNED], last[results.RANDOM])] == [
+        0.070, 0.076, 0.097,
+    ]  # fmt: skip
 
 
 def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_say() -> None:
