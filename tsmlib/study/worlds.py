@@ -108,7 +108,7 @@ WORLDS = {
             "laptop": Sizes(100, 2, 10, 300, 10, 48, 6, 3, 600, 200, searches=10),
             "paper": Sizes(200, 5, 150, 2500, 100, 64, 8, 3, 4000, 500, searches=10),
         },
-        {"rtsm": {"hidden": 96}, "lstm": {}},
+        {"rtsm": {"hidden": 96}, "lstm": {}, "ensemble+mse": {"gaussian": False}},
         tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
         random=lambda n, seed: random_data(PUSH, n, seed=seed),
         first=lambda n, seed: random_data(PUSH, n, seed=1000 * seed), action_dim=2, rms=0.1,
