@@ -143,5 +143,5 @@ def test_a_page_without_both_its_marks_is_left_as_it_is(tmp_path: Path, held: st
     page = tmp_path / "page.md"
     page.write_text(held)
     with pytest.raises(RunError, match="does not hold <!-- a --> and <!-- b --> once each"):
-        publish._between(page, ("<!-- a -->", "<!-- b -->"), "written")
+        publish.between(page, ("<!-- a -->", "<!-- b -->"), "written")
     assert page.read_text() == held

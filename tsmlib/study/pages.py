@@ -410,8 +410,8 @@ first round.
 {_exploration_aims(rows, free)}
 ![Executed return and open-loop gap of the pendulum against environment steps](../figures/10_rounds.png)
 
-mbrl-lib's PETS plans the pendulum anew after every step and is trained before every episode, as in its own examples; the
-pushing arm, like the others here, every ten steps and once a round (`benchmarks/peers`).
+mbrl-lib's PETS plans the pendulum anew after every step and is trained before every episode, as in its own examples;
+the pushing arm, like the others here, every ten steps and once a round (`benchmarks/peers`).
 
 {exploration_results.rounds_table(rows)}
 {_pushing_rounds(rows, free)}
