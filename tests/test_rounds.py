@@ -498,6 +498,18 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     assert mean + half > 0  # not shown
 
 
+def test_the_notebook_says_of_the_loop_of_mbrl_lib_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), execution="closed loop", metric="return_true", model=["pets", "rtsm"])
+    last = {env: own[own["iteration"] == own["iteration"].max()] for env, own in table.groups(rows, "env")}
+    own = {env: table.select(part, configuration=results.PLANNED) for env, part in last.items() if env in results.DRAWN}
+    wide = {env: part.pivot(index="seed", columns="model", values="value").dropna() for env, part in own.items()}
+    assert (wide[PENDULUM]["pets"] > wide[PENDULUM]["rtsm"]).tolist() == [True] * 3
+    assert (wide[PUSH]["pets"] < wide[PUSH]["rtsm"] - 7).tolist() == [True] * 2
+    plans = table.select(published("05_control"), env=PUSH, planner="zero", metric="return_true", seed=0)
+    nothing = float(plans["value"].mean())
+    assert ((wide[PUSH]["pets"] - nothing).abs() < 0.2).all()
+
+
 def test_the_notebook_says_of_torques_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), env=PUSH, model="rtsm", metric="torque_rms")
     last = table.select(rows, subset=results.LAST_PRIOR).pivot(index="seed", columns="configuration", values="value")

@@ -181,7 +181,8 @@ def _of_rounds(rows: pd.DataFrame, free: pd.DataFrame) -> list[Line]:
         ends = table.select(closed, env=env, metric="return_true", model=[OURS, "pets"])
         wide = ends[ends["iteration"] == ends["iteration"].max()].pivot(index="seed", columns="model", values="value")
         ahead = wide.get(OURS, pd.Series(dtype=float)) - wide.get("pets", pd.Series(dtype=float))
-        lines.append((f"return of `{OURS}` minus that of mbrl-lib's PETS after as many steps, {where}, lower end",
+        told = f"{where} ({ahead.notna().sum()} seeds)"
+        lines.append((f"return of `{OURS}` minus that of mbrl-lib's PETS after as many steps, {told}, lower end",
                       "at least", 0.0, _lower(ahead), "{:.2f}"))  # fmt: skip
     seconds = table.select(closed, env=PUSH, model=OURS, metric="wall_seconds")["value"]
     return [
