@@ -156,7 +156,7 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(
         ("peers_pets",), "", (PUSH,), ("pets",),
         script=(
-            f"{PETS}/pets.py --env {PUSH} --form gaussian --seconds 2320",
+            f"{PETS}/pets.py --env {PUSH} --form gaussian --seconds 2320 --run-dir {{runs}}/paper/seed0",
             f"python {ROWS} peers {METRICS}/peers_pets.csv",
         ),
     ),
@@ -364,7 +364,7 @@ def main() -> None:
         between(PAGE, MARKS, page())
         return
     place = folder() / "reproduce"
-    if place.is_dir():
+    if place.is_dir() and not given.list:
         print(f"compared with the tables in {place}, kept by a command that was stopped; delete it to begin anew")
     rows = shipped(place) if place.is_dir() else shipped()
     known = {one.id: one for one in (*claims(given.subject), *questions())}
