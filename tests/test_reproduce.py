@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 import sys
@@ -68,7 +69,7 @@ def test_every_command_is_one_that_its_script_takes(shipped: dict[str, pd.DataFr
 
 
 def test_the_commands_of_a_claim_make_each_row_that_it_asks_for(shipped: dict[str, pd.DataFrame]) -> None:
-    for name, wanted in reproduce.asked(claims(), shipped).items():
+    for name, wanted in reproduce.rows_of_claims(claims(), shipped).items():
         given = [
             rows_script.parser().parse_args(shlex.split(line)[2:])
             for line in reproduce.commands({name: wanted}) if reproduce.ROWS in line and "--seed" in line
@@ -80,7 +81,7 @@ def test_the_commands_of_a_claim_make_each_row_that_it_asks_for(shipped: dict[st
 
 def test_a_claim_asks_for_fewer_rows_than_its_tables_have(shipped: dict[str, pd.DataFrame]) -> None:
     (one,) = (claim for claim in claims() if claim.id == "C46")
-    ((name, found),) = reproduce.asked([one], shipped).items()
+    ((name, found),) = reproduce.rows_of_claims([one], shipped).items()
     assert name == "04_latent"
     assert set(found["model"]) == {"tsm"}
     assert 0 < len(found) < len(shipped[name]) / 10
@@ -88,7 +89,7 @@ def test_a_claim_asks_for_fewer_rows_than_its_tables_have(shipped: dict[str, pd.
 
 def test_a_plateau_is_told_anew_with_all_that_it_is_told_from(shipped: dict[str, pd.DataFrame]) -> None:
     (one,) = (claim for claim in claims() if claim.id == "C39")  # of tsm alone
-    lines = reproduce.commands(reproduce.with_sources(reproduce.asked([one], shipped), shipped))
+    lines = reproduce.commands(reproduce.with_sources(reproduce.rows_of_claims([one], shipped), shipped))
     free, first, early = "model_free.py --seeds 5", "policies --scale paper --seed 0", "early --scale paper --seed 0"
     at = [next(i for i, line in enumerate(lines) if what in line) for what in (free, first, early)]
     assert at == sorted(at)
@@ -98,7 +99,9 @@ def test_a_plateau_is_told_anew_with_all_that_it_is_told_from(shipped: dict[str,
 
 def test_the_first_records_of_a_policy_are_made_again_with_it(shipped: dict[str, pd.DataFrame]) -> None:
     for one in claims():
-        found = reproduce.with_sources(reproduce.asked([one], shipped), shipped).get("05_control", pd.DataFrame())
+        found = reproduce.with_sources(reproduce.rows_of_claims([one], shipped), shipped).get(
+            "05_control", pd.DataFrame()
+        )
         if found.empty:
             continue
         first = "policies --scale paper --seed 0 --envs tsm/Reacher-v0 --models tsm"
@@ -107,27 +110,37 @@ def test_the_first_records_of_a_policy_are_made_again_with_it(shipped: dict[str,
 
 
 def test_a_stopped_command_keeps_the_rows_before_and_says_at_its_end_how_far_the_new_ones_are(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    shipped: dict[str, pd.DataFrame],
+) -> None:  # fmt: skip
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    kept = tmp_path / "reproduce"
     monkeypatch.setattr(sys, "argv", ["reproduce.py", "02_train", "C46", "--seeds", "0"])
-    ran, codes = [], iter([0, 1, 0, 0, 0])
+    ran, codes, there = [], iter([0, 1, 0, 0, 0]), dict(shipped)
 
     def run(line: list[str], **_: object) -> subprocess.CompletedProcess[str]:
         ran.append(line)
+        if line[2] == "gradients":  # of seed 0, of two models
+            new = there["02_train"].copy()
+            new.loc[(new["seed"] == 0) & (new["model"] == "tsm"), "value"] += 1
+            there["02_train"] = new
         return subprocess.CompletedProcess(line, next(codes))
 
+    monkeypatch.setattr(reproduce, "shipped", lambda folder=None: shipped if folder == kept else dict(there))
     monkeypatch.setattr(subprocess, "run", run)
     with pytest.raises(SystemExit, match="ended with status 1; what was made before it stays"):
         reproduce.main()
-    kept = tmp_path / "reproduce"
-    assert {path.name for path in kept.iterdir()} == {path.name for path in Path(reproduce.RESULTS).iterdir()}
+    there_too = {path.name for path in Path(reproduce.RESULTS).iterdir()}
+    assert {path.name for path in kept.iterdir()} == {*there_too, reproduce.REQUEST}
+    assert "keeps the tables from before a command that was stopped" in ended(monkeypatch, capsys, "C46")
+    monkeypatch.setattr(sys, "argv", ["reproduce.py", "02_train", "C46", "--seeds", "0"])
     reproduce.main()
     assert [line[2] for line in ran] == ["gradients", "latent", "gradients", "latent", "tsmlib"]
     said = capsys.readouterr().out
     assert f"compared with the tables in {kept}" in said
     assert "C46: REPLICATED, again REPLICATED" in said
-    assert "rows are equal" in said
+    ((rows, again, equal),) = re.findall(r"02_train +gradient_error +(\d+) +(\d+) +(\d+)", said)
+    assert (rows, again, equal) == ("2", "2", "1")
     assert not kept.exists()
 
 
@@ -176,13 +189,13 @@ def test_what_needs_another_environment_is_refused_before_anything_runs(
 
 def test_rows_that_came_out_the_same_are_no_difference_and_others_are_told(shipped: dict[str, pd.DataFrame]) -> None:
     before = {"02_train": shipped["02_train"]}
-    same = reproduce.far(before, before)
+    same = reproduce.differences(before, before)
     assert (same["equal"] == same["rows"]).all()
     assert (same["largest difference"] == 0).all()
     moved = before["02_train"].copy()
     unit = moved["value"].std()
     moved.loc[moved.index[0], "value"] += 2 * unit
-    found = reproduce.far(before, {"02_train": moved.iloc[:-1]}).iloc[0]
+    found = reproduce.differences(before, {"02_train": moved.iloc[:-1]}).iloc[0]
     assert found["equal"] == found["there again"] - 1 == found["rows"] - 2
     assert np.isclose(found["largest difference"], 2 * unit)
     assert np.isclose(found["mean / deviation"], 2 / found["there again"])

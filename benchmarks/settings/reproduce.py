@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from tsmlib.storage import tables
+from tsmlib.storage import files, tables
 from tsmlib.study import adaptation, runs
 from tsmlib.study.claims import evaluate
 from tsmlib.study.claims.claim import Claim
@@ -59,6 +59,7 @@ CONTROL, CONVERGED = ("05_control", "05_control_rows"), {"metric": ("iterations_
 CEM, ADAM = {"planner": ("cem", "zero", "random")}, {"planner": ("adam",)}
 JUDGED = "08_claims"  # the table that ``publish --claims`` writes, whatever was made before
 CLAIMS = "python -m tsmlib publish --claims"
+REQUEST = "request.json"  # what a command was asked for
 FURTHEST = 20  # metrics that are printed
 
 
@@ -66,19 +67,19 @@ FURTHEST = 20  # metrics that are printed
 class Recipe:
     """Rows of ``tables``, and what makes them: ``rows.py part``, or ``script``, {seed} and {runs} in it.
 
-    envs, models: of the rows, as the command takes them; along: models of rows that come with them. only, apart:
-    column -> values that the rows have, and do not have. variant: what was changed of the environments in the rows.
-    whole: the command takes all of ``models``, whatever rows are wanted.
+    envs, models: of the rows, as the command takes them; extra_models: of rows that come with them. only,
+    excluded: column -> values that the rows have, and do not have. variant: what was changed of the environments in the
+    rows. whole: the command takes all of ``models``, whatever rows are wanted.
     """
 
     tables: tuple[str, ...]
     part: str
     envs: tuple[str, ...]
     models: tuple[str, ...] = ()
-    along: tuple[str, ...] = ()
+    extra_models: tuple[str, ...] = ()
     options: str = ""
     only: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    apart: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    excluded: Mapping[str, Sequence[str]] = field(default_factory=dict)
     variant: str = ""
     script: tuple[str, ...] = ()
     whole: bool = False
@@ -90,8 +91,8 @@ class Recipe:
     def made(self, table: pd.DataFrame) -> pd.DataFrame:
         """Those of the rows of one of ``tables`` that the command makes."""
         envs = [self.env_of_rows(env) for env in self.envs]
-        found = select(table, env=envs, model=[*self.models, *self.along], **self.only)
-        for column, values in self.apart.items():
+        found = select(table, env=envs, model=[*self.models, *self.extra_models], **self.only)
+        for column, values in self.excluded.items():
             found = found.drop(select(found, **{column: values}).index)
         return found
 
@@ -150,7 +151,7 @@ ARMS = [arm for arm in adaptation.VARIANTS if arm != "standard"]
 ROBOTS = ("Hopper-v5", "HalfCheetah-v5", PENDULUM)
 METRICS = "{runs}/paper/seed0/metrics"
 RECIPES = (  # in the order in which they are run: policies without a model before those that are compared with them
-    Recipe(("01_collect",), "collect", (REACH, OBSTACLE, PUSH, *PYMUNK), along=("none",)),
+    Recipe(("01_collect",), "collect", (REACH, OBSTACLE, PUSH, *PYMUNK), extra_models=("none",)),
     Recipe(("02_train",), "gradients", (PUSH,), OUR),
     Recipe(("03_predict",), "predict", (REACH, OBSTACLE, PUSH), (*FIVE, *ENSEMBLES)),
     Recipe(
@@ -170,7 +171,7 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(CONTROL, "control", (REACH, PUSH), (*FIVE, "ensemble+mse"), FLOORS, only={**CEM, **OPEN}),
     Recipe(CONTROL, "control", (REACH,), ("oracle",), only={"search_space": ("direct",)}),
     Recipe(CONTROL, "control", (PUSH,), FIVE, options=f"--closed {' '.join(FIVE)}", only=CLOSED),
-    Recipe(CONTROL, "control", (REACH, PUSH), FIVE, options="--planners adam", only=ADAM, apart=CONVERGED),
+    Recipe(CONTROL, "control", (REACH, PUSH), FIVE, options="--planners adam", only=ADAM, excluded=CONVERGED),
     Recipe(CONTROL[:1], "policies", (REACH,), (PAPERS,), FREE, "--iterations 880", POLICY, EARLY),
     Recipe(CONTROL[:1], "policies", (REACH,), (*FIVE[1:], "ensemble+mse"), FREE, "--iterations 2200", POLICY, EARLY),
     Recipe(CONTROL[:1], "policies", (PUSH,), FIVE, FREE, "--iterations 880", POLICY),
@@ -203,7 +204,7 @@ def shipped(folder: Path = RESULTS) -> dict[str, pd.DataFrame]:
     return {name: tables.load(path) for name in names if (path := tables.stored(folder / f"{name}.csv"))}
 
 
-def asked(some: Iterable[Claim], rows: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+def rows_of_claims(some: Iterable[Claim], rows: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """The rows that the checks of claims ask for, under every reading."""
     checks = [check for one in some for found in one.checks.values() for check in found]
     terms = {
@@ -227,21 +228,22 @@ def with_sources(wanted: Mapping[str, pd.DataFrame], rows: Mapping[str, pd.DataF
     learned, found = rows["05_control"], dict(wanted)
     if "05_control" not in wanted:
         return found
-    asked = select(wanted["05_control"], planner="policy")
-    told = select(asked, metric=list(policies.SOONEST))
+    of_policies = select(wanted["05_control"], planner="policy")
+    plateaus = select(of_policies, metric=list(policies.SOONEST))
     latent = select(learned, planner="policy", search_space="latent")
-    of = {tuple(key) for key in told[["env", "seed"]].to_numpy().tolist()}
-    again = latent[[tuple(key) in of for key in latent[["env", "seed"]].to_numpy().tolist()]]
-    first = pd.concat([asked, again])
-    of = {tuple(key) for key in first[["env", "seed", "model"]].to_numpy().tolist()}
-    early = select(latent, subset=policies.EARLY)
-    early = early[[tuple(key) in of for key in early[["env", "seed", "model"]].to_numpy().tolist()]]
-    index = wanted["05_control"].index.union(again.index).union(early.index)
-    found["05_control"] = learned.loc[index]
-    if len(told):
-        free = select(rows["model_free"], env=[*told["env"].unique()], model=FREE)
+    again = sharing(latent, plateaus, ["env", "seed"])
+    relearned = pd.concat([of_policies, again])
+    early = sharing(select(latent, subset=policies.EARLY), relearned, ["env", "seed", "model"])
+    found["05_control"] = learned.loc[wanted["05_control"].index.union(again.index).union(early.index)]
+    if len(plateaus):
+        free = select(rows["model_free"], env=[*plateaus["env"].unique()], model=FREE)
         found["model_free"] = rows["model_free"].loc[free.index.union(found.get("model_free", free[:0]).index)]
     return found
+
+
+def sharing(rows: pd.DataFrame, others: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """Those of ``rows`` that have the values of some row of ``others`` in these columns."""
+    return rows[rows.set_index(columns).index.isin(others.set_index(columns).index)]
 
 
 def commands(wanted: Mapping[str, pd.DataFrame], folder: str = "runs") -> list[str]:
@@ -255,7 +257,7 @@ def commands(wanted: Mapping[str, pd.DataFrame], folder: str = "runs") -> list[s
     return list(dict.fromkeys(found))
 
 
-def far(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def differences(before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Of each table and metric: rows, those that are there again, and how far their values then lie from those before,
     in units and as a share of the metric's standard deviation before, where it has one; the furthest first."""
     lines = []
@@ -309,7 +311,7 @@ def _seeds(recipe: Recipe, rows: pd.DataFrame) -> str:
     for env in recipe.envs:
         of = rows[rows["env"] == recipe.env_of_rows(env)]
         models: dict[str, list[str]] = {}
-        for word in (*recipe.models, *recipe.along[:1] * (not recipe.models)):
+        for word in (*recipe.models, *recipe.extra_models[:1] * (not recipe.models)):
             if there := sorted(set(of["seed"][of["model"] == word])):
                 models.setdefault(span(there), []).append(word)
         most = max(models, key=lambda seeds: len(models[seeds]), default="no rows ship")
@@ -331,7 +333,7 @@ def verdict(one: Claim, rows: Mapping[str, pd.DataFrame]) -> evaluate.Verdict:
     return evaluate.judge(one, evaluate.Tables(rows))
 
 
-def told(one: Claim, before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> str:
+def compared(one: Claim, before: Mapping[str, pd.DataFrame], after: Mapping[str, pd.DataFrame]) -> str:
     """Both verdicts on a claim, and the check that decided the first, then and now."""
     old, new = verdict(one, before), verdict(one, after)
     (again,) = (effect for effect in new.effects[""] if effect.check.text == old.key.check.text)
@@ -343,10 +345,11 @@ def folder() -> Path:
     return runs.home() / (os.environ.get("TSM_RUN_DIR") or "runs")
 
 
-def keep(place: Path) -> None:
-    """Copy the tables to ``place``, as a whole or not at all."""
+def keep(place: Path, request: Mapping[str, files.Json]) -> None:
+    """Copy the tables to ``place``, as a whole or not at all, and say for which request."""
     made = Path(f"{place}.partial")
     shutil.copytree(RESULTS, made, dirs_exist_ok=True)
+    files.write_bytes(made / REQUEST, files.dumps(made / REQUEST, dict(request)).encode())
     made.rename(place)
 
 
@@ -363,16 +366,21 @@ def main() -> None:
     if given.page:
         between(PAGE, MARKS, page())
         return
-    place = folder() / "reproduce"
+    place, request = folder() / "reproduce", {"what": given.what, "seeds": given.seeds, "subject": given.subject}
     if place.is_dir() and not given.list:
-        print(f"compared with the tables in {place}, kept by a command that was stopped; delete it to begin anew")
+        if (stopped := files.loads((place / REQUEST).read_bytes())) != request:
+            parser.error(
+                f"{place} keeps the tables from before a command that was stopped, {stopped}; run that one to its end, "
+                "or delete the folder to compare with what is there now"
+            )
+        print(f"compared with the tables in {place}, kept by this command as it was stopped")
     rows = shipped(place) if place.is_dir() else shipped()
     known = {one.id: one for one in (*claims(given.subject), *questions())}
     if not given.what or (unknown := [name for name in given.what if name not in (*rows, *known, "all")]):
         which = f"no table or claim is called {', '.join(unknown)}" if given.what else "nothing is named"
         parser.error(f"{which}; there are {', '.join(rows)}; claims C01 to C54; questions Q1 to Q7; all")
     chosen = [known[name] for name in given.what if name in known]
-    parts = [with_sources(asked(chosen, rows), rows)]
+    parts = [with_sources(rows_of_claims(chosen, rows), rows)]
     parts += [{name: rows[name] for name in rows if name in given.what or "all" in given.what}]
     wanted = {
         name: (found := pd.concat(some))[~found.index.duplicated()].sort_index()
@@ -393,7 +401,7 @@ def main() -> None:
         how = "; ".join(f"{name} (how to install it: {where})" for name, where in others.items())
         parser.error(f"these commands need another environment: {how}; --list prints the commands")
     if not place.is_dir():
-        keep(place)
+        keep(place, request)
     for i, line in enumerate([*lines, CLAIMS], 1):
         print(f"[{i} of {len(lines) + 1}] {line}", flush=True)
         if code := subprocess.run(words(line), cwd=ROOT, check=False).returncode:
@@ -401,13 +409,13 @@ def main() -> None:
                 f"{line}\nended with status {code}; what was made before it stays, and the same command goes on"
             )
     after = shipped()
-    found = far({name: table for name, table in wanted.items() if len(table)}, after)
+    found = differences({name: table for name, table in wanted.items() if len(table)}, after)
     print(found.head(FURTHEST).to_string(index=False, float_format="{:.3g}".format))
     print(f"{len(found)} metrics, the furthest first; {found['equal'].sum()} of {found['rows'].sum()} rows are equal")
     for name in rows:
         if more := len(after[name]) - len(rows[name]):
             print(f"{name} has {more:+} rows")
-    print("\n".join(told(one, rows, after) for one in chosen))
+    print("\n".join(compared(one, rows, after) for one in chosen))
     shutil.rmtree(place)
 
 

@@ -179,7 +179,8 @@ def rounds(
     rows = table.select(found, execution=planning.CLOSED, env=env)
     every, yours = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env, alone=True))
     curves, _ = table.pair(rows, partial(exploration.round_panels, titles=titles, env=env))
-    across = exploration.levels(every, curves, found[:0] if plans is None else plans, env)
+    oracle = exploration.oracle_rows(found[:0] if plans is None else plans, env)
+    across = exploration.levels(every, curves, oracle, env)
     if curves:
         stem = "10_pushing" if env == exploration.PUSH else "10_rounds"
         policies = {} if free is None else exploration.policy_panels(free, titles, env)
@@ -191,10 +192,12 @@ def rounds(
         ylabels = {f"{task}: {title}": units[title] for title in curves}
         ends = exploration.axis_ends(table.drawn(rows), env, fell)
         lowest = {f"{task}: {title}": low for title, low in ends.items()}
+        source = table.PUBLISHED if table.PUBLISHED in set(rows["source"]) else table.YOURS
         if policies and free is not None:
-            source = table.PUBLISHED if table.PUBLISHED in set(rows["source"]) else table.YOURS
             beside = table.select(free, env=env, planner="policy", subset="", model=exploration.MODEL_FREE)
             rows = pd.concat([rows, beside.assign(source=source)])
+        if len(oracle):
+            rows = pd.concat([rows, oracle.assign(source=source)])
         levels = {f"{task}: {title}": values for title, values in across.items()}
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest, levels=levels), stem, rows)
 

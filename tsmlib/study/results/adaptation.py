@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import Scores
 from tsmlib.figures.method import Look, Method
@@ -79,23 +78,10 @@ def shares_left(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[M
             if len(share := (after / before).dropna()):
                 ways[Method(way, look=WAYS[way])] = share.to_numpy(float)
         if ways:
-            found.setdefault(f"{zoo.look(word).name}, {ahead} steps", {})[changes_of(env)] = ways
+            spec = EnvSpec.parse(env)
+            arm = f"{spec.task} {spec.physics.word.removeprefix('-')}"
+            found.setdefault(f"{zoo.look(word).name}, {ahead} steps", {})[arm] = ways
     return {title: found[title] for title in sorted(found)}
-
-
-def changes_of(env: str) -> str:
-    """What has changed of an arm, in words: ``"push, mass x 0.5"``."""
-    spec, usual = EnvSpec.parse(env), Physics()
-    told = [
-        f"{name} x {value / of:g}"
-        for name, value, of in (
-            ("mass", spec.physics.mass, usual.mass), ("damping", spec.physics.damping, usual.damping),
-            ("upper link", spec.physics.link_lengths[0], usual.link_lengths[0]),
-            ("torque", spec.physics.torque_gain, usual.torque_gain),
-        )
-        if value != of
-    ]  # fmt: skip
-    return ", ".join([spec.task, *told])
 
 
 @table.sourced

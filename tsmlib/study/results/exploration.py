@@ -165,19 +165,23 @@ def policy_panels(
     return found
 
 
-def levels(alone: Panels, planned: Panels, plans: pd.DataFrame, env: str) -> dict[str, dict[Method, np.ndarray]]:
-    """Title of ROUNDS -> training alone, and the oracle open loop -> values (k,), for ``figures.rounds``.
+def oracle_rows(plans: pd.DataFrame, env: str) -> pd.DataFrame:
+    """Of rows of 05_control, what the oracle's plans over codes return, open loop, and their successes."""
+    return table.select(plans, env=env, model=ORACLE.model, search_space=ORACLE.search_space, planner=ORACLE.planner,
+                        execution=OPEN, metric=["return_true", "success"])  # fmt: skip
 
-    alone, planned: ``round_panels`` with training alone and without it; plans: rows of 05_control.
+
+def levels(alone: Panels, planned: Panels, oracle: pd.DataFrame, env: str) -> dict[str, dict[Method, np.ndarray]]:
+    """Title of ROUNDS -> training alone, and the oracle -> values (k,), for ``figures.rounds``.
+
+    alone, planned: ``round_panels`` with training alone and without it; oracle: ``oracle_rows``.
     """
     found: dict[str, dict[Method, np.ndarray]] = {}
     for metric, title in ROUNDS[env].items():
         beyond = {way: values[:, -1] for way, (_, values) in alone.get(title, {}).items()
                   if way not in planned.get(title, {})}  # fmt: skip
-        oracle = table.select(plans, env=env, model=ORACLE.model, search_space=ORACLE.search_space,
-                              planner=ORACLE.planner, execution=OPEN, metric=metric)  # fmt: skip
-        if title in planned and len(oracle) and metric in ("return_true", "success"):
-            seeds = oracle["value"].to_numpy(float)
+        seeds = table.select(oracle, metric=metric)["value"].to_numpy(float)
+        if title in planned and len(seeds):
             beyond[zoo.method(ORACLE.model, variant=f"{OPEN}, {len(seeds)} seeds")] = seeds
         if beyond:
             found[title] = beyond
