@@ -31,6 +31,7 @@ class Features(nn.Module):
         self.others = [d for d in range(state_dim) if d not in angles]
         self.dim = state_dim + len(angles)
         self._settled: tuple[slice | Tensor, slice | Tensor] | None = None
+        self._parts: tuple[slice | Tensor | list[int], ...] = (_columns(self.angles), _columns(self.others))
         self.register_buffer("mean", torch.zeros(self.dim))
         self.register_buffer("std", torch.ones(self.dim))
         self.register_buffer("step_std", torch.zeros(state_dim))  # of x_{t+1} - x_t, physical units; 0 until fitted
@@ -76,15 +77,18 @@ class Features(nn.Module):
         return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
 
     def settle(self) -> None:
-        """Fix which columns change: within ``torch.func`` and CUDA graphs no value can be looked at. After another
-        ``fit`` call it again. ValueError without statistics."""
+        """Fix which columns change, and indices on the device: within ``torch.func`` and CUDA graphs no value can be
+        looked at or brought there. After another ``fit`` call it again. ValueError without statistics."""
         if not self.fitted:
             raise ValueError("these features have no statistics of data; call fit first")
-        self._settled = tuple(  # type: ignore[assignment]  # of two
-            index if isinstance(index := _columns(some.nonzero()[:, 0].tolist()), slice)
-            else torch.tensor(index, dtype=torch.long, device=some.device)
-            for some in (self.moving, self.scored)
-        )  # fmt: skip
+
+        def fixed(index: list[int]) -> slice | Tensor:
+            at = _columns(index)
+            return at if isinstance(at, slice) else torch.tensor(at, dtype=torch.long).to(self.std.device)
+
+        moving, scored = (some.nonzero()[:, 0].tolist() for some in (self.moving, self.scored))
+        self._settled = fixed(moving), fixed(scored)
+        self._parts = fixed(self.angles), fixed(self.others)
 
     def forward(self, states: Tensor) -> Tensor:
         """(..., dx) -> (..., dim): cosines, sines, the rest; zero mean and unit variance on the training data."""
@@ -114,8 +118,8 @@ class Features(nn.Module):
         return slice(None) if moving.all() else moving
 
     def _raw(self, states: Tensor) -> Tensor:
-        angles = states[..., _columns(self.angles)]
-        return torch.cat([angles.cos(), angles.sin(), states[..., _columns(self.others)]], dim=-1)
+        angles, others = (states[..., part] for part in self._parts)
+        return torch.cat([angles.cos(), angles.sin(), others], dim=-1)
 
 
 class Featured:

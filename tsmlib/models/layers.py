@@ -4,7 +4,7 @@ Letters in shapes: B batch, M models side by side, P positions in time, C channe
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import cache, reduce
 from itertools import pairwise
 from typing import TypedDict
 
@@ -149,25 +149,15 @@ class CausalDecoder(Configured):
         return self._out(reduce(torch.add, skips), inputs[:, first:])
 
     def last(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, output_dim).
-
-        Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed.
-        """
-        n_positions, owed = inputs.shape[1], [[0]]
-        for dilation in reversed(self.dilations[1:]):
-            seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
-            owed.insert(0, sorted(seen))
-        s, held = self.inlet(inputs), list(reversed(range(n_positions)))
-        skips = []
+        """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, out)."""
+        s, skips = self.inlet(inputs), []
         codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
-        for layer, dilation, code, positions in zip(self.layers, self.dilations, codes, owed, strict=True):
-            at = {p: i for i, p in enumerate(held)}
+        taken = _owed_to_last(self.dilations, inputs.shape[1], s.device)
+        for layer, code, index in zip(self.layers, codes, taken, strict=True):
             s = F.pad(s, (0, 0, 0, 1))  # zeros stand for what lies before the first position
-            taken = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
-            earlier, now = s.index_select(1, torch.tensor(taken).to(s.device)).chunk(2, dim=1)
+            earlier, now = s.index_select(1, index).chunk(2, dim=1)
             s, skip = layer(earlier, now, code)
             skips.append(skip[:, 0])
-            held = positions
         return self._out(reduce(torch.add, skips), inputs[:, -1])
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
@@ -204,6 +194,26 @@ class CausalDecoder(Configured):
             layer_inputs.append(s)
             skips.append(skip[:, now - n :])
         return layer_inputs, skips
+
+
+@cache
+def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.device) -> list[Tensor]:
+    """For each layer, what the last position sees of its inputs: indices of those at t - d, then of those at t.
+
+    Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed. Kept,
+    so that a CUDA graph finds them on its device.
+    """
+    owed = [[0]]
+    for dilation in reversed(dilations[1:]):
+        seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
+        owed.insert(0, sorted(seen))
+    taken, held = list[Tensor](), list(reversed(range(n_positions)))
+    for dilation, positions in zip(dilations, owed, strict=True):
+        at = {p: i for i, p in enumerate(held)}
+        index = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
+        taken.append(torch.tensor(index).to(device))
+        held = positions
+    return taken
 
 
 class Encoder(nn.Module):

@@ -2,7 +2,7 @@
 
 Each policy has starts, targets, noise, gradient norm, record and checkpoint of its own, and is to float tolerance what
 ``learn_policy`` makes of it alone. Ten as one take about as long as five one after another, on a CPU too
-(benchmarks/settings, section 11).
+(benchmarks/settings, section 11). On a GPU imagined episodes and their gradient are recorded once, as CUDA graphs.
 
 Letters in shapes: S policies, each of M copies, n episodes of each copy, T horizon.
 """
@@ -10,6 +10,7 @@ Letters in shapes: S policies, each of M copies, n episodes of each copy, T hori
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
@@ -155,8 +156,9 @@ class _Stack:
         self.optimizer = torch.optim.Adam(self.weights.values(), lr=self.options.lr)
         self.module = deepcopy(modules[0])
         self.draws = self._recorded_draws()
-        if isinstance(features := getattr(self.module.model, "features", None), Features):
-            features.settle()
+        for own in (self.module.policy.features, getattr(self.module.model, "features", None)):
+            if isinstance(own, Features) and own.fitted:
+                own.settle()
         if first.state.step:
             for i, weight in enumerate(self.weights.values()):
                 own = [learner.state.optimizers["adam"].state[learner.trained[i]] for learner in learners]
@@ -164,6 +166,7 @@ class _Stack:
                     name: torch.stack([moments[name] for moments in own]) if value.ndim else value.clone()
                     for name, value in own[0].items()
                 }
+        self.imagined = self._recorded() if self.device.type == "cuda" else self._together
 
     def _recorded_draws(self) -> list[torch.Size]:
         """Shapes of the noise of n episodes of one copy, in the order in which it is drawn."""
@@ -210,23 +213,9 @@ class _Stack:
         o = self.options
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(iteration, o.lr, o.lr_decay, o.lr_final)
-        drawn, noise = [], []
-        for learner in self.learners:
-            start, target, separate = learner.episodes(iteration, o.episodes)
-            drawn.append((start, target))
-            noise.append(
-                [
-                    torch.cat([torch.randn(shape, generator=g, dtype=start.dtype) for g in separate.generators])
-                    for shape in self.draws
-                ]
-            )
-        starts, targets = (torch.stack(part) for part in zip(*drawn, strict=True))
-        numbers = [torch.stack(part).to(self.device) for part in zip(*noise, strict=True)]
-        with as_operations():
-            seen = vmap(self._imagined)(
-                self.weights, self.fixed, starts.to(self.device), targets.to(self.device), numbers
-            )
-        states, actions = (part.to(starts.device) for part in seen)
+        starts, targets, *noise = self._episodes(iteration)
+        given = [part.to(self.device) for part in (starts, targets, *noise)]
+        states, actions = (part.to(starts.device) for part in self.imagined(*given, *self.weights.values()))
         values = []
         for k, learner in enumerate(self.learners):
             try:
@@ -242,6 +231,35 @@ class _Stack:
             learner = self.learners[int(finite.int().argmin())]
             raise _of(learner, learner.state.stopped(NOT_FINITE, iteration))
         self.optimizer.step()
+
+    def _episodes(self, iteration: int) -> list[Tensor]:
+        """Starts, targets and noise of an iteration, (S, M n, .) each."""
+        drawn = []
+        for learner in self.learners:
+            start, target, separate = learner.episodes(iteration, self.options.episodes)
+            noise = [
+                torch.cat([torch.randn(shape, generator=g, dtype=start.dtype) for g in separate.generators])
+                for shape in self.draws
+            ]
+            drawn.append([start, target, *noise])
+        return [torch.stack(part) for part in zip(*drawn, strict=True)]
+
+    def _recorded(self) -> Callable[..., tuple[Tensor, Tensor]]:
+        """``_together`` and its gradient as CUDA graphs: imagined episodes are many small operations. As it is where a
+        model does what no graph can hold."""
+        given = [part.to(self.device) for part in self._episodes(0)]
+        try:
+            recorded = torch.cuda.make_graphed_callables(self._together, (*given, *self.weights.values()))
+        except RuntimeError as error:
+            warnings.warn(f"{type(self.module.model).__name__} is not recorded as a CUDA graph: {error}", stacklevel=2)
+            return self._together
+        return cast("Callable[..., tuple[Tensor, Tensor]]", recorded)
+
+    def _together(self, starts: Tensor, targets: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        """States and actions (S, M n, T, .) of all policies. rest: noise, then the weights."""
+        noise, weights = list(rest[: len(self.draws)]), dict(zip(self.weights, rest[len(self.draws) :], strict=True))
+        with as_operations():
+            return vmap(self._imagined)(weights, self.fixed, starts, targets, noise)
 
     def _imagined(
         self, weights: dict[str, Tensor], fixed: dict[str, Tensor], start: Tensor, target: Tensor, noise: list[Tensor]
