@@ -17,7 +17,7 @@ from tsmlib.models.features import Features
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
-from tsmlib.study import zoo
+from tsmlib.study import pendulum, zoo
 from tsmlib.study.results.policies import learning_curves
 from tsmlib.study.runs import ROOT
 
@@ -44,9 +44,9 @@ def played(env: str, n: int = 4) -> tuple[Task, torch.Tensor, np.ndarray, np.nda
     """One batch of episodes with random torques: the task, the actions (n, T, 2), what was observed, the rewards."""
     episodes = model_free.Episodes(env, n, seed=3)
     episodes.reset()
-    start, target = episodes.arms._states.astype(np.float32), episodes.arms.target.astype(np.float32)
+    start, target = episodes.robots._states.astype(np.float32), episodes.robots.target.astype(np.float32)
     task = Task.standard(env, start, torch.from_numpy(target))
-    episodes.arms.reset(options={"states": start, "target": target})  # as a task keeps them, in single precision
+    episodes.robots.reset(options={"states": start, "target": target})  # as a task keeps them, in single precision
     seen, rewards, over = [model_free.observed(start, target)], [], []
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (n, task.horizon, 2)).astype(np.float32)
     for step in range(task.horizon):
@@ -70,6 +70,30 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
     per_step = task.reward(trial.states[:, 1:], actions)
     np.testing.assert_allclose(rewards, per_step, atol=1e-6)
     np.testing.assert_allclose(rewards.sum(1), trial.executed_return, atol=1e-5)
+
+
+def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
+    task, episodes = pendulum.swing_up(3, seed=7), model_free.episodes_of(pendulum.PENDULUM, 3, seed=7)
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (3, task.horizon, 1)).astype(np.float32)
+    seen, rewards, over = [episodes.reset()], [], []
+    for step in range(task.horizon):
+        observation, reward, ended = episodes.step(actions[:, step])
+        seen.append(observation)
+        rewards.append(reward)
+        over.append(ended)
+    assert over == [False] * (task.horizon - 1) + [True]
+    trial = execute(task, torch.from_numpy(actions).clamp(-1, 1))
+    np.testing.assert_allclose(np.stack(seen, axis=1), trial.states, atol=1e-5)
+    np.testing.assert_allclose(np.stack(rewards, axis=1).sum(1), trial.executed_return, atol=1e-4)
+
+
+def test_the_pendulum_is_measured_from_the_starts_of_its_rounds_and_chosen_from_others() -> None:
+    tested, chosen = (model_free.load_task(pendulum.PENDULUM, split) for split in ("test", "validation"))
+    np.testing.assert_array_equal(tested.start, pendulum.swing_up(8, seed=pendulum.TESTED).start)
+    assert not (tested.start[:, None] == chosen.start).all(2).any()
+    found = model_free.measured(tested, lambda seen: np.zeros((len(seen), 1)))
+    trial = execute(tested, torch.zeros(8, tested.horizon, 1))
+    assert found == {"return_true": pytest.approx(float(trial.executed_return.mean()), abs=1e-4), "success": 0.0}
 
 
 def test_a_policy_sees_what_ours_see_and_the_target() -> None:
@@ -169,13 +193,13 @@ def test_sac_updates_as_often_per_step_as_its_configuration_says() -> None:
 
 @needs_sb3
 def test_the_library_is_told_how_an_episode_ended() -> None:
-    arms = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
-    arms.reset()
+    robots = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
+    robots.reset()
     for _ in range(model_free.horizon("tsm/Reacher-v0") - 1):
-        *_, done, infos = arms.step(np.zeros((3, 2), np.float32))
+        *_, done, infos = robots.step(np.zeros((3, 2), np.float32))
         assert not done.any()
         assert infos == [{}, {}, {}]
-    seen, _, done, infos = arms.step(np.zeros((3, 2), np.float32))
+    seen, _, done, infos = robots.step(np.zeros((3, 2), np.float32))
     assert done.all()
     for row, info in zip(seen, infos, strict=True):
         assert info["TimeLimit.truncated"]

@@ -7,8 +7,8 @@ seed, and its executed return on the frozen test targets is measured along the w
 
     OMP_NUM_THREADS=1 python benchmarks/model_free/model_free.py
 
-SAC, which is no policy gradient and learns from all that it has seen, is asked for by name. 10_explore compares all
-three after as many steps as ``--steps`` says.
+SAC, which is no policy gradient and learns from all that it has seen, is asked for by name, and so is the pendulum of
+10_explore, which compares all three with rounds after as many steps as ``--steps`` says.
 
 Every finished run is kept in the table and not repeated; of one that was stopped the table holds the beginning.
 """
@@ -21,19 +21,24 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm.auto import tqdm
 
 import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib import study
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.stepping import within_bounds
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import HORIZON, Task
 from tsmlib.storage import tables
+from tsmlib.study import pendulum, worlds
+from tsmlib.study.results import exploration
+from tsmlib.study.results.exploration import PENDULUM
 from tsmlib.study.runs import ROOT
 from tsmlib.trajectory import Segment
 
@@ -70,8 +75,9 @@ SETTINGS: dict[str, list[dict[str, float]]] = {
     ],
 }  # episodes: per update, of SAC side by side; std: of the actions, at first; updates: per step of the environment
 MINIBATCH = 250  # steps; of PPO, and of TRPO's value function
-STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 1_000_000}  # of the environment, by each seed
-SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v1": 200_000}  # by each configuration
+STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 1_000_000, PENDULUM: 200_000}  # by each seed
+SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v1": 200_000, PENDULUM: 40_000}  # by each configuration
+VALIDATION_STARTS = 2000  # seed of the pendulum's that a configuration is chosen by
 SEARCH_SEED = 100
 RECORDS = 25  # along the way, and one before
 UNITS = {"return_true": "m", "final_distance": "m", "success": "share", "seconds": "s", "cpu_seconds": "s"}
@@ -91,7 +97,17 @@ def observed(states: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def horizon(env: str) -> int:
     """Steps of an episode of an environment's task."""
+    if env == PENDULUM:
+        return exploration.HORIZON
     return HORIZON["push" if EnvSpec.parse(env).task == "push" else "reach"]
+
+
+def load_task(env: str, split: str) -> Task:
+    """The task that a policy is measured on: frozen targets, of the pendulum the starts that measure its rounds."""
+    if env != PENDULUM:
+        return study.load_task(env, split)
+    starts = worlds.world(env).sizes["paper"].starts
+    return worlds.world(env).tested(starts) if split == "test" else pendulum.swing_up(starts, VALIDATION_STARTS)
 
 
 class Episodes:
@@ -99,21 +115,73 @@ class Episodes:
 
     def __init__(self, env: str, n: int, *, seed: int) -> None:
         self.horizon = horizon(env)
-        self.arms: Any = gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped
+        self.robots = self.make(env, n)
         self.seed: int | None = seed  # of the first reset; the later ones go on from there
         self.taken = 0
 
+    def make(self, env: str, n: int) -> Any:
+        """The vector environment."""
+        return gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped
+
+    @property
+    def actions(self) -> gymnasium.Space:
+        """The actions that a policy gives."""
+        return self.robots.single_action_space
+
+    @property
+    def seen(self) -> int:
+        """Numbers that a policy sees, k."""
+        dx = self.robots.single_observation_space.shape[0]
+        return observed(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
+
+    def observed(self, states: np.ndarray) -> np.ndarray:
+        """What a policy sees of states (n, dx): (n, k)."""
+        return observed(states, self.robots.target)
+
     def reset(self) -> np.ndarray:
         """Begin n episodes: their first observations (n, k)."""
-        states, _ = self.arms.reset(seed=self.seed)
+        states, _ = self.robots.reset(seed=self.seed)
         self.seed, self.taken = None, 0
-        return observed(states, self.arms.target)
+        return self.observed(states)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Actions (n, 2) -> observations (n, k), rewards (n,), and whether the episodes are over."""
-        states, rewards, *_ = self.arms.step(actions)
+        """Actions (n, du) -> observations (n, k), rewards (n,), and whether the episodes are over."""
+        states, rewards = self.stepped(actions)
         self.taken += 1
-        return observed(states, self.arms.target), rewards, self.taken == self.horizon
+        return self.observed(states), rewards, self.taken == self.horizon
+
+    def stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, dx) after actions (n, du), and their rewards."""
+        states, rewards, *_ = self.robots.step(actions)
+        return states, rewards
+
+
+class Swings(Episodes):
+    """Episodes of n pendulums, with actions and reward as ``pendulum.swing_up`` has them; a policy sees the state."""
+
+    def make(self, env: str, n: int) -> Any:
+        return gymnasium.make_vec(env, num_envs=n, vectorization_mode="sync")
+
+    @property
+    def actions(self) -> gymnasium.Space:
+        return gymnasium.spaces.Box(-1, 1, self.robots.single_action_space.shape, np.float32)
+
+    @property
+    def seen(self) -> int:
+        return self.robots.single_observation_space.shape[0]
+
+    def observed(self, states: np.ndarray) -> np.ndarray:
+        return states.astype(np.float32)
+
+    def stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        actions = np.clip(actions, -1, 1)
+        states, *_ = self.robots.step(within_bounds(actions, self.robots.single_action_space))
+        return states, pendulum.upright(torch.from_numpy(states), torch.from_numpy(actions)).numpy()
+
+
+def episodes_of(env: str, n: int, *, seed: int) -> Episodes:
+    """Episodes of an environment."""
+    return (Swings if env == PENDULUM else Episodes)(env, n, seed=seed)
 
 
 def measured(task: Task, predict: Predictor) -> dict[str, float]:
@@ -121,14 +189,18 @@ def measured(task: Task, predict: Predictor) -> dict[str, float]:
     target = task.target.numpy()
 
     def control(past: Segment) -> torch.Tensor:
-        actions = predict(observed(past.states[:, -1].numpy(), target))
+        states = past.states[:, -1].numpy()
+        actions = predict(states.astype(np.float32) if task.env == PENDULUM else observed(states, target))
         return torch.from_numpy(np.asarray(actions, np.float32))[:, None]
 
     done = execute(task, control)
-    return {
-        "return_true": float(done.executed_return.mean()), "final_distance": float(done.final_distance.mean()),
-        "success": float((done.final_distance < task.tolerance).float().mean()),
-    }  # fmt: skip
+    found = {
+        "return_true": float(done.executed_return.mean()),
+        "success": float(cast(Tensor, done.success).float().mean()),
+    }
+    if task.position is not None:
+        found["final_distance"] = float(done.final_distance.mean())
+    return found
 
 
 # Theirs --------------------------------------------------------------------------------------------------------------
@@ -138,12 +210,10 @@ def vectorised(episodes: Episodes) -> Any:
     """``episodes`` as a vector environment of Stable-Baselines3. The end of an episode is a limit of time."""
     from stable_baselines3.common.vec_env import VecEnv
 
-    class Arms(VecEnv):
+    class Robots(VecEnv):
         def __init__(self) -> None:
-            arms = episodes.arms
-            k = observed(np.zeros((1, arms.single_observation_space.shape[0])), np.zeros((1, 2))).shape[1]
-            space = gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32)
-            super().__init__(arms.num_envs, space, arms.single_action_space)
+            space = gymnasium.spaces.Box(-np.inf, np.inf, (episodes.seen,), np.float32)
+            super().__init__(episodes.robots.num_envs, space, episodes.actions)
 
         def reset(self) -> np.ndarray:
             return episodes.reset()
@@ -160,21 +230,21 @@ def vectorised(episodes: Episodes) -> Any:
             return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
 
         def close(self) -> None:
-            episodes.arms.close()
+            episodes.robots.close()
 
         def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-            return [getattr(episodes.arms, attr_name)] * self.num_envs
+            return [getattr(episodes.robots, attr_name)] * self.num_envs
 
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            raise NotImplementedError("the arms share their attributes")
+            raise NotImplementedError("the episodes share their attributes")
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-            raise NotImplementedError("the arms share their methods")
+            raise NotImplementedError("the episodes share their methods")
 
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
             return [False] * self.num_envs
 
-    return Arms()
+    return Robots()
 
 
 def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
@@ -186,15 +256,15 @@ def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int
 
     special = {name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")}
     network: dict[str, Any] = dict(net_arch=[64, 64])
-    arms = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
+    robots = vectorised(episodes_of(env, int(setting["episodes"]), seed=seed))
     if algorithm == "sac":
         return SAC(  # ReLU is its default
-            "MlpPolicy", VecNormalize(arms, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
+            "MlpPolicy", VecNormalize(robots, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
             gradient_steps=max(1, round(setting["updates"] * setting["episodes"])), **special,
         )  # fmt: skip
     network |= dict(activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
-        "MlpPolicy", VecNormalize(arms, gamma=GAMMA), n_steps=horizon(env), batch_size=MINIBATCH, gamma=GAMMA,
+        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=horizon(env), batch_size=MINIBATCH, gamma=GAMMA,
         policy_kwargs=network, seed=seed, device="cpu", **special,
     )  # fmt: skip
 
@@ -213,7 +283,7 @@ def learn(
 
     clock = np.zeros(2)
     last = -1
-    title = f"{EnvSpec.parse(task.env).name} {algorithm} {named(setting)}, seed {seed}"
+    title = f"{task.env} {algorithm} {named(setting)}, seed {seed}"
     with tqdm(total=steps, desc=title, unit="step", mininterval=5) as bar:
         for goal in np.linspace(0, steps, records + 1).round().astype(int):
             began = _clock()
@@ -256,19 +326,27 @@ class Table:
 
     def put(self, key: Mapping[str, Any], task: Task, records: list[dict[str, float]]) -> list[dict[str, Any]]:
         """Write what is known of a run, in place of what was known before."""
+        simulator = {} if task.env == PENDULUM else {"sim": EnvSpec.parse(task.env).simulator}
         common = dict(
             key,
-            sim=EnvSpec.parse(task.env).simulator,
-            task=task.name,
+            **simulator,
+            task=exploration.TASKS.get(task.env, task.name),
             planner="policy",
             execution="policy",
             n=len(task),
             scale="paper",
         )
         new = [
-            dict(common, env_steps=record["steps"], metric=metric, value=record[metric], unit=unit)
+            dict(
+                common,
+                env_steps=record["steps"],
+                metric=metric,
+                value=record[metric],
+                unit="" if unit == "m" and task.env == PENDULUM else unit,
+            )
             for record in records
             for metric, unit in UNITS.items()
+            if metric in record
         ]
         others = [row for row in self.rows if any(row[name] != value for name, value in key.items())]
         self.rows = [*others, *new]
@@ -285,7 +363,7 @@ def run(
     key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
     rows = table.kept(key, steps)
     if not rows:
-        task, found = study.load_task(env, split), []
+        task, found = load_task(env, split), []
         for record in learn(algorithm, task, setting, steps=steps, records=records, seed=seed):
             found.append(record)
             rows = table.put(key, task, found)
@@ -303,7 +381,7 @@ def search(table: Table, env: str, algorithm: str, *, steps: int) -> dict[str, f
 
 def parser() -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--env", choices=ENVS, help="one task instead of both")
+    found.add_argument("--env", choices=(*ENVS, PENDULUM), help=f"one task instead of {' and '.join(ENVS)}")
     found.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=GRADIENTS, help="default ppo and trpo")
     found.add_argument("--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})")
     found.add_argument("--seeds", type=int, default=3, help="0, 1, ... (default 3)")
@@ -324,8 +402,8 @@ def main(given: list[str] | None = None) -> None:
     table = Table(arguments.out)
     pairs = list(itertools.product([arguments.env] if arguments.env else ENVS,
                                    arguments.algorithm))  # fmt: skip
-    steps = {env: arguments.steps or STEPS[env] for env in ENVS}
-    tried = {env: min(steps[env], SEARCH_STEPS[env]) for env in ENVS}
+    steps = {env: arguments.steps or most for env, most in STEPS.items()}
+    tried = {env: min(steps[env], most) for env, most in SEARCH_STEPS.items()}
     best = {(env, algorithm): search(table, env, algorithm, steps=tried[env]) for env, algorithm in pairs}
     for seed in range(arguments.seeds):
         for env, algorithm in pairs:

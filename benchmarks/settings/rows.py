@@ -45,11 +45,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from tsmlib import study
+from tsmlib import figures, study
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, needed, notebooks, parameters, rounds, runs, worlds, zoo
+from tsmlib.study import adaptation, drawings, media, needed, notebooks, parameters, rounds, runs, worlds, zoo
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
@@ -69,6 +69,7 @@ WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
 WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
+MAPPED = (exploration.PUSH, "rtsm", exploration.PLANNED, 0, "paper")  # the loop whose episodes are drawn
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -313,6 +314,10 @@ def main() -> None:
         for env, word, data in wanted_rounds(options, given):
             loop = rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds"))
             publish(notebook, [*loop.rows, *loop.seconds], loops=True)
+            if (env, word, data, run.seed, run.scale) == MAPPED:
+                figure, n = drawings.places(loop.episodes[0], loop.episodes[-1])
+                figures.stamp(figure, f"{media.of_run(run)}, n = {n}")
+                figures.save(figure, runs.ROOT / "figures" / "10_places")
     elif given.part == "adaptation":
         for env in wanted_arms(options, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))

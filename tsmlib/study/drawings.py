@@ -18,8 +18,10 @@ from tsmlib.evaluation import scoring
 from tsmlib.figures.method import Method
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.study import rounds as rounds_study
 from tsmlib.study import zoo
 from tsmlib.study.results import adaptation, exploration, latent, planning, policies, prediction, robustness, table
+from tsmlib.trajectory import Trajectories
 
 PROTOCOLS = {"ll_paper": "paper's protocol", "ll_shared": "one shared variance"}  # of figure 5
 SCORES = {**PROTOCOLS, "ll_own": "own density", "energy_score_noise": "energy score"}
@@ -200,6 +202,16 @@ def rounds(
             rows = pd.concat([rows, oracle.assign(source=source)])
         levels = {f"{task}: {title}": values for title, values in across.items()}
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest, levels=levels), stem, rows)
+
+
+def places(first: Trajectories, last: Trajectories, n: int = 24) -> tuple[Figure, int]:
+    """Where fingertip and object are in the episodes that a loop of pushes began with and in those of its last round,
+    with the contacts of an episode; and of how many episodes of each it is, ``n`` at most."""
+    seen = {"random": first, "own plans": last}
+    notes = {f"object: {title}": f"{rounds_study.of_pushes(each)['contacts_per_episode']:.1f} contacts an episode"
+             for title, each in seen.items()}  # fmt: skip
+    n = min(n, len(first), len(last))
+    return figures.visited(rounds_study.places(seen, n), ("x (m)", "y (m)"), notes, equal=True), n
 
 
 def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:

@@ -81,7 +81,7 @@ share, 1 by the simulator, 0 for doing nothing; gap, mean size of predicted minu
 
 def aims() -> pd.DataFrame:
     """The aims of the study and what the shipped rows say of them."""
-    control, free = published("05_control"), policies_results.finished(published("model_free"))
+    control, free = published("05_control"), policies_results.of_arms(published("model_free"))
     predict = pd.concat([published("03_predict"), published("peers_pets")])
     learned = tables_storage.frame(pd.concat([control, free]))
     return aims_results.aims(tables_storage.frame(predict), control, published("05_control_rows"), learned)
@@ -264,7 +264,7 @@ def results_page() -> str:
     """Every published table of predictions, plans and policies, from the shipped rows alone."""
     control, by_target, free = published("05_control"), published("05_control_rows"), published("model_free")
     predict = tables_storage.frame(pd.concat([published("03_predict"), published("peers_pets")]))
-    learned = tables_storage.frame(pd.concat([control, policies_results.finished(free)]))
+    learned = tables_storage.frame(pd.concat([control, policies_results.of_arms(free)]))
     seeds = {env: own["seed"].nunique() for env, own in table.groups(predict, "env")}
     scores = "\n\n".join(
         f"`{env}`, {n} training seed{'s' * (n > 1)}{' unless said' * (n > 1)}:\n\n"
@@ -414,7 +414,7 @@ mbrl-lib's PETS plans the pendulum anew after every step and is trained before e
 the pushing arm, like the others here, every ten steps and once a round (`benchmarks/peers`).
 
 {exploration_results.rounds_table(rows)}
-{_pushing_rounds(rows, free)}
+{_steps_of_policies(rows, free, exploration_results.PENDULUM)}{_pushing_rounds(rows, free)}
 The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque, of `mass0.5` the object has half its
 mass, of `damping2` the joints have twice their damping, and of `links0.12x0.11` the upper link is 20 % longer. n test
 episodes, open loop after ten observed steps, in units of the standard arm.
@@ -430,6 +430,18 @@ Right of the line adapting made a model worse.
 {_recovered(rows)}
 {exploration_results.sentences(rows)}
 {adaptation_results.sentences(rows)}"""
+
+
+def _steps_of_policies(rows: pd.DataFrame, free: pd.DataFrame | None, env: str) -> str:
+    """The part of that page on model-free learners of an environment; empty without rows of them."""
+    if free is None or not (beside := exploration_results.steps_table(rows, free, env)):
+        return ""
+    return f"""
+Environment steps to the return that a model-free learner ends with, means over seeds (of the policy / of the rounds),
+from the same starts; the fewest of rounds are their random episodes:
+
+{beside}
+"""
 
 
 def _exploration_aims(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
@@ -468,6 +480,10 @@ Steps are on a logarithmic axis. Axes end a little below the lowest of round 0 a
 what training alone ends with, and what the same search finds through the true simulator, open loop.
 
 {found}
+
+![Fingertip and object on the plane, in random episodes and in own plans](../figures/10_places.png)
+
+Every step of episodes of `rtsm`, seed 0: those it began with, and those of its last round of own plans.
 """
     if differences := exploration_results.differences_table(rows):
         page += f"""
@@ -476,13 +492,7 @@ after as many rounds, which have been trained as often:
 
 {differences}
 """
-    if free is not None and (beside := exploration_results.steps_table(rows, free)):
-        page += f"""
-Environment steps to the same return, means over seeds (of the policy / of the rounds), on the frozen targets; the
-fewest of rounds are their random episodes:
-
-{beside}
-"""
+    page += _steps_of_policies(rows, free, exploration_results.PUSH)
     if priors := exploration_results.priors_table(rows):
         page += f"""
 A search through the true simulator, which favours no prior, in codes of the prior before the first round and of the

@@ -14,7 +14,7 @@ import pandas as pd
 from tsmlib.figures.method import Method
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.study.results import table
-from tsmlib.study.results.planning import ARRIVED, ordered
+from tsmlib.study.results.planning import ARRIVED, PUSH, REACH, ordered
 from tsmlib.study.results.table import PolicyHeader, Row
 
 GRADIENTS = ("ppo", "trpo")  # the policy gradients of figure 7
@@ -220,9 +220,14 @@ def finished(found: pd.DataFrame) -> pd.DataFrame:
     return found.loc[own.index[(last == last.groupby(method, sort=False).transform("max")).to_numpy(dtype=bool)]]
 
 
+def of_arms(free: pd.DataFrame) -> pd.DataFrame:
+    """``finished`` rows of model-free learners on the two arms."""
+    return finished(table.select(free, env=[REACH, PUSH]))
+
+
 def gradients(free: pd.DataFrame) -> pd.DataFrame:
-    """``finished`` rows of the policy gradients among model-free learners, which are those of figure 7."""
-    return finished(table.select(free, model=GRADIENTS))
+    """Those of the policy gradients, which are in figure 7."""
+    return table.select(of_arms(free), model=GRADIENTS)
 
 
 def references(found: pd.DataFrame) -> dict[str, dict[Method, float]]:
