@@ -320,7 +320,8 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=PLANNED, metric="return_true")
     learned = table.select(free, env=env, planner="policy", subset="", metric="return_true")
     lines = []
-    for policy, theirs in table.groups(table.select(learned, model=MODEL_FREE), "model"):
+    for policy in (word for word in MODEL_FREE if word in set(learned["model"])):
+        theirs = table.select(learned, model=policy)
         end, level = _end(theirs)
         for word, ours in table.groups(rounds, "model"):
             own, k, taken = _there(ours, level)
