@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scripts import pins, start_with_only
@@ -18,7 +19,9 @@ from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
 from tsmlib.study import pendulum, zoo
-from tsmlib.study.results.policies import learning_curves
+from tsmlib.study.comparison import published
+from tsmlib.study.results.policies import finished_on_arms, gradients, learning_curves
+from tsmlib.study.results.table import select
 from tsmlib.study.runs import ROOT
 
 FOLDER = ROOT / "benchmarks" / "model_free"
@@ -73,7 +76,8 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
 
 
 def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
-    task, episodes = pendulum.swing_up(3, seed=7), model_free.episodes_of(pendulum.PENDULUM, 3, seed=7)
+    task, episodes = pendulum.swing_up(3, seed=7), model_free.episodes_of(pendulum.PENDULUM, 3, seed=0)
+    episodes.seeds = lambda _: [7, 8, 9]
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (3, task.horizon, 1)).astype(np.float32)
     seen, rewards, over = [episodes.reset()], [], []
     for step in range(task.horizon):
@@ -85,6 +89,12 @@ def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
     trial = execute(task, torch.from_numpy(actions).clamp(-1, 1))
     np.testing.assert_allclose(np.stack(seen, axis=1), trial.states, atol=1e-5)
     np.testing.assert_allclose(np.stack(rewards, axis=1).sum(1), trial.executed_return, atol=1e-4)
+
+
+def test_training_seeds_share_no_start_of_the_pendulum() -> None:
+    several = [model_free.episodes_of(pendulum.PENDULUM, 20, seed=seed) for seed in (0, 1)]
+    one, other = (np.concatenate([episodes.reset() for _ in range(3)]) for episodes in several)
+    assert not (one[:, None] == other).all(2).any()
 
 
 def test_the_pendulum_is_measured_from_the_starts_of_its_rounds_and_chosen_from_others() -> None:
@@ -161,6 +171,23 @@ def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
     assert curves["samples"].tolist() == [0, 500, 1000]
     assert curves["seconds"].tolist() == [-1.0, -2.0, -3.0]  # the processor's
     assert "iterations" not in curves
+
+
+def test_rows_of_the_pendulum_are_those_of_its_rounds_and_have_no_part_in_figure_7(tmp_path: Path) -> None:
+    table, env = model_free.Table(tmp_path / "model_free.csv"), pendulum.PENDULUM
+    key = dict(env=env, model="ppo", subset="", configuration="std=0.14", seed=0)
+    found = [{name: value for name, value in one.items() if name != "final_distance"} for one in records(0, 2000)]
+    rows = tables.frame(table.put(key, model_free.load_task(env, "test"), found))
+    theirs = select(published("10_explore"), env=env, metric="return_true")
+    own = select(tables.load(table.path), metric="return_true")
+    assert len(rows) == 2 * (len(model_free.UNITS) - 1)
+    for column in ("sim", "task", "unit", "n"):
+        assert set(own[column].astype(str)) == set(theirs[column].astype(str)), column
+    free = published("model_free")
+    both = tables.frame(pd.concat([free[free["env"] != env], rows]))
+    for kept in (finished_on_arms, gradients):
+        assert env not in set(kept(both)["env"])
+        assert len(kept(both)) == len(kept(free)) > 0
 
 
 @pytest.mark.parametrize("arguments", [["--seeds", "0"], ["--steps", "-1"], ["--records", "0"]])

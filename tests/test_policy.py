@@ -190,6 +190,15 @@ def test_the_last_position_alone_is_the_last_of_all(
     torch.testing.assert_close(decoder.last(inputs, z), decoder(inputs, z)[:, -1])
 
 
+def test_a_decoder_that_was_asked_in_inference_mode_still_learns() -> None:
+    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=(1, 3, 1))
+    inputs, z = normal(5, 7, 3).float(), normal(5, 4, seed=1).float()
+    with torch.inference_mode():
+        decoder.last(inputs, z)
+    decoder.last(inputs, z).sum().backward()
+    assert decoder.inlet.weight.grad is not None
+
+
 def test_the_first_action_of_a_decoded_segment_needs_no_other() -> None:
     past, z = some_past(5).actions, normal(5, 3)
     torch.testing.assert_close(prior().first(past, z), prior().decode(past, z)[:, 0])

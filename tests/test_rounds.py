@@ -344,7 +344,10 @@ def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> 
     ])  # fmt: skip
     free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (9000, -15))])
     cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
-    assert cells == ["SAC", "9,000", "-15.00", "`rtsm`", "600", "6.7%", "in round 1", "-10.00", "1 / 2"]
+    assert cells == ["SAC", "9,000", "-15.00", "`rtsm`", "600", "6.7%", "in round 1", "-10.00", "-", "1 / 2"]
+    further = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (800, -10))])
+    line = results.steps_table(rows, tables.frame(pd.concat([free, further]))).splitlines()[-1]
+    assert [cell.strip() for cell in line.split("|")][-3:-1] == ["800", "1 / 2"]
     assert results.steps_table(tables.frame([]), free) == results.steps_table(rows, tables.frame([])) == ""
 
 

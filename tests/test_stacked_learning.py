@@ -28,13 +28,14 @@ from tsmlib.trajectory import Segment
 
 DX, DU, H = 5, 2, 4
 SEEDS = (10, 20)
+ANGLES = (1,)  # not first, as on an arm
 OPTIONS = LearningOptions(horizon=9, episodes=3, iterations=6, record_every=2, lr=1e-2)
 SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
 MODELS: dict[str, Any] = {
-    "tsm": lambda: TSM(DX, DU, angles=(1,), **SMALL),
-    "onestep": lambda: OneStep(DX, DU, angles=(1,), hidden=8, layers=1),
-    "lstm": lambda: LSTM(DX, DU, angles=(1,), hidden=8, past_len=H, segment_len=8),
-    "rtsm": lambda: RecurrentTSM(DX, DU, angles=(1,), hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=8),
+    "tsm": lambda: TSM(DX, DU, angles=ANGLES, **SMALL),
+    "onestep": lambda: OneStep(DX, DU, angles=ANGLES, hidden=8, layers=1),
+    "lstm": lambda: LSTM(DX, DU, angles=ANGLES, hidden=8, past_len=H, segment_len=8),
+    "rtsm": lambda: RecurrentTSM(DX, DU, angles=ANGLES, hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=8),
 }
 KINDS = ("onestep", "segment")
 
@@ -57,7 +58,7 @@ def models(word: str) -> list[Any]:
 def policies(kind: str) -> list[Any]:
     made: list[Policy] = []
     for seed in SEEDS:
-        options: dict[str, Any] = dict(angles=(1,), copies=2, seed=seed)
+        options: dict[str, Any] = dict(angles=ANGLES, copies=2, seed=seed)
         torch.manual_seed(seed)
         if kind == "onestep":
             made.append(OneStepPolicy(DX, DU, hidden=8, **options))
@@ -114,6 +115,21 @@ def test_each_of_several_policies_learns_what_it_learns_alone(kind: str, word: s
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_gpu_it_learns_the_same(kind: str, word: str) -> None:
     assert_same(alone(kind, word), together(kind, word, device="cuda"))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("word", MODELS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("error:.*is not captured")
+def test_models_of_arms_are_captured_as_cuda_graphs(kind: str, word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "ANGLES", (0, 1))
+    assert_same(alone(kind, word), together(kind, word, device="cuda"))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_model_that_no_cuda_graph_holds_says_so() -> None:
+    with pytest.warns(UserWarning, match="LSTM is not captured"):
+        together("onestep", "lstm", device="cuda")
 
 
 def test_each_copys_gradient_is_shortened_by_its_own_norm() -> None:
@@ -203,14 +219,14 @@ def test_what_cannot_be_one_of_several_is_refused() -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("target_std", 0.5), ("copies", 3), ("hidden", 4)])
 def test_policies_that_are_not_alike_are_refused_naming_what_differs(name: str, value: float) -> None:
-    options: dict[str, Any] = dict(angles=(1,), copies=2, hidden=8) | {name: value}
+    options: dict[str, Any] = dict(angles=ANGLES, copies=2, hidden=8) | {name: value}
     learned = [policies("onestep")[0], OneStepPolicy(DX, DU, **options)]
     with pytest.raises(ValueError, match="OneStepPolicys that are stacked must be alike; found .* and "):
         learn_stacked(learned, models("onestep"), arrive, draws(), OPTIONS, seeds=SEEDS)
 
 
 def test_models_that_are_not_alike_are_refused_naming_what_differs() -> None:
-    longer = in_units(LSTM(DX, DU, angles=(1,), hidden=8, past_len=H, segment_len=9))
+    longer = in_units(LSTM(DX, DU, angles=ANGLES, hidden=8, past_len=H, segment_len=9))
     with pytest.raises(ValueError, match="LSTMs that are stacked must be alike; found segment_len 8 and 9"):
         learn_stacked(policies("onestep"), [models("lstm")[0], longer], arrive, draws(), OPTIONS, seeds=SEEDS)
     with pytest.raises(ValueError, match="found class 'LSTM' and 'OneStep'"):

@@ -316,7 +316,7 @@ def main() -> None:
             publish(notebook, [*loop.rows, *loop.seconds], loops=True)
             if (env, word, data, run.seed, run.scale) == MAPPED:
                 figure, n = drawings.places(loop.episodes[0], loop.episodes[-1])
-                figures.stamp(figure, f"{media.of_run(run)}, n = {n}")
+                media.stamp_run(run, figure, n)
                 figures.save(figure, runs.ROOT / "figures" / "10_places")
     elif given.part == "adaptation":
         for env in wanted_arms(options, given):

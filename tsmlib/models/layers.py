@@ -197,7 +197,7 @@ class CausalDecoder(Configured):
 
 
 @cache
-def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.device) -> list[Tensor]:
+def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.device) -> tuple[Tensor, ...]:
     """For each layer, what the last position sees of its inputs: indices of those at t - d, then of those at t.
 
     Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed. Kept,
@@ -211,9 +211,10 @@ def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.de
     for dilation, positions in zip(dilations, owed, strict=True):
         at = {p: i for i, p in enumerate(held)}
         index = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
-        taken.append(torch.tensor(index).to(device))
+        with torch.inference_mode(False):  # they are kept for those who learn, too
+            taken.append(torch.tensor(index).to(device))
         held = positions
-    return taken
+    return tuple(taken)
 
 
 class Encoder(nn.Module):

@@ -2,7 +2,8 @@
 
 Each policy has starts, targets, noise, gradient norm, record and checkpoint of its own, and is to float tolerance what
 ``learn_policy`` makes of it alone. Ten as one take about as long as five one after another, on a CPU too
-(benchmarks/settings, section 11). On a GPU imagined episodes and their gradient are recorded once, as CUDA graphs.
+(benchmarks/settings, section 11). On a GPU imagined episodes and their gradient are captured once, as CUDA graphs,
+where a graph can hold the model.
 
 Letters in shapes: S policies, each of M copies, n episodes of each copy, T horizon.
 """
@@ -166,7 +167,7 @@ class _Stack:
                     name: torch.stack([moments[name] for moments in own]) if value.ndim else value.clone()
                     for name, value in own[0].items()
                 }
-        self.imagined = self._recorded() if self.device.type == "cuda" else self._together
+        self.imagined = self._captured() if self.device.type == "cuda" else self._together
 
     def _recorded_draws(self) -> list[torch.Size]:
         """Shapes of the noise of n episodes of one copy, in the order in which it is drawn."""
@@ -244,14 +245,16 @@ class _Stack:
             drawn.append([start, target, *noise])
         return [torch.stack(part) for part in zip(*drawn, strict=True)]
 
-    def _recorded(self) -> Callable[..., tuple[Tensor, Tensor]]:
-        """``_together`` and its gradient as CUDA graphs: imagined episodes are many small operations. As it is where a
-        model does what no graph can hold."""
+    def _captured(self) -> Callable[..., tuple[Tensor, Tensor]]:
+        """``_together`` and its gradient as CUDA graphs: imagined episodes are many small operations. The function
+        itself, with a warning, where a model does what no graph can hold."""
         given = [part.to(self.device) for part in self._episodes(0)]
         try:
             recorded = torch.cuda.make_graphed_callables(self._together, (*given, *self.weights.values()))
+        except torch.OutOfMemoryError:
+            raise
         except RuntimeError as error:
-            warnings.warn(f"{type(self.module.model).__name__} is not recorded as a CUDA graph: {error}", stacklevel=2)
+            warnings.warn(f"{type(self.module.model).__name__} is not captured as a CUDA graph: {error}", stacklevel=2)
             return self._together
         return cast("Callable[..., tuple[Tensor, Tensor]]", recorded)
 

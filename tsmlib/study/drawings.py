@@ -205,13 +205,15 @@ def rounds(
 
 
 def places(first: Trajectories, last: Trajectories, n: int = 24) -> tuple[Figure, int]:
-    """Where fingertip and object are in the episodes that a loop of pushes began with and in those of its last round,
-    with the contacts of an episode; and of how many episodes of each it is, ``n`` at most."""
-    seen = {"random": first, "own plans": last}
+    """Where fingertip and object are, and contacts per episode; and of how many episodes of each it is.
+
+    first, last: episodes that a loop of pushes began with, and those of its last round, of which the first ``n`` count.
+    """
+    n = min(n, len(first), len(last))
+    seen = {"random": first.take(slice(n)), "own plans": last.take(slice(n))}
     notes = {f"object: {title}": f"{rounds_study.of_pushes(each)['contacts_per_episode']:.1f} contacts an episode"
              for title, each in seen.items()}  # fmt: skip
-    n = min(n, len(first), len(last))
-    return figures.visited(rounds_study.places(seen, n), ("x (m)", "y (m)"), notes, equal=True), n
+    return figures.visited(rounds_study.places(seen), ("x (m)", "y (m)"), notes, equal=True), n
 
 
 def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:

@@ -43,9 +43,14 @@ def show(run: Run, figure: Figure, stem: str, rows: pd.DataFrame | None = None, 
     if rows is not None:
         figures.stamp(figure, table.stamp(rows, figure=True))
     elif n is not None:
-        figures.stamp(figure, f"{'' if run.scale == 'paper' else 'yours: '}{of_run(run)}, n = {n:,}")
+        stamp_run(run, figure, n)
     figures.save(figure, run.figures / stem)
     display(figure)
+
+
+def stamp_run(run: Run, figure: Figure, n: int) -> None:
+    """Stamp a figure with a run, and of how many of its episodes or targets it is."""
+    figures.stamp(figure, f"{'' if run.scale == 'paper' else 'yours: '}{of_run(run)}, n = {n:,}")
 
 
 def of_run(run: Run) -> str:

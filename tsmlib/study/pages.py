@@ -81,7 +81,7 @@ share, 1 by the simulator, 0 for doing nothing; gap, mean size of predicted minu
 
 def aims() -> pd.DataFrame:
     """The aims of the study and what the shipped rows say of them."""
-    control, free = published("05_control"), policies_results.of_arms(published("model_free"))
+    control, free = published("05_control"), policies_results.finished_on_arms(published("model_free"))
     predict = pd.concat([published("03_predict"), published("peers_pets")])
     learned = tables_storage.frame(pd.concat([control, free]))
     return aims_results.aims(tables_storage.frame(predict), control, published("05_control_rows"), learned)
@@ -264,7 +264,7 @@ def results_page() -> str:
     """Every published table of predictions, plans and policies, from the shipped rows alone."""
     control, by_target, free = published("05_control"), published("05_control_rows"), published("model_free")
     predict = tables_storage.frame(pd.concat([published("03_predict"), published("peers_pets")]))
-    learned = tables_storage.frame(pd.concat([control, policies_results.of_arms(free)]))
+    learned = tables_storage.frame(pd.concat([control, policies_results.finished_on_arms(free)]))
     seeds = {env: own["seed"].nunique() for env, own in table.groups(predict, "env")}
     scores = "\n\n".join(
         f"`{env}`, {n} training seed{'s' * (n > 1)}{' unless said' * (n > 1)}:\n\n"
@@ -410,6 +410,8 @@ first round.
 {_exploration_aims(rows, free)}
 ![Executed return and open-loop gap of the pendulum against environment steps](../figures/10_rounds.png)
 
+Steps are on a logarithmic axis; of learners without a model single seeds are marked at the end.
+
 mbrl-lib's PETS plans the pendulum anew after every step and is trained before every episode, as in its own examples;
 the pushing arm, like the others here, every ten steps and once a round (`benchmarks/peers`).
 
@@ -437,8 +439,8 @@ def _steps_of_policies(rows: pd.DataFrame, free: pd.DataFrame | None, env: str) 
     if free is None or not (beside := exploration_results.steps_table(rows, free, env)):
         return ""
     return f"""
-Environment steps to the return that a model-free learner ends with, means over seeds (of the policy / of the rounds),
-from the same starts; the fewest of rounds are their random episodes:
+Environment steps to the return that a model-free learner ends with, and its own to that of the last round, means over
+seeds (of the policy / of the rounds), from the same starts; the fewest of rounds are their random episodes:
 
 {beside}
 """
@@ -483,7 +485,7 @@ what training alone ends with, and what the same search finds through the true s
 
 ![Fingertip and object on the plane, in random episodes and in own plans](../figures/10_places.png)
 
-Every step of episodes of `rtsm`, seed 0: those it began with, and those of its last round of own plans.
+Every step of 24 episodes of `rtsm`, seed 0, of those it began with and of its last round of own plans.
 """
     if differences := exploration_results.differences_table(rows):
         page += f"""

@@ -74,9 +74,9 @@ def torques_of(prior: ActionPrior, n: int = 256) -> float:
     return float(actions.square().mean().sqrt())
 
 
-def places(seen: Mapping[str, Trajectories], n: int = 24) -> dict[str, np.ndarray]:
-    """Where fingertip and object are (m) in up to ``n`` episodes of each, as many of all: title -> (states, 2)."""
-    n = min(n, *map(len, seen.values()))
+def places(seen: Mapping[str, Trajectories]) -> dict[str, np.ndarray]:
+    """Where fingertip and object are (m) in as many episodes of each as all have: title -> (states, 2)."""
+    n = min(map(len, seen.values()))
     return {
         f"{body}: {title}": data.states[:n, :, where].reshape(-1, 2)
         for body, where in (("fingertip", TIP), ("object", BLOCK)) for title, data in seen.items()

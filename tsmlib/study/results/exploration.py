@@ -310,8 +310,8 @@ def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
 
 
 def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
-    """Environment steps of rounds to the final return of each model-free learner, and the round that came to it; means
-    over seeds. Empty where either has no rows.
+    """Environment steps of rounds to the final return of each model-free learner, and the round that came to it; and
+    the learner's own to the return after the last round; means over seeds. Empty where either has no rows.
 
     free: learning curves of ``benchmarks/model_free``. "-" for a return that was not reached.
     """
@@ -322,15 +322,17 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
     lines = []
     for policy in (word for word in MODEL_FREE if word in set(learned["model"])):
         theirs = table.select(learned, model=policy)
-        end, level = _end(theirs)
+        curve, (end, level) = theirs.groupby("env_steps")["value"].mean(), _end(theirs)
         for word, ours in table.groups(rounds, "model"):
             own, k, taken = _there(ours, level)
+            there = curve.index[curve >= own.iloc[-1]]
             lines.append({
                 "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{level:.2f}",
                 "rounds of": f"`{word}`", "steps to that return": "-" if k is None else f"{taken:,.0f}",
                 "share": "-" if k is None else f"{taken / end:.1%}",
                 "when": "never" if k is None else f"in round {k:.0f}" if k else "before the first round",
                 "return after the last": f"{own.iloc[-1]:.2f}",
+                "policy's steps to that": f"{there[0]:,.0f}" if len(there) else "-",
                 "seeds": f"{theirs['seed'].nunique()} / {ours['seed'].nunique()}",
             })  # fmt: skip
     return table.markdown(pd.DataFrame(lines))

@@ -220,14 +220,14 @@ def finished(found: pd.DataFrame) -> pd.DataFrame:
     return found.loc[own.index[(last == last.groupby(method, sort=False).transform("max")).to_numpy(dtype=bool)]]
 
 
-def of_arms(free: pd.DataFrame) -> pd.DataFrame:
+def finished_on_arms(free: pd.DataFrame) -> pd.DataFrame:
     """``finished`` rows of model-free learners on the two arms."""
     return finished(table.select(free, env=[REACH, PUSH]))
 
 
 def gradients(free: pd.DataFrame) -> pd.DataFrame:
-    """Those of the policy gradients, which are in figure 7."""
-    return table.select(of_arms(free), model=GRADIENTS)
+    """``finished_on_arms`` rows of PPO and TRPO, the policy gradients of figure 7."""
+    return table.select(finished_on_arms(free), model=GRADIENTS)
 
 
 def references(found: pd.DataFrame) -> dict[str, dict[Method, float]]:
