@@ -513,6 +513,20 @@ def test_the_notebook_says_of_the_loop_of_mbrl_lib_what_the_published_rows_say()
     assert ((wide[PUSH]["pets"] - nothing).abs() < 0.2).all()
 
 
+def test_the_notebook_says_of_policies_of_the_pendulum_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), execution="closed loop", env=PENDULUM)
+    lines = results.steps_table(rows, published("model_free"), PENDULUM).splitlines()
+    names, _, *found = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    compared = [dict(zip(names, line, strict=True)) for line in found]
+    assert len(compared) == 3 * 4  # and of rounds the segment model, the LSTM, the ensemble and PETS
+    for one in compared:
+        steps = int(one["policy's steps to that"].replace(",", ""))
+        assert 4_000 <= steps <= 12_000 if one["policy"] == "SAC" else steps >= 48_000
+        assert float(one["its return"]) > float(one["return after the last"])
+        assert one["its steps"] == "100,000"
+    assert rows["env_steps"].max() == 2_200
+
+
 def test_the_notebook_says_of_torques_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), env=PUSH, model="rtsm", metric="torque_rms")
     last = table.select(rows, subset=results.LAST_PRIOR).pivot(index="seed", columns="configuration", values="value")
