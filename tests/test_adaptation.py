@@ -240,8 +240,8 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
         for name, ways in robots.items() for way, share in ways.items()
     }  # fmt: skip
     harmed = [mean for (_, name, _), mean in means.items() if name in in_vain]
-    assert min(harmed) >= 0.93
-    assert np.mean([mean > 1 for mean in harmed]) > 0.5
+    assert min(harmed) > 1
+    assert len(harmed) == 3 * (3 + 2)  # arms; ways of the segment model and of the LSTM
     helped = [mean for (_, name, way), mean in means.items() if way != "codes" and any(w in name for w in of_use)]
     assert len(helped) == 4 * 2 * 2 + 2  # arms, models, ways; and an ensemble of the reaching arm
     assert max(helped) < 1
