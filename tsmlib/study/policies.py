@@ -49,6 +49,7 @@ class Budget:
 
 
 USUAL = Budget()
+MEASURED = {"smoke": 2, "laptop": 8, "paper": 100}  # first targets of a task that a learning curve is of, at most
 
 
 class Learned(NamedTuple):
@@ -63,8 +64,8 @@ def learn(run: Run, task: Task, method: Method, budget: Budget = USUAL) -> Learn
 
     method: a model and a search space, latent (a SegmentPolicy, acting through the action prior) or direct (a
     OneStepPolicy). Episodes start as those of the training data, so the environment is not asked. Its executed
-    return on ``task`` is measured at ten points along the way, beside the return that the model predicts there
-    (``assess``); neither has a part in learning.
+    return on the first targets of ``task``, as many as ``MEASURED`` says, is measured at ten points along the way,
+    beside the return that the model predicts there (``assess``); neither has a part in learning.
 
     From the run's folder; else, at scale laptop with seed 0, the shipped one, whatever its budget; else learned now,
     going on from its checkpoint if it was stopped.
@@ -192,15 +193,20 @@ class _Asked:
             horizon=self.task.horizon, iterations=n, episodes=EPISODES[self.run.scale], record_every=max(1, n // 10)
         )
 
+    @property
+    def measured(self) -> Task:
+        """What the learning curve is of, the same for every notebook that asks for the policy at a scale."""
+        return self.task.take(min(len(self.task), MEASURED[self.run.scale]))
+
     def measure(self, policy: Policy) -> dict[str, Tensor]:
         """Numbers of the learning curve."""
-        return assess(policy, self.net, self.task, seed=self.run.seed + 1)
+        return assess(policy, self.net, self.measured, seed=self.run.seed + 1)
 
     def store(self, policy: Policy, curve: LearningCurve) -> Learned:
         """The policy as it is kept in the run's folder."""
         header: dict[str, Json] = {
             "made_from": self.made_from, "budget": asdict(self.budget), "model": self.method.model,
-            "search_space": self.method.search_space, "targets": len(self.task),
+            "search_space": self.method.search_space, "targets": len(self.measured),
             "fingerprint": fingerprint(self.task.env), "seed": self.run.seed, "scale": self.run.scale,
             "curve": asdict(curve), "seconds": curve.seconds[-1], "torch": torch.__version__,
             "threads": torch.get_num_threads(), "device": self.run.device, "finished": time.strftime("%Y-%m-%d"),
