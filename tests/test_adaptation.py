@@ -240,6 +240,11 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
         for name, ways in robots.items() for way, share in ways.items()
     }  # fmt: skip
     harmed = [mean for (_, name, _), mean in means.items() if name in in_vain]
+    lows = [
+        mean - half for title, robots in shares.items() if title.endswith("80 steps") for name in in_vain
+        for mean, half in map(interval, robots.get(name, {}).values())
+    ]  # fmt: skip
+    assert sum(low > 1 for low in lows) == 3
     assert min(harmed) > 1
     assert len(harmed) == 3 * (3 + 2)  # arms; ways of the segment model and of the LSTM
     helped = [mean for (_, name, way), mean in means.items() if way != "codes" and any(w in name for w in of_use)]

@@ -121,6 +121,16 @@ def test_the_map_has_as_many_episodes_of_each_source() -> None:
     assert {ax.get_aspect() for ax in figures.visited(found, ("x", "y"), {}, equal=True).axes} == {1.0}
 
 
+def test_contacts_beside_the_map_are_of_all_episodes_and_points_of_the_first() -> None:
+    first, last = worlds.world(PUSH).random(5, 0), worlds.world(PUSH).random(3, 1)
+    figure, n = drawings.places(first, last, n=2)
+    assert n == 2
+    titles = [ax.get_title(loc="left") or ax.get_title() for ax in figure.axes]
+    found = rounds.of_pushes(first)["contacts_per_episode"]
+    assert titles[2] == f"object: random\n{found:.1f} contacts an\nepisode, of all 5"
+    assert len(figure.axes[2].lines[0].get_xdata()) == 2 * (rounds.HORIZON + 1)
+
+
 def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = rounds.loop(RUN, "rtsm", env=PUSH).rows
 
@@ -345,9 +355,10 @@ def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> 
     free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (9000, -15))])
     cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
     assert cells == ["SAC", "9,000", "-15.00", "`rtsm`", "600", "6.7%", "in round 1", "-10.00", "-", "1 / 2"]
-    further = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (800, -10))])
-    line = results.steps_table(rows, tables.frame(pd.concat([free, further]))).splitlines()[-1]
-    assert [cell.strip() for cell in line.split("|")][-3:-1] == ["800", "1 / 2"]
+    falls_back = [(0, -30), (800, -10), (900, -12), (1000, -9)]  # below what the rounds end with
+    free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in falls_back])
+    line = results.steps_table(rows, free).splitlines()[-1]
+    assert [cell.strip() for cell in line.split("|")][-3:-1] == ["1,000", "1 / 2"]
     assert results.steps_table(tables.frame([]), free) == results.steps_table(rows, tables.frame([])) == ""
 
 
@@ -521,7 +532,7 @@ def test_the_notebook_says_of_policies_of_the_pendulum_what_the_published_rows_s
     assert len(compared) == 3 * 4  # and of rounds the segment model, the LSTM, the ensemble and PETS
     for one in compared:
         steps = int(one["policy's steps to that"].replace(",", ""))
-        assert 4_000 <= steps <= 12_000 if one["policy"] == "SAC" else steps >= 48_000
+        assert steps == 12_000 if one["policy"] == "SAC" else 48_000 <= steps <= 68_000
         assert float(one["its return"]) > float(one["return after the last"])
         assert one["its steps"] == "100,000"
     assert rows["env_steps"].max() == 2_200

@@ -156,12 +156,12 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
         for name, ways in robots.items():
             for way, seeds in ways.items():
                 at = names.index(name) + 0.22 * ([*look_of].index(way) - (len(look_of) - 1) / 2)
-                ax.plot(seeds, np.full(len(seeds), at), ".", color=tint(way.look.colour, 0.6), ms=3, mew=0, zorder=2)
+                ax.plot(seeds, np.full(len(seeds), at), ".", color=DARK, ms=2.5, mew=0, zorder=4)
                 ax.plot(seeds.mean(), at, **look_of[way] | {"ls": "", "ms": 5, "mew": 1}, zorder=3)
         ax.set(title=title, xlabel=xlabel, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
         ax.set_yticks(range(len(names)), names)
         ax.grid(axis="x", color=GRID, lw=0.6)
-    dots = entry("single seeds", color=tint(DARK, 0.5), ls="", marker=".", ms=3)
+    dots = entry("single seeds", color=DARK, ls="", marker=".", ms=2.5)
     return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), dots], 4)
 
 

@@ -205,15 +205,18 @@ def rounds(
 
 
 def places(first: Trajectories, last: Trajectories, n: int = 24) -> tuple[Figure, int]:
-    """Where fingertip and object are, and contacts per episode; and of how many episodes of each it is.
+    """Where fingertip and object are, in how many episodes of each; and the contacts per episode of all.
 
-    first, last: episodes that a loop of pushes began with, and those of its last round, of which the first ``n`` count.
+    first, last: episodes that a loop of pushes began with, and those of its last round; the first ``n`` are drawn.
     """
-    n = min(n, len(first), len(last))
-    seen = {"random": first.take(slice(n)), "own plans": last.take(slice(n))}
-    notes = {f"object: {title}": f"{rounds_study.of_pushes(each)['contacts_per_episode']:.1f} contacts an episode"
-             for title, each in seen.items()}  # fmt: skip
-    return figures.visited(rounds_study.places(seen), ("x (m)", "y (m)"), notes, equal=True), n
+    n, seen = min(n, len(first), len(last)), {"random": first, "own plans": last}
+    contacts = {title: rounds_study.of_pushes(each)["contacts_per_episode"] for title, each in seen.items()}
+    notes = {
+        f"object: {title}": f"{contacts[title]:.1f} contacts an\nepisode, of all {len(each)}"
+        for title, each in seen.items()
+    }
+    drawn = {title: each.take(slice(n)) for title, each in seen.items()}
+    return figures.visited(rounds_study.places(drawn), ("x (m)", "y (m)"), notes, equal=True), n
 
 
 def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:

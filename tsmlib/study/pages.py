@@ -439,8 +439,9 @@ def _steps_of_policies(rows: pd.DataFrame, free: pd.DataFrame | None, env: str) 
     if free is None or not (beside := exploration_results.steps_table(rows, free, env)):
         return ""
     return f"""
-Environment steps to the return that a model-free learner ends with, and its own to that of the last round, means over
-seeds (of the policy / of the rounds), from the same starts; the fewest of rounds are their random episodes:
+Environment steps of rounds to the return that a model-free learner ends with, and the learner's own to the return after
+the last round, at the first of its 25 records from which it stays there; means over seeds (of the policy / of the
+rounds), from the same starts; the fewest of rounds are their random episodes:
 
 {beside}
 """
@@ -485,7 +486,7 @@ what training alone ends with, and what the same search finds through the true s
 
 ![Fingertip and object on the plane, in random episodes and in own plans](../figures/10_places.png)
 
-Every step of 24 episodes of `rtsm`, seed 0, of those it began with and of its last round of own plans.
+Every step of 24 random episodes that `rtsm`, seed 0, began with, and of 24 from its last round of own plans.
 """
     if differences := exploration_results.differences_table(rows):
         page += f"""

@@ -242,7 +242,7 @@ ZOO = {spec.word: spec for spec in _MODELS}
 PAPERS, OURS = "tsm", "rtsm"  # the model of the paper, and the one that goes beyond it
 CODED = ("TSM", "RecurrentTSM")  # classes whose predictions are a function of codes; the first has an encoder too
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method
-    "ppo": Look("PPO", "#999933"), "trpo": Look("TRPO", "#7B4B2A"), "sac": Look("SAC", "#44AA99"),
+    "ppo": Look("PPO", "#999933"), "trpo": Look("TRPO", "#7B4B2A"), "sac": Look("SAC", "#D81B60"),
     "oracle": Look("oracle", "#111111"),
     "random": Look("random torques", "#7A7A7A"), "zero": Look("zero torque", "#B0B0B0"),
     "data": Look("data", "#4A4A4A"), "filter": Look("Kalman filter", "#B03A2E"),

@@ -311,7 +311,8 @@ def priors_table(rows: pd.DataFrame, env: str = PUSH) -> pd.DataFrame:
 
 def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
     """Environment steps of rounds to the final return of each model-free learner, and the round that came to it; and
-    the learner's own to the return after the last round; means over seeds. Empty where either has no rows.
+    the learner's own to the return after the last round, where it stays; means over seeds. Empty where either has no
+    rows.
 
     free: learning curves of ``benchmarks/model_free``. "-" for a return that was not reached.
     """
@@ -325,7 +326,7 @@ def steps_table(rows: pd.DataFrame, free: pd.DataFrame, env: str = PUSH) -> str:
         curve, (end, level) = theirs.groupby("env_steps")["value"].mean(), _end(theirs)
         for word, ours in table.groups(rounds, "model"):
             own, k, taken = _there(ours, level)
-            there = curve.index[curve >= own.iloc[-1]]
+            there = curve.index[curve[::-1].cummin()[::-1] >= own.iloc[-1]]
             lines.append({
                 "policy": zoo.look(policy).name, "its steps": f"{end:,.0f}", "its return": f"{level:.2f}",
                 "rounds of": f"`{word}`", "steps to that return": "-" if k is None else f"{taken:,.0f}",
