@@ -6,6 +6,7 @@ import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,6 +44,13 @@ def load() -> ModuleType:
 model_free = load()
 
 
+def driven(episodes: Any, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What is observed after each of actions (n, T, du), and the rewards: one batch of whole episodes."""
+    seen, rewards, over = zip(*(episodes.step(actions[:, step]) for step in range(actions.shape[1])), strict=True)
+    assert over == (False,) * (actions.shape[1] - 1) + (True,)
+    return np.stack(seen, axis=1), np.stack(rewards, axis=1)
+
+
 def played(env: str, n: int = 4) -> tuple[Task, torch.Tensor, np.ndarray, np.ndarray]:
     """One batch of episodes with random torques: the task, the actions (n, T, 2), what was observed, the rewards."""
     episodes = model_free.Episodes(env, n, seed=3)
@@ -50,15 +58,10 @@ def played(env: str, n: int = 4) -> tuple[Task, torch.Tensor, np.ndarray, np.nda
     start, target = episodes.robots._states.astype(np.float32), episodes.robots.target.astype(np.float32)
     task = Task.standard(env, start, torch.from_numpy(target))
     episodes.robots.reset(options={"states": start, "target": target})  # as a task keeps them, in single precision
-    seen, rewards, over = [model_free.observed(start, target)], [], []
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (n, task.horizon, 2)).astype(np.float32)
-    for step in range(task.horizon):
-        observation, reward, ended = episodes.step(actions[:, step])
-        seen.append(observation)
-        rewards.append(reward)
-        over.append(ended)
-    assert over == [False] * (task.horizon - 1) + [True]
-    return task, torch.from_numpy(actions).clamp(-1, 1), np.stack(seen, axis=1), np.stack(rewards, axis=1)
+    seen, rewards = driven(episodes, actions)
+    seen = np.concatenate([model_free.observed(start, target)[:, None], seen], axis=1)
+    return task, torch.from_numpy(actions).clamp(-1, 1), seen, rewards
 
 
 @pytest.mark.parametrize("env", model_free.ENVS)
@@ -79,16 +82,10 @@ def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
     task, episodes = pendulum.swing_up(3, seed=7), model_free.episodes_of(pendulum.PENDULUM, 3, seed=0)
     episodes.seeds = lambda _: [7, 8, 9]
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (3, task.horizon, 1)).astype(np.float32)
-    seen, rewards, over = [episodes.reset()], [], []
-    for step in range(task.horizon):
-        observation, reward, ended = episodes.step(actions[:, step])
-        seen.append(observation)
-        rewards.append(reward)
-        over.append(ended)
-    assert over == [False] * (task.horizon - 1) + [True]
+    first, (seen, rewards) = episodes.reset(), driven(episodes, actions)
     trial = execute(task, torch.from_numpy(actions).clamp(-1, 1))
-    np.testing.assert_allclose(np.stack(seen, axis=1), trial.states, atol=1e-5)
-    np.testing.assert_allclose(np.stack(rewards, axis=1).sum(1), trial.executed_return, atol=1e-4)
+    np.testing.assert_allclose(np.concatenate([first[:, None], seen], axis=1), trial.states, atol=1e-5)
+    np.testing.assert_allclose(rewards.sum(1), trial.executed_return, atol=1e-4)
 
 
 def test_training_seeds_share_no_start_of_the_pendulum() -> None:

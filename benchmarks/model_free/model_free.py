@@ -129,7 +129,7 @@ class Episodes:
         return self.robots.single_action_space
 
     @property
-    def seen(self) -> int:
+    def observation_size(self) -> int:
         """Numbers that a policy sees, k."""
         dx = self.robots.single_observation_space.shape[0]
         return observed(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
@@ -175,7 +175,7 @@ class Swings(Episodes):
         return gymnasium.spaces.Box(-1, 1, self.robots.single_action_space.shape, np.float32)
 
     @property
-    def seen(self) -> int:
+    def observation_size(self) -> int:
         return self.robots.single_observation_space.shape[0]
 
     def observed(self, states: np.ndarray) -> np.ndarray:
@@ -220,7 +220,7 @@ def vectorised(episodes: Episodes) -> Any:
 
     class Robots(VecEnv):
         def __init__(self) -> None:
-            space = gymnasium.spaces.Box(-np.inf, np.inf, (episodes.seen,), np.float32)
+            space = gymnasium.spaces.Box(-np.inf, np.inf, (episodes.observation_size,), np.float32)
             super().__init__(episodes.robots.num_envs, space, episodes.actions)
 
         def reset(self) -> np.ndarray:
