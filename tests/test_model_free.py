@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -37,6 +38,7 @@ def load() -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look there
     spec.loader.exec_module(module)
     return module
 
@@ -79,8 +81,8 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
 
 
 def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
-    task, episodes = pendulum.swing_up(3, seed=7), model_free.episodes_of(pendulum.PENDULUM, 3, seed=0)
-    episodes.seeds = lambda _: [7, 8, 9]
+    task, episodes = pendulum.swing_up(3, seed=7), model_free.Episodes(pendulum.PENDULUM, 3, seed=0)
+    episodes.seed = [7, 8, 9]
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (3, task.horizon, 1)).astype(np.float32)
     first, (seen, rewards) = episodes.reset(), driven(episodes, actions)
     trial = execute(task, torch.from_numpy(actions).clamp(-1, 1))
@@ -89,13 +91,13 @@ def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
 
 
 def test_training_seeds_share_no_start_of_the_pendulum() -> None:
-    several = [model_free.episodes_of(pendulum.PENDULUM, 20, seed=seed) for seed in (0, 1)]
+    several = [model_free.Episodes(pendulum.PENDULUM, 20, seed=seed) for seed in (0, 1)]
     one, other = (np.concatenate([episodes.reset() for _ in range(3)]) for episodes in several)
     assert not (one[:, None] == other).all(2).any()
 
 
 def test_the_pendulum_is_measured_from_the_starts_of_its_rounds_and_chosen_from_others() -> None:
-    tested, chosen = (model_free.load_task(pendulum.PENDULUM, split) for split in ("test", "validation"))
+    tested, chosen = (model_free.WORLDS[pendulum.PENDULUM].task(split) for split in ("test", "validation"))
     np.testing.assert_array_equal(tested.start, pendulum.swing_up(8, seed=pendulum.TESTED).start)
     assert not (tested.start[:, None] == chosen.start).all(2).any()
     found = model_free.measured(tested, lambda seen: np.zeros((len(seen), 1)))
@@ -135,7 +137,7 @@ def test_the_first_configurations_try_each_pair_of_values_once() -> None:
         for pair in (list(settings[0])[:2], list(settings[0])[1:], list(settings[0])[::2]):
             assert len({tuple(setting[name] for name in pair) for setting in settings[:4]}) == 4
         for setting in settings:
-            assert setting["episodes"] * model_free.horizon("tsm/Reacher-v0") % model_free.MINIBATCH == 0
+            assert setting["episodes"] * model_free.WORLDS["tsm/Reacher-v0"].horizon % model_free.MINIBATCH == 0
 
 
 def records(*steps: int) -> list[dict[str, float]]:
@@ -174,7 +176,7 @@ def test_rows_of_the_pendulum_are_those_of_its_rounds_and_have_no_part_in_figure
     table, env = model_free.Table(tmp_path / "model_free.csv"), pendulum.PENDULUM
     key = dict(env=env, model="ppo", subset="", configuration="std=0.14", seed=0)
     found = [{name: value for name, value in one.items() if name != "final_distance"} for one in records(0, 2000)]
-    rows = tables.frame(table.put(key, model_free.load_task(env, "test"), found))
+    rows = tables.frame(table.put(key, model_free.WORLDS[env].task("test"), found))
     theirs = select(published("10_explore"), env=env, metric="return_true")
     own = select(tables.load(table.path), metric="return_true")
     assert len(rows) == 2 * (len(model_free.UNITS) - 1)
@@ -219,7 +221,7 @@ def test_sac_updates_as_often_per_step_as_its_configuration_says() -> None:
 def test_the_library_is_told_how_an_episode_ended() -> None:
     robots = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
     robots.reset()
-    for _ in range(model_free.horizon("tsm/Reacher-v0") - 1):
+    for _ in range(model_free.WORLDS["tsm/Reacher-v0"].horizon - 1):
         *_, done, infos = robots.step(np.zeros((3, 2), np.float32))
         assert not done.any()
         assert infos == [{}, {}, {}]

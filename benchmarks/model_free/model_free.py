@@ -20,6 +20,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -95,101 +96,99 @@ def observed(states: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.concatenate([np.cos(angles), np.sin(angles), states[:, 2:], target], axis=1, dtype=np.float32)
 
 
-def horizon(env: str) -> int:
-    """Steps of an episode of an environment's task."""
-    if env == PENDULUM:
-        return exploration.HORIZON
-    return HORIZON["push" if EnvSpec.parse(env).task == "push" else "reach"]
+Robots = gymnasium.vector.VectorEnv
 
 
-def load_task(env: str, split: str) -> Task:
-    """The task that a policy is measured on: frozen targets, of the pendulum the starts that measure its rounds."""
-    if env != PENDULUM:
-        return study.load_task(env, split)
-    starts = worlds.world(env).sizes["paper"].starts
-    return worlds.world(env).tested(starts) if split == "test" else pendulum.swing_up(starts, VALIDATION_STARTS)
+@dataclass(frozen=True)
+class World:
+    """What differs between the arms and the pendulum.
+
+    horizon: steps of an episode; task: split -> the starts and targets that a policy is measured on; made: number of
+    robots -> their vector environment; action_space: of one robot, as a policy gives actions; seen: (states (n, dx),
+    targets (n, 2)) -> what a policy sees (n, k); seeds: (seed, number of robots) -> of their first reset; stepped:
+    (robots, actions (n, du)) -> their states and rewards; unit: of a return.
+    """
+
+    horizon: int
+    task: Callable[[str], Task]
+    made: Callable[[int], Robots]
+    action_space: Callable[[Robots], gymnasium.Space]
+    seen: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    seeds: Callable[[int, int], int | list[int]]
+    stepped: Callable[[Robots, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    unit: str = "m"
+
+
+def _arm(env: str) -> World:
+    """An arm, whose environment draws starts and targets."""
+    return World(
+        HORIZON["push" if EnvSpec.parse(env).task == "push" else "reach"],
+        task=lambda split: study.load_task(env, split),
+        made=lambda n: cast(Robots, gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped),
+        action_space=lambda robots: robots.single_action_space,
+        seen=observed, seeds=lambda seed, _: seed,
+        stepped=lambda robots, actions: robots.step(actions)[:2],
+    )  # fmt: skip
+
+
+def _swings(split: str) -> Task:
+    """Starts of the pendulum: those that measure its rounds, or others by which a configuration is chosen."""
+    n = worlds.world(PENDULUM).sizes["paper"].starts
+    return worlds.world(PENDULUM).tested(n) if split == "test" else pendulum.swing_up(n, VALIDATION_STARTS)
+
+
+def _swung(robots: Robots, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Actions and reward are those of ``pendulum.swing_up``."""
+    actions = np.clip(actions, -1, 1)
+    states, *_ = robots.step(within_bounds(actions, robots.single_action_space))
+    return states, pendulum.upright(torch.from_numpy(states), torch.from_numpy(actions)).numpy()
+
+
+WORLDS = {env: _arm(env) for env in ENVS} | {
+    PENDULUM: World(
+        exploration.HORIZON, _swings,
+        made=lambda n: gymnasium.make_vec(PENDULUM, num_envs=n, vectorization_mode="sync"),
+        action_space=lambda robots: gymnasium.spaces.Box(-1, 1, robots.single_action_space.shape, np.float32),
+        seen=lambda states, _: states.astype(np.float32),
+        # One for each pendulum, none of another training seed; from neighbouring ones they would start alike.
+        seeds=lambda seed, n: np.random.SeedSequence(seed).generate_state(n).tolist(),
+        stepped=_swung, unit="",
+    )
+}  # fmt: skip
 
 
 class Episodes:
-    """Episodes of a task's length in n arms at once, one after another. Starts and targets are the environment's."""
+    """Episodes of a task's length in n robots at once, one after another. Starts and targets are the environment's."""
 
     def __init__(self, env: str, n: int, *, seed: int) -> None:
-        self.horizon = horizon(env)
-        self.robots = self.make(env, n)
-        self.seed: int | None = seed  # of the first reset; the later ones go on from there
+        self.world = WORLDS[env]
+        self.horizon = self.world.horizon
+        self.robots = self.world.made(n)
+        self.actions = self.world.action_space(self.robots)
+        self.seed: int | list[int] | None = self.world.seeds(seed, n)  # of the first reset; later ones go on from there
         self.taken = 0
-
-    def make(self, env: str, n: int) -> Any:
-        """The vector environment."""
-        return gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped
-
-    @property
-    def actions(self) -> gymnasium.Space:
-        """The actions that a policy gives."""
-        return self.robots.single_action_space
 
     @property
     def observation_size(self) -> int:
         """Numbers that a policy sees, k."""
         dx = self.robots.single_observation_space.shape[0]
-        return observed(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
+        return self.world.seen(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
 
     def observed(self, states: np.ndarray) -> np.ndarray:
         """What a policy sees of states (n, dx): (n, k)."""
-        return observed(states, self.robots.target)
+        return self.world.seen(states, getattr(self.robots, "target", np.zeros(0)))
 
     def reset(self) -> np.ndarray:
         """Begin n episodes: their first observations (n, k)."""
-        states, _ = self.robots.reset(seed=None if self.seed is None else self.seeds(self.seed))
+        states, _ = self.robots.reset(seed=self.seed)
         self.seed, self.taken = None, 0
         return self.observed(states)
 
-    def seeds(self, seed: int) -> int | list[int]:
-        """Of the first reset, by the seed of the episodes."""
-        return seed
-
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """Actions (n, du) -> observations (n, k), rewards (n,), and whether the episodes are over."""
-        states, rewards = self.stepped(actions)
+        states, rewards = self.world.stepped(self.robots, actions)
         self.taken += 1
         return self.observed(states), rewards, self.taken == self.horizon
-
-    def stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States (n, dx) after actions (n, du), and their rewards."""
-        states, rewards, *_ = self.robots.step(actions)
-        return states, rewards
-
-
-class Swings(Episodes):
-    """Episodes of n pendulums, with actions and reward as ``pendulum.swing_up`` has them; a policy sees the state."""
-
-    def make(self, env: str, n: int) -> Any:
-        return gymnasium.make_vec(env, num_envs=n, vectorization_mode="sync")
-
-    def seeds(self, seed: int) -> list[int]:
-        """One for each pendulum, none of another training seed; from neighbouring ones they would start alike."""
-        return np.random.SeedSequence(seed).generate_state(self.robots.num_envs).tolist()
-
-    @property
-    def actions(self) -> gymnasium.Space:
-        return gymnasium.spaces.Box(-1, 1, self.robots.single_action_space.shape, np.float32)
-
-    @property
-    def observation_size(self) -> int:
-        return self.robots.single_observation_space.shape[0]
-
-    def observed(self, states: np.ndarray) -> np.ndarray:
-        return states.astype(np.float32)
-
-    def stepped(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        actions = np.clip(actions, -1, 1)
-        states, *_ = self.robots.step(within_bounds(actions, self.robots.single_action_space))
-        return states, pendulum.upright(torch.from_numpy(states), torch.from_numpy(actions)).numpy()
-
-
-def episodes_of(env: str, n: int, *, seed: int) -> Episodes:
-    """Episodes of an environment."""
-    return (Swings if env == PENDULUM else Episodes)(env, n, seed=seed)
 
 
 def measured(task: Task, predict: Predictor) -> dict[str, float]:
@@ -198,7 +197,7 @@ def measured(task: Task, predict: Predictor) -> dict[str, float]:
 
     def control(past: Segment) -> torch.Tensor:
         states = past.states[:, -1].numpy()
-        actions = predict(states.astype(np.float32) if task.env == PENDULUM else observed(states, target))
+        actions = predict(WORLDS[task.env].seen(states, target))
         return torch.from_numpy(np.asarray(actions, np.float32))[:, None]
 
     done = execute(task, control)
@@ -258,21 +257,22 @@ def vectorised(episodes: Episodes) -> Any:
 def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
     """The library's algorithm with a configuration of the search; what is not named here is the library's default."""
     from sb3_contrib import TRPO
-    from sbx import SAC
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
     special = {name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")}
     network: dict[str, Any] = dict(net_arch=[64, 64])
-    robots = vectorised(episodes_of(env, int(setting["episodes"]), seed=seed))
+    robots = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
     if algorithm == "sac":
+        from sbx import SAC
+
         return SAC(  # ReLU is its default
             "MlpPolicy", VecNormalize(robots, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
             gradient_steps=max(1, round(setting["updates"] * setting["episodes"])), **special,
         )  # fmt: skip
     network |= dict(activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
-        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=horizon(env), batch_size=MINIBATCH, gamma=GAMMA,
+        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=WORLDS[env].horizon, batch_size=MINIBATCH, gamma=GAMMA,
         policy_kwargs=network, seed=seed, device="cpu", **special,
     )  # fmt: skip
 
@@ -350,7 +350,7 @@ class Table:
                 env_steps=record["steps"],
                 metric=metric,
                 value=record[metric],
-                unit="" if unit == "m" and task.env == PENDULUM else unit,
+                unit=WORLDS[task.env].unit if unit == "m" else unit,
             )
             for record in records
             for metric, unit in UNITS.items()
@@ -371,7 +371,7 @@ def run(
     key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
     rows = table.kept(key, steps)
     if not rows:
-        task, found = load_task(env, split), []
+        task, found = WORLDS[env].task(split), []
         for record in learn(algorithm, task, setting, steps=steps, records=records, seed=seed):
             found.append(record)
             rows = table.put(key, task, found)
