@@ -1,13 +1,11 @@
-"""Few-shot adaptation as the study measures it: rows, tables, sentences, the benchmark."""
+"""Few-shot adaptation as the study measures it: rows, tables, sentences."""
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from scripts import run_script
 
@@ -158,41 +156,38 @@ def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
         assert page in (ROOT / "docs" / "results.md").read_text()
 
 
-def test_the_benchmark_adds_lines_once_and_plans_when_they_are_asked_for(tmp_path: Path) -> None:
-    script, out = runs.ROOT / "benchmarks" / "adaptation" / "run.py", tmp_path / "table.csv"
-    options = ["--arm", "tsm/Reacher-v0", "--variants", "gain0.7", "--models", "lstm", "--ways", "zero-shot", "head",
-               "--episodes", "5", "--test", "4", "--share", "0.01", "--out", str(out)]  # fmt: skip
-    run_script(script, *options)
-    first = pd.read_csv(out)
-    assert set(first["copies"]) == {0}  # of reaching, which has no symmetry
-    assert first[["way", "episodes"]].to_numpy().tolist() == [["zero-shot", 0], ["head", 5]]
-    assert "{" not in run_script(script, *options)  # nothing measured again
-    run_script(script, *options, "--targets", "2")
-    planned = pd.read_csv(out)
-    assert planned["cost"].notna().all()
-    assert set(planned["judge"]) == {"expectation"}
-    assert "{" not in run_script(script, *options, "--targets", "2")
-    planned.assign(judge="mode").to_csv(out, index=False)
-    run_script(script, *options, "--targets", "2")
-    assert set(pd.read_csv(out)["judge"]) == {"expectation"}
+def test_plans_of_an_adapted_model_are_rows_beside_its_predictions() -> None:
+    task, model = tsmlib.load_task(WEAK).take(2), load_pretrained("lstm", env="tsm/Reacher-v0")
+    rows = adaptation.plan_rows(RUN, "lstm", WEAK, model, way="all", episodes=20, n_targets=2)
+    trial = adaptation.planned(model, WEAK, 2)
+    assert {(row["configuration"], row["env_steps"], row["n"]) for row in rows} == {("all", 2000, 2)}
+    assert {row["metric"]: row["value"] for row in rows} == {
+        "return_true": pytest.approx(float(trial.executed_return.mean())),
+        "gap_absolute": pytest.approx(float(trial.gap.abs().mean())),
+        "success": float((trial.final_distance <= task.tolerance).float().mean()),
+    }
+    assert adaptation_results.plans_table(tables.frame(rows))
+    assert not adaptation_results.ways_table(tables.frame(rows))
 
 
-def test_lines_of_models_trained_on_symmetric_copies_are_averaged_by_themselves() -> None:
-    script = str(runs.ROOT / "benchmarks" / "adaptation" / "run.py")
-    run = runpy.run_path(script)
-    assert [run["copies"](env, n) for env, n in ((PUSH, 20), (PUSH, 0), (WEAK, 20))] == [8, 0, 0]
-    known = pd.read_csv(runs.ROOT / "benchmarks" / "adaptation" / "table.csv")
-    line = known[(known["way"] == "all") & known["judge"].notna()].iloc[0]
-    both = pd.DataFrame([{**line}, {**line, "copies": 8, "energy_score_10": 9.0}])
-    cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in run["summary"](both).splitlines()]
-    at = cells[0].index("energy_score_10")
-    assert [each[at] for each in cells[2:]] == [f"{line['energy_score_10']:.3g}", "9"]
+@pytest.mark.parametrize("targets", [0, 2])
+def test_rows_of_adaptation_are_of_predictions_or_of_plans(
+    targets: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "RESULTS", tmp_path / "results")
+    (tmp_path / "results").mkdir()
+    script = runs.ROOT / "benchmarks" / "settings" / "rows.py"
+    options = ["--models", "lstm", "--ways", "zero-shot", "--scale", "smoke", "--targets", str(targets)]
+    run_script(script, "adaptation", *options)
+    rows = tables.load(tmp_path / "results" / "10_explore.csv")
+    scored = set(rows["metric"])
+    assert scored == {*adaptation_results.PLANS} if targets else scored >= {*adaptation_results.SCORES}
+    assert set(rows["planner"]) == ({"cem"} if targets else {"none"})
 
 
-def test_the_benchmark_predicts_returns_by_samples_that_neither_planner_nor_judges_drew(
+def test_returns_of_adapted_models_are_predicted_by_samples_that_neither_planner_nor_judges_drew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    run = runpy.run_path(str(runs.ROOT / "benchmarks" / "adaptation" / "run.py"))
     drawn = dict[str, int]()
 
     def watched(name: str, whole: Any) -> Any:
@@ -203,15 +198,28 @@ def test_the_benchmark_predicts_returns_by_samples_that_neither_planner_nor_judg
         return call
 
     for name in ("cem", "expected_predictor", "fresh_predictor"):
-        monkeypatch.setattr(tsmlib, name, watched(name, getattr(tsmlib, name)))
+        monkeypatch.setattr(adaptation, name, watched(name, getattr(adaptation, name)))
     env = "tsm/Reacher-v0"
-    model = tsmlib.load_pretrained("rtsm", env=env)
-    task = tsmlib.load_task(env).take(2)
-    found = run["planned"](env, model, 2, 3)
+    trial = adaptation.planned(load_pretrained("rtsm", env=env), env, 2, seed=3)
     judges = range(8 * drawn["expected_predictor"], 8 * drawn["expected_predictor"] + 8)
     assert drawn["fresh_predictor"] not in {*judges, drawn["cem"]}
-    assert float(found["gap"]) >= 0
-    assert int(found["targets"]) == len(task)
+    assert len(trial.actions) == 2
+
+
+def test_what_plans_gain_by_adapting_is_paired_by_seed() -> None:
+    common = dict(env=WEAK, model="lstm", planner="cem", execution="open loop", n=50, scale="paper")
+    rows = tables.frame(
+        common | dict(metric=metric, configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, steps, returns in (("zero-shot", 0, [-10.0, -14.0]), ("all", 2000, [-8.0, -12.0]))
+        for seed, value in enumerate(returns) for metric, value in
+        (("return_true", value), ("success", 0.5), ("gap_absolute", 1.0))
+    )  # fmt: skip
+    lines = adaptation_results.plans_table(rows).splitlines()
+    names, _, zero, tuned = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    assert dict(zip(names, zero, strict=True))["minus zero-shot"] == ""
+    found = dict(zip(names, tuned, strict=True))
+    assert found["minus zero-shot"] == "+2.00"  # of both seeds
+    assert (found["episodes"], found["seeds"], found["n"]) == ("20", "2", "50")
 
 
 def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> None:

@@ -129,8 +129,16 @@ def _adapted(env: str, variant: str, options: str) -> Recipe:
     """Models adapted to a changed arm."""
     models = (OURS, "lstm", "ensemble+mse")
     return Recipe(
-        ("10_explore",), "adaptation", (env,), models, options=f"{options} --episodes 5 20 80", variant=variant
-    )
+        ("10_explore",), "adaptation", (env,), models, options=f"{options} --episodes 5 20 80", variant=variant,
+        only={"planner": ("none",)},
+    )  # fmt: skip
+
+
+def _plans(env: str, variant: str) -> Recipe:
+    """What models adapted to a changed arm plan there."""
+    options = f"--ways {' '.join(adaptation.PLANNING)} --episodes 20 --targets 50"
+    models, only = (OURS, "lstm", "ensemble+mse"), {"planner": ("cem",), "execution": ("open loop",)}
+    return Recipe(("10_explore",), "adaptation", (env,), models, options=options, variant=variant, only=only)
 
 
 def _loop(env: str) -> Recipe:
@@ -192,7 +200,9 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     _rounds((PUSH,), (OURS,), "no new episodes"),
     *map(_loop, (PENDULUM, PUSH)),
     _adapted(REACH, "gain0.7", ""),
+    _plans(REACH, "gain0.7"),
     *(_adapted(PUSH, arm, "--ways zero-shot all head codes scratch") for arm in ARMS),
+    *(_plans(PUSH, arm) for arm in ARMS),
 )  # fmt: skip
 
 

@@ -25,10 +25,10 @@ new ones (the same training alone); of pushing also contacts in each round's epi
 the true simulator returns as much in codes of the last prior as in those of the first. What was trained stays in the
 run's folder, where a loop that was killed goes on.
 adaptation: shipped models adapted to --variants of --envs, by default the reaching arm, by --ways, from --episodes;
-reference is a model trained in full on such an arm. Both are rows of 10_explore. peers publishes rows that were made
-beside them, in the files that are named: of benchmarks/peers mbrl-lib's loop in 10_explore and the scores of its models
-in peers_pets, of benchmarks/model_free policies without a model in model_free. whole publishes tables of scripts beside
-this one, starts.py and samples.py, in place of all their rows.
+reference is a model trained in full on such an arm; with --targets they plan, and are not scored. Both are rows of
+10_explore. peers publishes rows that were made beside them, in the files that are named: of benchmarks/peers mbrl-lib's
+loop in 10_explore and the scores of its models in peers_pets, of benchmarks/model_free policies without a model in
+model_free. whole publishes tables of scripts beside this one, starts.py and samples.py, in place of all their rows.
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
 those of all seeds of the same environment and algorithm; all others stay. Rounds take the place of all rows of the
@@ -179,13 +179,22 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
     return rows
 
 
-def adapted(run: runs.Run, models: list[str], envs: list[str], ways: list[str], episodes: list[int]) -> list[Row]:
-    """Rows of 10_explore.csv: of shipped models, adapted to changed arms; zero-shot whatever the episodes are."""
+def adapted(
+    run: runs.Run, models: list[str], envs: list[str], ways: list[str], episodes: list[int], targets: int
+) -> list[Row]:
+    """Rows of 10_explore.csv: of shipped models, adapted to changed arms; zero-shot whatever the episodes are. targets:
+    of plans, in place of predictions."""
     rows = list[Row]()
     for env, word in product(envs, models):
         for way in (way for way in (*adaptation.ways(word), adaptation.REFERENCE) if way in ways):
             for n in episodes[:1] if way in ("zero-shot", adaptation.REFERENCE) else episodes:
-                rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
+                if targets:
+                    model, known, _ = adaptation.made(run, word, env, way=way, episodes=n)
+                    rows += adaptation.plan_rows(
+                        run, word, env, model, way=way, episodes=known, n_targets=targets
+                    )  # fmt: skip
+                else:
+                    rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
     return rows
 
 
@@ -264,6 +273,13 @@ def parser() -> argparse.ArgumentParser:
                        help=f"of the arm that is adapted to (default {WEAK[1]})")  # fmt: skip
     found.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="of adaptation (default all)")
     found.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
+    found.add_argument(
+        "--targets",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of adaptation: plans to the first N frozen targets, in place of predictions",
+    )
     found.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
     found.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
     found.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
@@ -297,6 +313,8 @@ def main() -> None:
         options.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
         options.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
+    if given.targets < 0:
+        options.error(f"--targets {given.targets}: expected at least 0")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "convergence" and not needed.control(run).converging:
@@ -320,7 +338,7 @@ def main() -> None:
                 figures.save(figure, runs.ROOT / "figures" / "10_places")
     elif given.part == "adaptation":
         for env in wanted_arms(options, given):
-            publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes))
+            publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes, given.targets))
     elif given.part == "gradients":
         starts = [study.load_task(env).take(2) for env in given.envs]
         publish(notebook, [row for task in starts for row in study.error_rows(run, task, given.models)])

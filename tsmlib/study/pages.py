@@ -10,7 +10,7 @@ from tsmlib.envs.spec import MUJOCO_IDS
 from tsmlib.planning.predictors import JUDGING
 from tsmlib.planning.tasks import HORIZON
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import needed, plans, runs, worlds, zoo
+from tsmlib.study import adaptation, needed, plans, runs, worlds, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
 from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
@@ -429,7 +429,7 @@ Seeds are of the few episodes and of the updates on them: all begin from one mod
 Right of the line adapting made a model worse.
 
 {adaptation_results.ways_table(rows)}
-{_recovered(rows)}
+{_recovered(rows)}{_adapted_plans(rows)}
 {exploration_results.sentences(rows)}
 {adaptation_results.sentences(rows)}"""
 
@@ -464,6 +464,19 @@ def _recovered(rows: pd.DataFrame) -> str:
     return f"""
 The share of its loss that a model recovers from n episodes, (zero-shot - adapted) / (zero-shot - trained in full) of
 the energy score at the most steps ahead, paired by seed:
+
+{found}
+"""
+
+
+def _adapted_plans(rows: pd.DataFrame) -> str:
+    """The part of that page on what adapted models plan; empty without rows."""
+    if not (found := adaptation_results.plans_table(rows)):
+        return ""
+    return f"""
+What such models plan on those arms: the cross-entropy method, {adaptation.CANDIDATES} candidates and
+{adaptation.ITERATIONS} iterations, over codes of the standard arm's prior, executed open loop, to the first n frozen
+targets. Candidates are judged by the mode and {JUDGING} samples, of the LSTM by its one rollout:
 
 {found}
 """

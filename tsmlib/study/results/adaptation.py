@@ -1,7 +1,7 @@
 """Results of adapted models (10_explore): their rows; curves, tables and sentences from rows.
 
-Rows are ``open loop``, without a planner; ``env_steps`` are those of the changed arm that a model knows, and
-``configuration`` is the way (``study.adaptation``).
+Rows are ``open loop``, of predictions without a planner; ``env_steps`` are those of the changed arm that a model
+knows, and ``configuration`` is the way (``study.adaptation``).
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ import pandas as pd
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.prediction import Scores
 from tsmlib.figures.method import Look, Method
+from tsmlib.planning.execution import Trial
 from tsmlib.study import zoo
 from tsmlib.study.results import table
-from tsmlib.study.results.planning import OPEN
+from tsmlib.study.results.planning import ARRIVED, OPEN
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 
 REFERENCE: Final = "reference"
 SCORES = {"energy_score_noise": "energy score", "nrmse": "nRMSE"}
+PLANS = ("return_true", "success", "gap_absolute")  # metrics of plans
 WAYS = {  # of training: no colour and no marker of a model; the redder, the more of the weights is trained on
     "zero-shot": Look("zero-shot", "#6E6E6E", (5, 2, 0)), "all": Look("all weights", "#8B0A1A", (6, 1, 0)),
     "head": Look("head", "#E34A33", "8"), "codes": Look("codes", "#F4A582", "+"),
@@ -49,6 +51,22 @@ def adapted_rows(
     if seconds is not None:
         found.append(common | dict(metric="train_seconds", value=seconds, unit="s"))
     return found
+
+
+def planned_rows(run: Run, env: str, word: str, way: str, trial: Trial, *, episodes: int) -> list[Row]:
+    """Executed return, share within the task's tolerance and mean size of the gap of an adapted model's plans."""
+    assert trial.success is not None
+    common = dict(
+        env=env, sim=EnvSpec.parse(env).simulator, model=word, planner="cem", search_space="latent", execution=OPEN,
+        configuration=way, env_steps=100 * episodes, n=len(trial.actions), seed=run.seed, scale=run.scale,
+    )  # fmt: skip
+    found = {
+        "return_true": (trial.executed_return, "m"), "success": (trial.success.float(), "share"),
+        "gap_absolute": (trial.gap.abs(), "m"),
+    }  # fmt: skip
+    return [
+        common | dict(metric=metric, value=float(values.mean()), unit=unit) for metric, (values, unit) in found.items()
+    ]
 
 
 def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]]:
@@ -98,6 +116,33 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
         line["CPU s"] = table.spell(spent, "{:.0f}") if len(spent) else "-"
         lines.append({**line, "seeds": own["seed"].nunique(), "n": int(own["n"].max())})
     return pd.DataFrame(lines)
+
+
+@table.sourced
+def plans_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """A line for each arm, model, way and number of episodes: what its plans return, minus zero-shot (paired by seed),
+    how many end within the tolerance, and the size of the gap."""
+    lines = []
+    here = table.select(rows, execution=OPEN, planner="cem", configuration=list(WAYS))
+    for (env, word), own in table.groups(here, ["env", "model"]):
+        wide = own.pivot(index="seed", columns=["metric", "configuration", "env_steps"], values="value")
+        for way, steps in sorted(set(zip(own["configuration"], own["env_steps"], strict=True)), key=_in_order):
+            returns, success, gap = (wide[metric, way, steps].dropna() for metric in PLANS)
+            line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name, "episodes": int(steps) // 100}
+            line["executed return"] = table.spell(returns, "{:.2f} ± {:.2f}")
+            line["minus zero-shot"] = ""
+            if way != "zero-shot" and ("return_true", "zero-shot", 0) in wide:
+                gained = (wide["return_true", way, steps] - wide["return_true", "zero-shot", 0]).dropna()
+                line["minus zero-shot"] = table.spell(gained, "{:+.2f} ± {:.2f}")
+            line[ARRIVED] = table.spell(success, "{:.2f} ± {:.2f}")
+            line["size of the gap"] = table.spell(gap, "{:.2f} ± {:.2f}")
+            lines.append({**line, "seeds": len(returns), "n": int(own["n"].max())})
+    return pd.DataFrame(lines)
+
+
+def _in_order(of: tuple[str, int]) -> tuple[int, int]:
+    """Ways in the order of WAYS, each by its episodes."""
+    return [*WAYS].index(of[0]), of[1]
 
 
 @table.sourced
