@@ -234,15 +234,15 @@ def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> Non
         for seed, value in enumerate(values)
     )  # fmt: skip
     ((title, robots),) = adaptation_results.shares_left(rows, 20).items()
-    assert (title, list(robots)) == ("LSTM, 10 steps", ["reach gain0.7"])
-    assert {way.model: share.tolist() for way, share in robots["reach gain0.7"].items()} == {
+    assert (title, list(robots)) == ("LSTM, 10 steps", ["reach, torque × 0.7"])
+    assert {way.model: share.tolist() for way, share in robots["reach, torque × 0.7"].items()} == {
         "all": [0.5, 0.75], "head": [2.0],
     }  # fmt: skip
 
 
 def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() -> None:
     shares = adaptation_results.shares_left(published("10_explore"), 20)
-    in_vain, of_use = ("push mass0.5", "push mass2", "push links0.12x0.11"), ("damping", "gain")
+    in_vain, of_use = ("push, mass × 0.5", "push, mass × 2", "push, upper link × 1.2"), ("damping", "torque")
     means = {
         (title, name, way.model): share.mean() for title, robots in shares.items() if title.endswith("80 steps")
         for name, ways in robots.items() for way, share in ways.items()

@@ -400,3 +400,11 @@ def test_the_study_collects_trains_and_plans_on_a_variant_by_its_id(tmp_path: Pa
     assert study.load_or_train(run, env, "onestep").header == trained.header
     row = place(imperfect(env, delay=5))
     assert (row["env"], row["sim"], row["delay"]) == (env, "mujoco", 5)
+
+
+@pytest.mark.parametrize(("changes", "label"), [
+    ({}, ""), ({"torque_gain": 0.7}, "torque × 0.7"), ({"link_lengths": (0.12, 0.11)}, "upper link × 1.2"),
+    ({"object_radius": 0.045, "mass": 2.0}, "mass × 2, object × 1.5"),
+])  # fmt: skip
+def test_a_figure_names_an_arm_by_factors_of_what_the_standard_one_has(changes: Any, label: str) -> None:
+    assert Physics(**changes).label == label

@@ -61,6 +61,12 @@ class Physics:
         """The changed values as they stand in an id: ``"-mass2-links0.12x0.11"``; '' for the standard arm."""
         return "".join(f"-{_WORDS[name]}{_spelled(value)}" for name, value in self.changed.items())
 
+    @property
+    def label(self) -> str:
+        """The changed values as a figure names them: ``"mass × 2, upper link × 1.2"``; '' for the standard arm."""
+        named = zip(_LABELS, _flat(self), _flat(Physics()), strict=True)
+        return ", ".join(f"{name} × {value / usual:.3g}" for name, value, usual in named if value != usual)
+
 
 SHORTEST, LONGEST = 0.06, 0.24  # m: a link; both together, so that the fingertip stays within the walls
 RANGES = {
@@ -71,6 +77,7 @@ STANDARD: dict[str, object] = {field.name: field.default for field in fields(Phy
 _WORDS = {
     "mass": "mass", "damping": "damping", "link_lengths": "links", "object_radius": "radius", "torque_gain": "gain",
 }  # fmt: skip
+_LABELS = ("mass", "damping", "upper link", "lower link", "object", "torque")  # of ``_flat``
 PATTERN = "".join(rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values())  # of ``Physics.word``, a group for each
 
 
@@ -79,6 +86,12 @@ def parse(groups: Iterable[str | None]) -> Changes:
     given = {name: text for name, text in zip(_WORDS, groups, strict=True) if text}
     values = {name: tuple(map(float, text.split("x"))) for name, text in given.items()}
     return cast(Changes, {name: value if name == "link_lengths" else value[0] for name, value in values.items()})
+
+
+def _flat(physics: Physics) -> tuple[float, ...]:
+    return (
+        physics.mass, physics.damping, *physics.link_lengths, physics.object_radius, physics.torque_gain,
+    )  # fmt: skip
 
 
 def _spelled(value: object) -> str:

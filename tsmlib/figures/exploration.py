@@ -144,7 +144,8 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
     """
     names = [*dict.fromkeys(name for robots in shares.values() for name in robots)]
     look_of = axes.looks(*shares.values())
-    figure, grid = panels(len(shares), len(shares), 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
+    columns = len(shares) if len(shares) <= 4 else -(-len(shares) // 2)
+    figure, grid = panels(len(shares), columns, 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
     every = np.concatenate([
         np.ravel(finite(f"{title}, {name}", values, "k"))
         for title, robots in shares.items() for name, ways in robots.items() for values in ways.values()
@@ -158,8 +159,11 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
                 at = names.index(name) + 0.22 * ([*look_of].index(way) - (len(look_of) - 1) / 2)
                 ax.plot(seeds, np.full(len(seeds), at), ".", color=DARK, ms=2.5, mew=0, zorder=4)
                 ax.plot(seeds.mean(), at, **look_of[way] | {"ls": "", "ms": 5, "mew": 1}, zorder=3)
-        ax.set(title=title, xlabel=xlabel, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
+        ax.set(title=title, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
         ax.set_yticks(range(len(names)), names)
+    for ax in grid[-columns:]:
+        ax.set_xlabel(xlabel)
+    for ax in grid:
         ax.grid(axis="x", color=GRID, lw=0.6)
     dots = entry("single seeds", color=DARK, ls="", marker=".", ms=2.5)
     return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), dots], 4)

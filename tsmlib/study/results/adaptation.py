@@ -86,7 +86,7 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 def shares_left(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
     """Model and steps ahead -> arm -> way -> the share of the zero-shot energy score that is left (k,), paired by seed,
     for ``figures.shares_left``. What is adapted alone, not what is trained anew."""
-    found: dict[str, dict[str, dict[Method, np.ndarray]]] = {}
+    found: dict[tuple[int, str], dict[str, dict[Method, np.ndarray]]] = {}
     here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
     for (word, ahead, env), own in table.groups(here, ["model", "steps_ahead", "env"]):
         before = table.select(own, configuration="zero-shot").set_index("seed")["value"]
@@ -97,9 +97,8 @@ def shares_left(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[M
                 ways[Method(way, look=WAYS[way])] = share.to_numpy(float)
         if ways:
             spec = EnvSpec.parse(env)
-            arm = f"{spec.task} {spec.physics.word.removeprefix('-')}"
-            found.setdefault(f"{zoo.look(word).name}, {ahead} steps", {})[arm] = ways
-    return {title: found[title] for title in sorted(found)}
+            found.setdefault((int(ahead), zoo.look(word).name), {})[f"{spec.task}, {spec.physics.label}"] = ways
+    return {f"{word}, {ahead} steps": found[ahead, word] for ahead, word in sorted(found)}
 
 
 @table.sourced
