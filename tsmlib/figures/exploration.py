@@ -102,15 +102,15 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
     """Errors of adapted models against the episodes that they know of the changed robot, on logarithmic axes.
 
     curves: title -> way -> episodes (R,) and errors (k, R), all above 0; yours: as curves, drawn over them as hollow
-    diamonds. Mean over seeds, bars for the 95 % t interval; marks at the same number of episodes stand a little beside
-    each other.
+    diamonds. A mark for the mean over seeds, a dot for each seed; marks at the same number of episodes stand a little
+    beside each other.
     """
     own, look_of = yours or {}, axes.looks(curves, yours or {})
     figure, grid = panels(len(curves), len(curves), 2.1, head=0, sharex=True, sharey=True)
     given = [found for rows in (*curves.values(), *own.values()) for found in rows.values()]
     every, ticks = [y for _, y in given], sorted({float(x) for at, _ in given for x in at})
     points = np.concatenate([np.ravel(found) for found in every])
-    limits = axes.limits(points, axes.ends(column for found in every for column in found.T), log=True)
+    limits = axes.limits(points, points, log=True)
     for ax, (title, rows) in zip(grid, curves.items(), strict=True):
         axes.log_axis(ax, *limits)
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -120,18 +120,17 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
         ax.minorticks_off()
         for way, row in rows.items():
             at, found = _checked(f"{title}, {way.label}", *row)
-            mean, half = axes.band(found)
             beside = at * 1.06 ** ([*look_of].index(way) - (len(look_of) - 1) / 2)
-            axes.bars(ax, beside, mean, half, way.look.colour)
-            ax.plot(beside, mean, **look_of[way] | {"ms": 5.5, "mew": 1}, zorder=3)
+            ax.plot(beside, found.T, ".", color=DARK, ms=2.5, mew=0, zorder=4)
+            ax.plot(beside, found.mean(0), **look_of[way] | {"ms": 5.5, "mew": 1}, zorder=3)
         for way, row in own.get(title, {}).items():
             at, found = _checked(f"{title}, {way.label}, yours", *row)
             axes.diamonds(ax, "y", at, found.mean(0), way)
         ax.grid(axis="y", color=GRID, lw=0.6)
         ax.set(title=title, xlabel="episodes of the changed arm")
     grid[0].set_ylabel(ylabel)
-    bars = [_bar()] * any(len(found) > 1 for found in every)
-    handles = [*axes.entries(look_of), *bars, *axes.yours_entry(*own.values())]
+    dots = [_dots()] * any(len(found) > 1 for found in every)
+    handles = [*axes.entries(look_of), *dots, *axes.yours_entry(*own.values())]
     return axes.finish(figure, [grid], handles, 4)
 
 
@@ -165,12 +164,11 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
         ax.set_xlabel(xlabel)
     for ax in grid:
         ax.grid(axis="x", color=GRID, lw=0.6)
-    dots = entry("single seeds", color=DARK, ls="", marker=".", ms=2.5)
-    return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), dots], 4)
+    return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), _dots()], 4)
 
 
-def _bar() -> Line2D:
-    return entry("95 % interval over seeds", color=DARK, ls="", marker="|", ms=8, mew=0.8)
+def _dots() -> Line2D:
+    return entry("single seeds", color=DARK, ls="", marker=".", ms=2.5)
 
 
 def _checked(word: str, at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
