@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scripts import run_script
 
 import tsmlib
 from tsmlib import figures
+from tsmlib.planning.predictors import JUDGING
 from tsmlib.statistics import interval
 from tsmlib.storage import tables
 from tsmlib.study import adaptation, pages, runs, zoo
@@ -80,7 +83,8 @@ def test_seconds_of_models_trained_as_one_are_seconds_of_none(monkeypatch: pytes
     metrics = []
     for header in ({"seconds": 9.0, "copies": 3}, {"seconds": 9.0}):
         monkeypatch.setattr(adaptation, "load_or_train", lambda *_, h=header: Trained(net, h))
-        rows = tables.frame(adaptation.rows(RUN, "lstm", WEAK, way="reference", episodes=5, n_test=4)[1])
+        full = adaptation.made(RUN, "lstm", WEAK, way="reference", episodes=5)
+        rows = tables.frame(adaptation.score_rows(RUN, "lstm", WEAK, "reference", full, n_test=4))
         metrics.append(set(rows["metric"]))
         (_, _, line) = str(adaptation_results.ways_table(rows)).splitlines()
         assert ("| - " in line) == ("copies" in header)
@@ -157,17 +161,21 @@ def test_the_page_has_the_published_rows_and_nothing_without_them() -> None:
 
 
 def test_plans_of_an_adapted_model_are_rows_beside_its_predictions() -> None:
-    task, model = tsmlib.load_task(WEAK).take(2), load_pretrained("lstm", env="tsm/Reacher-v0")
-    rows = adaptation.plan_rows(RUN, "lstm", WEAK, model, way="all", episodes=20, n_targets=2)
-    trial = adaptation.planned(model, WEAK, 2)
-    assert {(row["configuration"], row["env_steps"], row["n"]) for row in rows} == {("all", 2000, 2)}
-    assert {row["metric"]: row["value"] for row in rows} == {
+    adapted = adaptation.Adapted(load_pretrained("rtsm", env="tsm/Reacher-v0"), 20, 1.0)
+    task, about = tsmlib.load_task(WEAK).take(2), (RUN, "rtsm", WEAK, "all", adapted)
+    plans, scores = adaptation.plan_rows(*about, n_targets=2), adaptation.score_rows(*about, n_test=4)
+    trial = adaptation.planned(RUN, adapted.model, WEAK, 2)
+    assert {(row["configuration"], row["env_steps"], row["n"], row["samples"]) for row in plans} == {
+        ("all", 2000, 2, JUDGING)
+    }
+    assert {row["metric"]: row["value"] for row in plans} == {
         "return_true": pytest.approx(float(trial.executed_return.mean())),
         "gap_absolute": pytest.approx(float(trial.gap.abs().mean())),
         "success": float((trial.final_distance <= task.tolerance).float().mean()),
     }
-    assert adaptation_results.plans_table(tables.frame(rows))
-    assert not adaptation_results.ways_table(tables.frame(rows))
+    both = tables.frame([*plans, *scores])
+    assert adaptation_results.plans_table(both) == adaptation_results.plans_table(tables.frame(plans)) != ""
+    assert adaptation_results.ways_table(both) == adaptation_results.ways_table(tables.frame(scores)) != ""
 
 
 @pytest.mark.parametrize("targets", [0, 2])
@@ -180,8 +188,8 @@ def test_rows_of_adaptation_are_of_predictions_or_of_plans(
     options = ["--models", "lstm", "--ways", "zero-shot", "--scale", "smoke", "--targets", str(targets)]
     run_script(script, "adaptation", *options)
     rows = tables.load(tmp_path / "results" / "10_explore.csv")
-    scored = set(rows["metric"])
-    assert scored == {*adaptation_results.PLANS} if targets else scored >= {*adaptation_results.SCORES}
+    scored = {*adaptation_results.SCORES, "train_seconds"}
+    assert set(rows["metric"]) == ({*adaptation_results.PLANS} if targets else scored)
     assert set(rows["planner"]) == ({"cem"} if targets else {"none"})
 
 
@@ -200,26 +208,32 @@ def test_returns_of_adapted_models_are_predicted_by_samples_that_neither_planner
     for name in ("cem", "expected_predictor", "fresh_predictor"):
         monkeypatch.setattr(adaptation, name, watched(name, getattr(adaptation, name)))
     env = "tsm/Reacher-v0"
-    trial = adaptation.planned(load_pretrained("rtsm", env=env), env, 2, seed=3)
-    judges = range(8 * drawn["expected_predictor"], 8 * drawn["expected_predictor"] + 8)
-    assert drawn["fresh_predictor"] not in {*judges, drawn["cem"]}
-    assert len(trial.actions) == 2
+    trial = adaptation.planned(replace(RUN, seed=3), load_pretrained("rtsm", env=env), env, 2)
+    judges = range(JUDGING * drawn["expected_predictor"], JUDGING * (drawn["expected_predictor"] + 1))
+    assert len({drawn["fresh_predictor"], drawn["cem"], *judges}) == JUDGING + 2
+    assert (trial.gap.abs() > 0).all()
 
 
-def test_what_plans_gain_by_adapting_is_paired_by_seed() -> None:
-    common = dict(env=WEAK, model="lstm", planner="cem", execution="open loop", n=50, scale="paper")
+def test_what_plans_gain_by_adapting_is_paired_by_seed_and_of_as_many_targets() -> None:
+    common = dict(env=WEAK, model="lstm", planner="cem", execution="open loop", scale="paper")
     rows = tables.frame(
-        common | dict(metric=metric, configuration=way, env_steps=steps, seed=seed, value=value)
-        for way, steps, returns in (("zero-shot", 0, [-10.0, -14.0]), ("all", 2000, [-8.0, -12.0]))
-        for seed, value in enumerate(returns) for metric, value in
-        (("return_true", value), ("success", 0.5), ("gap_absolute", 1.0))
+        common | dict(metric=metric, configuration=way, env_steps=steps, seed=seed, value=value, n=n)
+        for way, steps, found in (
+            ("all", 2000, [(1, -12.0, 50), (0, -8.0, 50), (2, -1.0, 20)]),
+            ("zero-shot", 0, [(0, -10.0, 50), (1, -14.0, 50), (2, -90.0, 50), (3, -90.0, 50)]),
+        )
+        for seed, value, n in found
+        for metric, value in (("return_true", value), ("success", 0.5), ("gap_absolute", 1.0))
     )  # fmt: skip
     lines = adaptation_results.plans_table(rows).splitlines()
     names, _, zero, tuned = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     assert dict(zip(names, zero, strict=True))["minus zero-shot"] == ""
     found = dict(zip(names, tuned, strict=True))
-    assert found["minus zero-shot"] == "+2.00"  # of both seeds
-    assert (found["episodes"], found["seeds"], found["n"]) == ("20", "2", "50")
+    assert found["minus zero-shot"] == "+2.00"  # of seeds 0 and 1
+    assert (found["episodes"], found["seeds"], found["n"]) == ("20", "3", "50")
+    page = pages.exploration_page(pd.concat([published("10_explore"), rows]))
+    assert f"{adaptation.ITERATIONS} iterations, over codes" in page
+    assert lines[-1] in page
 
 
 def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> None:
@@ -267,3 +281,21 @@ def test_shares_left_are_drawn_with_a_mark_for_the_mean_and_a_dot_for_each_seed(
     dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
     assert [share.tolist() for share in ways.values()] == dots[: len(ways)]
     assert [text.get_text() for text in ax.get_yticklabels()] == [*robots]
+
+
+def test_shares_left_of_three_models_stand_in_two_rows() -> None:
+    way = next(
+        iter(adaptation_results.shares_left(published("10_explore"), 20)["LSTM, 10 steps"]["reach, torque × 0.7"])
+    )
+    figure = figures.shares_left({str(title): {"arm": {way: np.array([0.5, 2.0])}} for title in range(6)}, "share")
+    assert {ax.get_subplotspec().get_gridspec().get_geometry() for ax in figure.axes} == {(2, 3)}
+    assert [ax.get_xlabel() for ax in figure.axes] == [""] * 3 + ["share"] * 3
+
+
+def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
+    way = next(
+        iter(adaptation_results.shares_left(published("10_explore"), 20)["LSTM, 10 steps"]["reach, torque × 0.7"])
+    )
+    (ax,) = figures.adapted({"LSTM": {way: (np.array([5.0, 20.0]), np.array([[1.0, 2.0], [3.0, 4.0]]))}}, "error").axes
+    marks = [line.get_ydata().tolist() for line in ax.lines]
+    assert sorted(marks) == [[1.0, 2.0], [2.0, 3.0], [3.0, 4.0]]

@@ -28,8 +28,11 @@ from tsmlib.study.runs import ROOT
 
 FOLDER = ROOT / "benchmarks" / "model_free"
 needs_sb3 = pytest.mark.skipif(
-    not all(importlib.util.find_spec(name) for name in ("stable_baselines3", "sb3_contrib", "sbx")),
-    reason="Stable-Baselines3, sb3-contrib and SBX are not installed; benchmarks/model_free/README.md tells how",
+    not all(importlib.util.find_spec(name) for name in ("stable_baselines3", "sb3_contrib")),
+    reason="Stable-Baselines3 and sb3-contrib are not installed; benchmarks/model_free/README.md tells how",
+)
+needs_sbx = pytest.mark.skipif(
+    not importlib.util.find_spec("sbx"), reason="SBX is not installed; benchmarks/model_free/README.md tells how"
 )
 
 
@@ -97,7 +100,7 @@ def test_training_seeds_share_no_start_of_the_pendulum() -> None:
 
 
 def test_the_pendulum_is_measured_from_the_starts_of_its_rounds_and_chosen_from_others() -> None:
-    tested, chosen = (model_free.WORLDS[pendulum.PENDULUM].task(split) for split in ("test", "validation"))
+    tested, chosen = (model_free.SETUPS[pendulum.PENDULUM].task(split) for split in ("test", "validation"))
     np.testing.assert_array_equal(tested.start, pendulum.swing_up(8, seed=pendulum.TESTED).start)
     assert not (tested.start[:, None] == chosen.start).all(2).any()
     found = model_free.measured(tested, lambda seen: np.zeros((len(seen), 1)))
@@ -137,7 +140,7 @@ def test_the_first_configurations_try_each_pair_of_values_once() -> None:
         for pair in (list(settings[0])[:2], list(settings[0])[1:], list(settings[0])[::2]):
             assert len({tuple(setting[name] for name in pair) for setting in settings[:4]}) == 4
         for setting in settings:
-            assert setting["episodes"] * model_free.WORLDS["tsm/Reacher-v0"].horizon % model_free.MINIBATCH == 0
+            assert setting["episodes"] * model_free.SETUPS["tsm/Reacher-v0"].horizon % model_free.MINIBATCH == 0
 
 
 def records(*steps: int) -> list[dict[str, float]]:
@@ -176,7 +179,7 @@ def test_rows_of_the_pendulum_are_those_of_its_rounds_and_have_no_part_in_figure
     table, env = model_free.Table(tmp_path / "model_free.csv"), pendulum.PENDULUM
     key = dict(env=env, model="ppo", subset="", configuration="std=0.14", seed=0)
     found = [{name: value for name, value in one.items() if name != "final_distance"} for one in records(0, 2000)]
-    rows = tables.frame(table.put(key, model_free.WORLDS[env].task("test"), found))
+    rows = tables.frame(table.put(key, model_free.SETUPS[env].task("test"), found))
     theirs = select(published("10_explore"), env=env, metric="return_true")
     own = select(tables.load(table.path), metric="return_true")
     assert len(rows) == 2 * (len(model_free.UNITS) - 1)
@@ -197,7 +200,7 @@ def test_numbers_that_make_no_run_are_refused(tmp_path: Path, arguments: list[st
 
 
 @needs_sb3
-@pytest.mark.parametrize("algorithm", model_free.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", [*model_free.GRADIENTS, pytest.param("sac", marks=needs_sbx)])
 def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) -> None:
     setting = dict(model_free.SETTINGS[algorithm][0], episodes=5)
     task = study.load_task("tsm/Reacher-v0", "validation").take(5)
@@ -211,6 +214,7 @@ def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) ->
 
 
 @needs_sb3
+@needs_sbx
 def test_sac_updates_as_often_per_step_as_its_configuration_says() -> None:
     for updates, episodes, each in ((0.25, 20, 5), (1, 40, 40)):
         setting = {"learning_rate": 3e-4, "episodes": episodes, "updates": updates}
@@ -221,7 +225,7 @@ def test_sac_updates_as_often_per_step_as_its_configuration_says() -> None:
 def test_the_library_is_told_how_an_episode_ended() -> None:
     robots = model_free.vectorised(model_free.Episodes("tsm/Reacher-v0", 3, seed=0))
     robots.reset()
-    for _ in range(model_free.WORLDS["tsm/Reacher-v0"].horizon - 1):
+    for _ in range(model_free.SETUPS["tsm/Reacher-v0"].horizon - 1):
         *_, done, infos = robots.step(np.zeros((3, 2), np.float32))
         assert not done.any()
         assert infos == [{}, {}, {}]

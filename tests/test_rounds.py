@@ -391,7 +391,8 @@ def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round(
     (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
     (["adaptation", "--models", "ensemble+mse", "--envs", PUSH], "no pretrained ensemble"),
     (["adaptation", "--models", "rtsm", "--episodes", "1"], "expected at least 2, since one is held out"),
-    (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected at least 0"),
+    (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected 1 to 100"),
+    (["rounds", "--models", "rtsm", "--targets", "5"], "--targets 5: expected 1 to 100, and of adaptation alone"),
     (["peers"], "peers and whole, and nothing else, take tables that are there; got none"),
     (["peers", "nowhere.csv"], "take tables that are there; got ['nowhere.csv']"),
 ])  # fmt: skip

@@ -100,33 +100,34 @@ Robots = gymnasium.vector.VectorEnv
 
 
 @dataclass(frozen=True)
-class World:
+class Setup:
     """What differs between the arms and the pendulum.
 
     horizon: steps of an episode; task: split -> the starts and targets that a policy is measured on; made: number of
-    robots -> their vector environment; action_space: of one robot, as a policy gives actions; seen: (states (n, dx),
-    targets (n, 2)) -> what a policy sees (n, k); seeds: (seed, number of robots) -> of their first reset; stepped:
-    (robots, actions (n, du)) -> their states and rewards; unit: of a return.
+    robots -> their vector environment; action_space: of one robot, as a policy gives actions; target: robots -> their
+    targets (n, 2); seen: (states (n, dx), targets) -> what a policy sees (n, k); seeds: (seed, number of robots) -> of
+    their first reset; stepped: (robots, actions (n, du)) -> their states and rewards; unit: of a return.
     """
 
     horizon: int
     task: Callable[[str], Task]
     made: Callable[[int], Robots]
     action_space: Callable[[Robots], gymnasium.Space]
+    target: Callable[[Robots], np.ndarray]
     seen: Callable[[np.ndarray, np.ndarray], np.ndarray]
     seeds: Callable[[int, int], int | list[int]]
     stepped: Callable[[Robots, np.ndarray], tuple[np.ndarray, np.ndarray]]
     unit: str = "m"
 
 
-def _arm(env: str) -> World:
+def _arm(env: str) -> Setup:
     """An arm, whose environment draws starts and targets."""
-    return World(
+    return Setup(
         HORIZON["push" if EnvSpec.parse(env).task == "push" else "reach"],
         task=lambda split: study.load_task(env, split),
         made=lambda n: cast(Robots, gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped),
         action_space=lambda robots: robots.single_action_space,
-        seen=observed, seeds=lambda seed, _: seed,
+        target=lambda robots: cast(Any, robots).target, seen=observed, seeds=lambda seed, _: seed,
         stepped=lambda robots, actions: robots.step(actions)[:2],
     )  # fmt: skip
 
@@ -144,12 +145,12 @@ def _swung(robots: Robots, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return states, pendulum.upright(torch.from_numpy(states), torch.from_numpy(actions)).numpy()
 
 
-WORLDS = {env: _arm(env) for env in ENVS} | {
-    PENDULUM: World(
+SETUPS = {env: _arm(env) for env in ENVS} | {
+    PENDULUM: Setup(
         exploration.HORIZON, _swings,
         made=lambda n: gymnasium.make_vec(PENDULUM, num_envs=n, vectorization_mode="sync"),
         action_space=lambda robots: gymnasium.spaces.Box(-1, 1, robots.single_action_space.shape, np.float32),
-        seen=lambda states, _: states.astype(np.float32),
+        target=lambda robots: np.zeros((robots.num_envs, 0)), seen=lambda states, _: states.astype(np.float32),
         # One for each pendulum, none of another training seed; from neighbouring ones they would start alike.
         seeds=lambda seed, n: np.random.SeedSequence(seed).generate_state(n).tolist(),
         stepped=_swung, unit="",
@@ -161,22 +162,21 @@ class Episodes:
     """Episodes of a task's length in n robots at once, one after another. Starts and targets are the environment's."""
 
     def __init__(self, env: str, n: int, *, seed: int) -> None:
-        self.world = WORLDS[env]
-        self.horizon = self.world.horizon
-        self.robots = self.world.made(n)
-        self.actions = self.world.action_space(self.robots)
-        self.seed: int | list[int] | None = self.world.seeds(seed, n)  # of the first reset; later ones go on from there
+        self.setup = SETUPS[env]
+        self.robots = self.setup.made(n)
+        self.actions = self.setup.action_space(self.robots)
+        self.seed: int | list[int] | None = self.setup.seeds(seed, n)  # of the first reset; later ones go on from there
         self.taken = 0
 
     @property
     def observation_size(self) -> int:
         """Numbers that a policy sees, k."""
         dx = self.robots.single_observation_space.shape[0]
-        return self.world.seen(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
+        return self.setup.seen(np.zeros((1, dx)), np.zeros((1, 2))).shape[1]
 
     def observed(self, states: np.ndarray) -> np.ndarray:
         """What a policy sees of states (n, dx): (n, k)."""
-        return self.world.seen(states, getattr(self.robots, "target", np.zeros(0)))
+        return self.setup.seen(states, self.setup.target(self.robots))
 
     def reset(self) -> np.ndarray:
         """Begin n episodes: their first observations (n, k)."""
@@ -186,9 +186,9 @@ class Episodes:
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """Actions (n, du) -> observations (n, k), rewards (n,), and whether the episodes are over."""
-        states, rewards = self.world.stepped(self.robots, actions)
+        states, rewards = self.setup.stepped(self.robots, actions)
         self.taken += 1
-        return self.observed(states), rewards, self.taken == self.horizon
+        return self.observed(states), rewards, self.taken == self.setup.horizon
 
 
 def measured(task: Task, predict: Predictor) -> dict[str, float]:
@@ -197,7 +197,7 @@ def measured(task: Task, predict: Predictor) -> dict[str, float]:
 
     def control(past: Segment) -> torch.Tensor:
         states = past.states[:, -1].numpy()
-        actions = predict(WORLDS[task.env].seen(states, target))
+        actions = predict(SETUPS[task.env].seen(states, target))
         return torch.from_numpy(np.asarray(actions, np.float32))[:, None]
 
     done = execute(task, control)
@@ -217,7 +217,7 @@ def vectorised(episodes: Episodes) -> Any:
     """``episodes`` as a vector environment of Stable-Baselines3. The end of an episode is a limit of time."""
     from stable_baselines3.common.vec_env import VecEnv
 
-    class Robots(VecEnv):
+    class Vectorised(VecEnv):
         def __init__(self) -> None:
             space = gymnasium.spaces.Box(-np.inf, np.inf, (episodes.observation_size,), np.float32)
             super().__init__(episodes.robots.num_envs, space, episodes.actions)
@@ -251,7 +251,7 @@ def vectorised(episodes: Episodes) -> Any:
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
             return [False] * self.num_envs
 
-    return Robots()
+    return Vectorised()
 
 
 def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int) -> Any:
@@ -272,7 +272,7 @@ def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int
         )  # fmt: skip
     network |= dict(activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
-        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=WORLDS[env].horizon, batch_size=MINIBATCH, gamma=GAMMA,
+        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=SETUPS[env].horizon, batch_size=MINIBATCH, gamma=GAMMA,
         policy_kwargs=network, seed=seed, device="cpu", **special,
     )  # fmt: skip
 
@@ -350,7 +350,7 @@ class Table:
                 env_steps=record["steps"],
                 metric=metric,
                 value=record[metric],
-                unit=WORLDS[task.env].unit if unit == "m" else unit,
+                unit=SETUPS[task.env].unit if unit == "m" else unit,
             )
             for record in records
             for metric, unit in UNITS.items()
@@ -371,7 +371,7 @@ def run(
     key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
     rows = table.kept(key, steps)
     if not rows:
-        task, found = WORLDS[env].task(split), []
+        task, found = SETUPS[env].task(split), []
         for record in learn(algorithm, task, setting, steps=steps, records=records, seed=seed):
             found.append(record)
             rows = table.put(key, task, found)

@@ -188,13 +188,11 @@ def adapted(
     for env, word in product(envs, models):
         for way in (way for way in (*adaptation.ways(word), adaptation.REFERENCE) if way in ways):
             for n in episodes[:1] if way in ("zero-shot", adaptation.REFERENCE) else episodes:
+                found = adaptation.made(run, word, env, way=way, episodes=n)
                 if targets:
-                    model, known, _ = adaptation.made(run, word, env, way=way, episodes=n)
-                    rows += adaptation.plan_rows(
-                        run, word, env, model, way=way, episodes=known, n_targets=targets
-                    )  # fmt: skip
+                    rows += adaptation.plan_rows(run, word, env, way, found, n_targets=targets)
                 else:
-                    rows += adaptation.rows(run, word, env, way=way, episodes=n, n_test=100)[1]
+                    rows += adaptation.score_rows(run, word, env, way, found, n_test=100)
     return rows
 
 
@@ -313,8 +311,8 @@ def main() -> None:
         options.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
         options.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
-    if given.targets < 0:
-        options.error(f"--targets {given.targets}: expected at least 0")
+    if (given.targets and given.part != "adaptation") or not 0 <= given.targets <= 100:
+        options.error(f"--targets {given.targets}: expected 1 to 100, and of adaptation alone")
     notebook = NOTEBOOKS.get(given.part, "05_control")
     run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
     if given.part == "convergence" and not needed.control(run).converging:

@@ -64,8 +64,11 @@ class Physics:
     @property
     def label(self) -> str:
         """The changed values as a figure names them: ``"mass × 2, upper link × 1.2"``; '' for the standard arm."""
-        named = zip(_LABELS, _flat(self), _flat(Physics()), strict=True)
-        return ", ".join(f"{name} × {value / usual:.3g}" for name, value, usual in named if value != usual)
+        found = list[str]()
+        for name, value in self.changed.items():
+            both = zip(_LABELS[name], _several(value), _several(STANDARD[name]), strict=True)
+            found += [f"{label} × {new / usual:.3g}" for label, new, usual in both if new != usual]
+        return ", ".join(found)
 
 
 SHORTEST, LONGEST = 0.06, 0.24  # m: a link; both together, so that the fingertip stays within the walls
@@ -77,7 +80,10 @@ STANDARD: dict[str, object] = {field.name: field.default for field in fields(Phy
 _WORDS = {
     "mass": "mass", "damping": "damping", "link_lengths": "links", "object_radius": "radius", "torque_gain": "gain",
 }  # fmt: skip
-_LABELS = ("mass", "damping", "upper link", "lower link", "object", "torque")  # of ``_flat``
+_LABELS = {
+    "mass": ("mass",), "damping": ("damping",), "link_lengths": ("upper link", "lower link"),
+    "object_radius": ("object",), "torque_gain": ("torque",),
+}  # fmt: skip
 PATTERN = "".join(rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values())  # of ``Physics.word``, a group for each
 
 
@@ -88,10 +94,8 @@ def parse(groups: Iterable[str | None]) -> Changes:
     return cast(Changes, {name: value if name == "link_lengths" else value[0] for name, value in values.items()})
 
 
-def _flat(physics: Physics) -> tuple[float, ...]:
-    return (
-        physics.mass, physics.damping, *physics.link_lengths, physics.object_radius, physics.torque_gain,
-    )  # fmt: skip
+def _several(value: object) -> tuple[float, ...]:
+    return value if isinstance(value, tuple) else (cast(float, value),)
 
 
 def _spelled(value: object) -> str:

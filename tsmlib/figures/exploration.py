@@ -143,7 +143,7 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
     """
     names = [*dict.fromkeys(name for robots in shares.values() for name in robots)]
     look_of = axes.looks(*shares.values())
-    columns = len(shares) if len(shares) <= 4 else -(-len(shares) // 2)
+    columns = len(shares) if len(shares) <= 4 else -(-len(shares) // 2)  # two rows where one would be too narrow
     figure, grid = panels(len(shares), columns, 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
     every = np.concatenate([
         np.ravel(finite(f"{title}, {name}", values, "k"))
@@ -160,10 +160,9 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
                 ax.plot(seeds.mean(), at, **look_of[way] | {"ls": "", "ms": 5, "mew": 1}, zorder=3)
         ax.set(title=title, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
         ax.set_yticks(range(len(names)), names)
+        ax.grid(axis="x", color=GRID, lw=0.6)
     for ax in grid[-columns:]:
         ax.set_xlabel(xlabel)
-    for ax in grid:
-        ax.grid(axis="x", color=GRID, lw=0.6)
     return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), _dots()], 4)
 
 

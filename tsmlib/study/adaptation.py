@@ -22,14 +22,14 @@ from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.prediction import Scores, score
 from tsmlib.fine_tuning import Part, fine_tune
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.base import DynamicsModel
+from tsmlib.models.base import DynamicsModel, as_dynamics
 from tsmlib.models.features import Features
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import cem, reevaluate
-from tsmlib.planning.predictors import expected_predictor, fresh_predictor
+from tsmlib.planning.predictors import JUDGING, expected_predictor, fresh_predictor
 from tsmlib.planning.search_spaces import LatentActions
-from tsmlib.study import zoo
+from tsmlib.study import plans, zoo
 from tsmlib.study.data import HELD_OUT_SEED, random_data, sizes
 from tsmlib.study.models import TrainedModel, load_or_train, load_pretrained
 from tsmlib.study.results import adaptation as results
@@ -44,7 +44,7 @@ WAYS: tuple[Way, ...] = ("zero-shot", "all", "head", "codes", "scratch")
 Reference = Literal["reference"]
 REFERENCE: Reference = results.REFERENCE
 PLANNING: tuple[Way, ...] = ("zero-shot", "all")  # ways whose models plan, too
-CANDIDATES, ITERATIONS = 96, 5  # of the cross-entropy method, by which adapted models plan
+ITERATIONS = 5  # of the cross-entropy method, by which adapted models plan
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
 EPISODES = (5, 20, 80)  # of the changed arm
@@ -71,6 +71,17 @@ BUDGETS: Mapping[str, TuningBudget] = {
     "lstm": TuningBudget(300, 800, {"all": 1e-3, "head": 1e-2}),
     "ensemble+mse": TuningBudget(300, 800, {"all": 1e-3, "head": 1e-2}),
 }
+
+
+class Adapted(NamedTuple):
+    """A model of a changed arm, the episodes of that arm that it knows, and the CPU seconds of its training.
+
+    seconds: None where they are of several models together.
+    """
+
+    model: TrainedModel
+    episodes: int
+    seconds: float | None
 
 
 def ways(word: str) -> tuple[Way, ...]:
@@ -150,47 +161,42 @@ def units_of(env: str) -> Features:
     return load_pretrained(FEATURES_OF, env=EnvSpec.parse(env).standard.id).features
 
 
-def made(
-    run: Run, word: str, env: str, *, way: Way | Reference, episodes: int, share: float = 1.0
-) -> tuple[TrainedModel, int, float | None]:
-    """A model of ``env`` by a way, the episodes of the changed arm that it knows, and the CPU seconds of its training;
-    None where they are of several models together. A reference has the scale's episodes and updates."""
+def made(run: Run, word: str, env: str, *, way: Way | Reference, episodes: int, share: float = 1.0) -> Adapted:
+    """A model of ``env`` by a way. A reference has the scale's episodes and updates."""
     if way == REFERENCE:
         found = load_or_train(run, env, word)
-        return found.model, sizes(run, env)["train"], None if "copies" in found.header else found.header["seconds"]
-    net, seconds = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
-    return net, 0 if way == "zero-shot" else episodes, seconds
+        seconds = None if "copies" in found.header else found.header["seconds"]
+        return Adapted(found.model, sizes(run, env)["train"], seconds)
+    net, spent = adapted(word, env, way, few(env, episodes, seed=run.seed), seed=run.seed, share=share)
+    return Adapted(net, 0 if way == "zero-shot" else episodes, spent)
 
 
-def rows(
-    run: Run, word: str, env: str, *, way: Way | Reference, episodes: int, n_test: int, share: float = 1.0
-) -> tuple[TrainedModel, list[Row]]:
-    """A model of ``env`` by a way, and the rows of its scores."""
-    net, n, seconds = made(run, word, env, way=way, episodes=episodes, share=share)
-    scores = scored(net, env, held_out(env, n_test), seed=run.seed)
-    return net, results.adapted_rows(run, env, word, way, scores, episodes=n, ahead=AHEAD, seconds=seconds)
+def score_rows(run: Run, word: str, env: str, way: Way | Reference, found: Adapted, *, n_test: int) -> list[Row]:
+    """Rows of what a model of ``env`` predicts, on so many test episodes."""
+    scores = scored(found.model, env, held_out(env, n_test), seed=run.seed)
+    return results.adapted_rows(
+        run, env, word, way, scores, episodes=found.episodes, ahead=AHEAD, seconds=found.seconds
+    )
 
 
-def planned(model: TrainedModel, env: str, n_targets: int, *, seed: int = 0) -> Trial:
-    """Plans on the arm's first frozen targets, over codes of the standard arm's prior, executed open loop.
+def planned(run: Run, model: TrainedModel, env: str, n_targets: int) -> Trial:
+    """Plans to the first test targets of an arm, over codes of the standard arm's prior, executed open loop.
 
-    Candidates are judged by the mode and ``JUDGING`` samples, of a model without samples by its one rollout; the return
-    is predicted from samples that neither planner nor judges drew.
+    Candidates are judged by the mode and ``JUDGING`` samples, of an ensemble by its members, of a model without samples
+    by its one rollout; the return is predicted from samples that neither planner nor judges drew.
     """
-    task = load_task(env).take(n_targets)
+    task, candidates = load_task(env).take(n_targets), plans.CANDIDATES[run.scale]
     space = LatentActions(cast(ActionPrior, load_pretrained("prior", env=env)), task.horizon)
-    past, drawn = task.past(model.past_len), 1000 + seed  # not the planner's; of the judges eight times that
+    past, drawn = task.past(model.past_len), 1000 + run.seed  # not the planner's; of the judges JUDGING times that
     predict = expected_predictor(model, past, seed=drawn)
     plan = cem(
-        predict, task.reward, space, len(task), candidates=CANDIDATES, elites=9, iterations=ITERATIONS, screened=0.25,
-        seed=seed,
+        predict, task.reward, space, len(task), candidates=candidates, elites=max(2, candidates // 10),
+        iterations=ITERATIONS, screened=plans.SCREENED, seed=run.seed,
     )  # fmt: skip
     return execute(task, reevaluate(plan, fresh_predictor(model, past, seed=drawn), task.reward))
 
 
-def plan_rows(
-    run: Run, word: str, env: str, model: TrainedModel, *, way: Way | Reference, episodes: int, n_targets: int
-) -> list[Row]:
-    """Rows of what a model of ``env`` by a way plans. episodes: of the changed arm that it knows."""
-    trial = planned(model, env, n_targets, seed=run.seed)
-    return results.planned_rows(run, env, word, way, trial, episodes=episodes)
+def plan_rows(run: Run, word: str, env: str, way: Way | Reference, found: Adapted, *, n_targets: int) -> list[Row]:
+    """Rows of what a model of ``env`` plans, to so many targets."""
+    trial, samples = planned(run, found.model, env, n_targets), JUDGING * as_dynamics(found.model).stochastic
+    return results.planned_rows(run, env, word, way, trial, episodes=found.episodes, samples=samples)

@@ -231,7 +231,7 @@ def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:
     """Energy scores of models that were adapted to a changed arm, way by way."""
-    rows = table.select(found, execution=planning.OPEN, env=env)
+    rows = table.select(found, execution=planning.OPEN, planner="none", env=env)
     curves, yours = table.pair(rows, partial(adaptation.way_curves, steps_ahead=steps_ahead))
     if curves:
         yield Drawing(

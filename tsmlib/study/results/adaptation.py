@@ -53,13 +53,18 @@ def adapted_rows(
     return found
 
 
-def planned_rows(run: Run, env: str, word: str, way: str, trial: Trial, *, episodes: int) -> list[Row]:
-    """Executed return, share within the task's tolerance and mean size of the gap of an adapted model's plans."""
+def planned_rows(run: Run, env: str, word: str, way: str, trial: Trial, *, episodes: int, samples: int) -> list[Row]:
+    """Executed return, share within the task's tolerance and mean size of the gap of an adapted model's plans.
+
+    samples: by which candidates were judged beside the mode.
+    """
     assert trial.success is not None
+    spec = EnvSpec.parse(env)
     common = dict(
-        env=env, sim=EnvSpec.parse(env).simulator, model=word, planner="cem", search_space="latent", execution=OPEN,
-        configuration=way, env_steps=100 * episodes, n=len(trial.actions), seed=run.seed, scale=run.scale,
-    )  # fmt: skip
+        env=env, sim=spec.simulator, task=spec.task, model=word, planner="cem", search_space="latent",
+        execution=OPEN, horizon=trial.actions.shape[1], configuration=way, env_steps=100 * episodes,
+        n=len(trial.actions), seed=run.seed, scale=run.scale,
+    ) | ({"samples": samples} if samples else {})  # fmt: skip
     found = {
         "return_true": (trial.executed_return, "m"), "success": (trial.success.float(), "share"),
         "gap_absolute": (trial.gap.abs(), "m"),
@@ -119,29 +124,27 @@ def ways_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 @table.sourced
 def plans_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """A line for each arm, model, way and number of episodes: what its plans return, minus zero-shot (paired by seed),
-    how many end within the tolerance, and the size of the gap."""
+    """A line for each arm, model, way and number of episodes: what its plans return, minus zero-shot (paired by seed,
+    to as many targets), how many end within the tolerance, and the size of the gap."""
     lines = []
     here = table.select(rows, execution=OPEN, planner="cem", configuration=list(WAYS))
     for (env, word), own in table.groups(here, ["env", "model"]):
-        wide = own.pivot(index="seed", columns=["metric", "configuration", "env_steps"], values="value")
-        for way, steps in sorted(set(zip(own["configuration"], own["env_steps"], strict=True)), key=_in_order):
+        columns = ["metric", "configuration", "env_steps"]
+        wide, n = (own.pivot(index="seed", columns=columns, values=name) for name in ("value", "n"))
+        ways = set(zip(own["configuration"], own["env_steps"], strict=True))
+        for way, steps in sorted(ways, key=lambda of: ([*WAYS].index(of[0]), of[1])):
             returns, success, gap = (wide[metric, way, steps].dropna() for metric in PLANS)
             line: Row = {"env": env, "model": f"`{word}`", "what": WAYS[way].name, "episodes": int(steps) // 100}
             line["executed return"] = table.spell(returns, "{:.2f} ± {:.2f}")
             line["minus zero-shot"] = ""
             if way != "zero-shot" and ("return_true", "zero-shot", 0) in wide:
-                gained = (wide["return_true", way, steps] - wide["return_true", "zero-shot", 0]).dropna()
+                this, before = ("return_true", way, steps), ("return_true", "zero-shot", 0)
+                gained = (wide[this] - wide[before]).where(n[this] == n[before]).dropna()
                 line["minus zero-shot"] = table.spell(gained, "{:+.2f} ± {:.2f}")
-            line[ARRIVED] = table.spell(success, "{:.2f} ± {:.2f}")
+            line[ARRIVED] = table.spell(success, "{:.1%} ± {:.1%}")
             line["size of the gap"] = table.spell(gap, "{:.2f} ± {:.2f}")
-            lines.append({**line, "seeds": len(returns), "n": int(own["n"].max())})
+            lines.append({**line, "seeds": len(returns), "n": int(n["return_true", way, steps].max())})
     return pd.DataFrame(lines)
-
-
-def _in_order(of: tuple[str, int]) -> tuple[int, int]:
-    """Ways in the order of WAYS, each by its episodes."""
-    return [*WAYS].index(of[0]), of[1]
 
 
 @table.sourced
