@@ -389,7 +389,7 @@ def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round(
     (["convergence", "--scale", "laptop", "--envs", PUSH, "--models", "tsm"], "nothing converges at scale laptop"),
     (["adaptation", "--models", "rtsm", "--variants", "mass2"], "cannot be chosen: it has no object"),
     (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
-    (["adaptation", "--models", "ensemble+mse", "--envs", PUSH], "no pretrained ensemble"),
+    (["adaptation", "--models", "ensemble+mse", "--envs", "tsm/PymunkPush-v1"], "no pretrained ensemble"),
     (["adaptation", "--models", "rtsm", "--episodes", "1"], "expected at least 2, since one is held out"),
     (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected 1 to 100"),
     (["rounds", "--models", "rtsm", "--targets", "5"], "--targets 5: expected 1 to 100, and of adaptation alone"),
@@ -524,6 +524,16 @@ def test_the_notebook_says_of_the_loop_of_mbrl_lib_what_the_published_rows_say()
     plans = table.select(published("05_control"), env=PUSH, planner="zero", metric="return_true", seed=0)
     nothing = float(plans["value"].mean())
     assert ((wide[PUSH]["pets"] - nothing).abs() < 0.2).all()
+
+
+def test_the_notebook_says_of_the_ensemble_that_pushes_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PUSH, execution="closed loop", configuration=results.PLANNED)
+    returns = table.select(rows, metric="return_true", model=["ensemble+mse", "rtsm"])
+    wide = returns.pivot(index="seed", columns=["model", "iteration"], values="value")
+    assert len(wide) == 3
+    assert (wide["ensemble+mse", 5] > wide["ensemble+mse", 0]).all()
+    assert (wide["ensemble+mse", 5] < wide["rtsm", 1]).all()
+    assert rows["env_steps"].max() == 95_000
 
 
 def test_the_notebook_says_of_policies_of_the_pendulum_what_the_published_rows_say() -> None:

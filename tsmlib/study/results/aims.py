@@ -28,10 +28,19 @@ Line = tuple[str, str, float, float, str]  # of table.thresholds
 
 
 class Worst(NamedTuple):
-    """A ratio or a difference against the other model that is hardest to be ahead of, and that model."""
+    """A ratio or a difference against the other model that is hardest to be ahead of, and that model.
+
+    seeds: that both have, where they are fewer than of our own model; else 0.
+    """
 
     value: float
     against: str
+    seeds: int = 0
+
+    @property
+    def told(self) -> str:
+        """``"`lstm`'s"``, ``"`ensemble+mse`'s (1 seed)"``."""
+        return f"`{self.against}`'s" + f" ({self.seeds} seed{'s' * (self.seeds > 1)})" * bool(self.seeds)
 
 
 def aims(predict: pd.DataFrame, plans: pd.DataFrame, targets: pd.DataFrame, learned: pd.DataFrame) -> pd.DataFrame:
@@ -54,7 +63,9 @@ def of_exploration(rows: pd.DataFrame, free: pd.DataFrame) -> pd.DataFrame:
 
 def missed(found: pd.DataFrame) -> str:
     """A clause with the aims of a table of ``aims`` that were not reached; empty if all were."""
-    lines = [f"{line.what} {line.measured} ({line.threshold})" for line in found[~found["reached"]].itertuples()]
+    short = found["threshold"].replace({"at most": "≤", "at least": "≥"}, regex=True)
+    left = found.assign(threshold=short)[~found["reached"]]
+    lines = [f"{line.what} {line.measured} ({line.threshold})" for line in left.itertuples()]
     return f"{len(lines)} of {len(found)} are missed: {'; '.join(lines)}." if lines else ""
 
 
@@ -62,11 +73,11 @@ def gap_told(targets: pd.DataFrame, *, most: int = 5) -> str:
     """How far the ratio of mean gaps rests on few targets: the share of the ``most`` largest, the 95 % interval when
     targets are drawn again, and medians. Rows of 05_control_rows; empty without those of both models."""
     gaps = _latent(planning.gap_sizes(planning.plans_of(targets, env=PUSH, planners=["cem"])))
-    means = {other: float(gaps[other].to_numpy().mean()) for other in BASELINES if {OURS, other} <= {*gaps}}
-    if not means:
+    pairs = {other: _shared(gaps[OURS], gaps[other]) for other in BASELINES if {OURS, other} <= {*gaps}}
+    if not pairs:
         return ""
-    other = min(means, key=lambda each: means[each])
-    both = pd.concat([gaps[OURS].mean(), gaps[other].mean()], axis=1, join="inner").to_numpy()
+    other = max(pairs, key=lambda each: _ratio(*pairs[each]))
+    both = pd.concat([each.mean() for each in pairs[other]], axis=1, join="inner").to_numpy()
     if len(both) < 2:
         return ""
     ours, theirs = both.T
@@ -76,10 +87,21 @@ def gap_told(targets: pd.DataFrame, *, most: int = 5) -> str:
     ).confidence_interval  # fmt: skip
     largest = np.sort(ours)[-most:].sum() / ours.sum()
     return (
-        f"Few targets decide a mean gap: the {most} largest of `{OURS}` are {largest:.0%} of its {ours.mean():.2f} m. "
-        f"Its ratio to that of `{other}` is {drawn.low:.2f} to {drawn.high:.2f} in 95 % of draws of {len(ours)} "
-        f"targets with replacement; the medians are {np.median(ours):.2f} and {np.median(theirs):.2f} m."
+        f"Few targets decide a mean gap: the {most} largest of `{OURS}` are {largest:.0%} of its {ours.mean():.2f} m "
+        f"({len(pairs[other][0])} of {len(gaps[OURS])} seeds). Its ratio to that of `{other}` is {drawn.low:.2f} to "
+        f"{drawn.high:.2f} in 95 % of draws of {len(ours)} targets with replacement; the medians are "
+        f"{np.median(ours):.2f} and {np.median(theirs):.2f} m."
     )
+
+
+def _shared(ours: pd.DataFrame, theirs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Both tables (seeds, targets), of the seeds that they share."""
+    seeds = ours.index.intersection(theirs.index)
+    return ours.loc[seeds], theirs.loc[seeds]
+
+
+def _ratio(ours: pd.DataFrame, theirs: pd.DataFrame) -> float:
+    return float(ours.to_numpy().mean() / theirs.to_numpy().mean())
 
 
 def _latent(found: Mapping[Method, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -103,25 +125,30 @@ def _of_plans(plans: pd.DataFrame, targets: pd.DataFrame) -> list[Line]:
     there = [other for other in BASELINES if {OURS, other} <= {*costs} & {*gaps}]
     apart = {other: planning.paired_differences(costs[OURS], costs[other]) for other in there}
     apart = {other: each for other, each in apart.items() if each.size}
-    behind = _worst({other: sum(interval(each.mean().to_numpy())) for other, each in apart.items()})
+    behind = _worst(
+        {other: sum(interval(each.mean().to_numpy())) for other, each in apart.items()},
+        {other: len(each) for other, each in apart.items()} | {OURS: len(costs.get(OURS, ()))},
+    )
     trained = _worst({
         other: float(each.to_numpy().mean()) + random_effects(each.to_numpy()).half()
         for other, each in apart.items() if len(each) > 1
     })  # fmt: skip
-    gap = _worst({other: float(gaps[OURS].to_numpy().mean() / gaps[other].to_numpy().mean()) for other in there})
+    both = {other: _shared(gaps[OURS], gaps[other]) for other in there}
+    seeds = {other: len(ours) for other, (ours, _) in both.items()} | {OURS: len(gaps.get(OURS, ()))}
+    gap = _worst({other: _ratio(*each) for other, each in both.items()}, seeds)
     return [
         ("cost of no torque over the oracle's", "at least", 2.0, mean("cost_over_oracle", "none"), "{:.2f}"),
-        ("pushes by the oracle that end within 5 cm", "at least", 0.9,
+        ("pushes by the oracle within 5 cm", "at least", 0.9,
          mean("success", ORACLE.model), "{:.0%}"),
         (f"cost of plans through `{OURS}` over the oracle's", "at most", 1.15, mean("cost_over_oracle", OURS),
          "{:.2f}"),
-        (f"pushes by `{OURS}`, planned again every ten steps, that end within 5 cm", "at least", 0.8,
+        (f"pushes by `{OURS}`, planned again every ten steps, within 5 cm", "at least", 0.8,
          mean("success", OURS, closed), "{:.0%}"),
-        (f"`{OURS}`'s cost minus that of `{behind.against}` (m), upper end over targets", "at most", 0.0, behind.value,
+        (f"`{OURS}`'s cost minus {behind.told} (m), upper end over targets", "at most", 0.0, behind.value,
          "{:.2f}"),
-        (f"`{OURS}`'s cost minus that of `{trained.against}` (m), upper end over targets and seeds", "at most", 0.0,
+        (f"`{OURS}`'s cost minus {trained.told} (m), upper end over targets and seeds", "at most", 0.0,
          trained.value, "{:.2f}"),
-        (f"`{OURS}`'s mean gap over that of `{gap.against}`", "at most", 0.5, gap.value, "{:.2f}"),
+        (f"`{OURS}`'s mean gap over {gap.told}", "at most", 0.5, gap.value, "{:.2f}"),
         (f"steps predicted by `{OURS}` that violate physics", "at most", 0.05, mean("violations", OURS), "{:.1%}"),
     ]  # fmt: skip
 
@@ -130,8 +157,8 @@ def _of_predictions(predict: pd.DataFrame) -> list[Line]:
     found = list[Line]()
     for env, steps, bound in ((PUSH, 10, 0.5), (PUSH, 80, 0.5), (OBSTACLE, None, 1.0), (REACH, None, 1.0)):
         worst = _over_others(predict, env, steps)
-        where = f"{steps} steps ahead" if env == PUSH else f"of {EnvSpec.parse(env).name}"
-        what = f"`{OURS}`'s energy score {where} over that of `{worst.against}`"
+        where = f"at {steps} steps" if env == PUSH else f"of {EnvSpec.parse(env).name}"
+        what = f"`{OURS}`'s energy score {where} over {worst.told}"
         found.append((what, "at most", bound, worst.value, "{:.2f}"))
     return found
 
@@ -141,7 +168,9 @@ def _over_others(predict: pd.DataFrame, env: str, steps: int | None) -> Worst:
     rows = prediction.select(predict, ENERGY, env=env, steps_ahead=steps)
     wide = rows.pivot(index="seed", columns="model", values="value")
     ours = wide[OURS] if OURS in wide else pd.Series(dtype=float)
-    return _worst({str(other): float((ours / wide[other]).mean()) for other in wide if other != OURS})
+    ratios = {str(other): ours / wide[other] for other in wide}
+    seeds = {other: int(each.notna().sum()) for other, each in ratios.items()}
+    return _worst({other: float(each.mean()) for other, each in ratios.items() if other != OURS}, seeds)
 
 
 def _of_policies(learned: pd.DataFrame) -> list[Line]:
@@ -154,7 +183,7 @@ def _of_policies(learned: pd.DataFrame) -> list[Line]:
     ours = inside.pop(OURS, float("nan"))
     names = {"": "others"} | {word: zoo.look(word).name for word in seeds}
     return [
-        (f"return of the best policy inside `{OURS}` minus that of {names[worst.against]} "
+        (f"return of the best policy inside `{OURS}` minus {names[worst.against]}'s "
          f"({seeds.get(OURS, 0)} and {seeds.get(worst.against, 0)} seeds)", "at least", 0.0, -worst.value, "{:.2f}")
         for others in (inside, free)
         for worst in [_worst({model: end - ours for model, end in others.items()})]
@@ -229,8 +258,9 @@ def _lower(values: pd.Series) -> float:
     return mean - half
 
 
-def _worst(found: Mapping[str, float]) -> Worst:
-    """The largest value and whose it is; NaN of nothing."""
+def _worst(found: Mapping[str, float], seeds: Mapping[str, int] | None = None) -> Worst:
+    """The largest value and whose it is; NaN of nothing. seeds: of each model, our own among them."""
     known = {word: value for word, value in found.items() if value == value}
     word = max(known, key=lambda each: known[each], default="")
-    return Worst(known.get(word, float("nan")), word)
+    n = (seeds or {}).get(word, 0)
+    return Worst(known.get(word, float("nan")), word, n if n < (seeds or {}).get(OURS, 0) else 0)
