@@ -299,3 +299,17 @@ def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
     (ax,) = figures.adapted({"LSTM": {way: (np.array([5.0, 20.0]), np.array([[1.0, 2.0], [3.0, 4.0]]))}}, "error").axes
     marks = [line.get_ydata().tolist() for line in ax.lines]
     assert sorted(marks) == [[1.0, 2.0], [2.0, 3.0], [3.0, 4.0]]
+
+
+def test_the_notebook_says_of_plans_on_changed_arms_what_the_published_rows_say() -> None:
+    rows = published("10_explore")
+    pushed = rows["env"].str.startswith("tsm/ReacherPush-") & (rows["env"] != PUSH)
+    plans = rows[pushed & (rows["planner"] == "cem") & (rows["metric"] == "return_true") & (rows["seed"] == 0)]
+    wide = plans.pivot(index=["env", "model"], columns="configuration", values="value").loc[
+        (slice(None), ["rtsm", "lstm"]), :
+    ]
+    gained = wide["all"] - wide["zero-shot"]
+    assert len(gained) == 6 * 2
+    assert gained.min() >= 0
+    best = gained.idxmax()
+    assert (best[0].split("-")[1], round(gained.max(), 1)) == ("damping2", 2.8)
