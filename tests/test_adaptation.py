@@ -232,7 +232,7 @@ def test_what_plans_gain_by_adapting_is_paired_by_seed_and_of_as_many_targets() 
     assert found["minus zero-shot"] == "+2.00"  # of seeds 0 and 1
     assert (found["episodes"], found["seeds"], found["n"]) == ("20", "3", "50")
     page = pages.exploration_page(pd.concat([published("10_explore"), rows]))
-    assert f"{adaptation.ITERATIONS} iterations, over codes" in page
+    assert f"{adaptation.PLAN_ITERATIONS} iterations, over codes" in page
     assert lines[-1] in page
 
 

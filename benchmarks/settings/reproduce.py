@@ -127,9 +127,8 @@ def _rounds(envs: tuple[str, ...], models: tuple[str, ...], data: str) -> Recipe
 
 def _adapted(env: str, variant: str, options: str) -> Recipe:
     """Models adapted to a changed arm."""
-    models = (OURS, "lstm", "ensemble+mse")
     return Recipe(
-        ("10_explore",), "adaptation", (env,), models, options=f"{options} --episodes 5 20 80", variant=variant,
+        ("10_explore",), "adaptation", (env,), TUNED, options=f"{options} --episodes 5 20 80", variant=variant,
         only={"planner": ("none",)},
     )  # fmt: skip
 
@@ -139,7 +138,7 @@ def _plans(env: str, variant: str) -> Recipe:
     options = f"--ways {' '.join(adaptation.PLANNING)} --episodes 20 --targets 50"
     only = {"planner": ("cem",), "execution": ("open loop",), "configuration": adaptation.PLANNING}
     return Recipe(
-        ("10_explore",), "adaptation", (env,), (OURS, "lstm", "ensemble+mse"), options=options, variant=variant,
+        ("10_explore",), "adaptation", (env,), TUNED, options=options, variant=variant,
         only=only | {"env_steps": (0, 2000)},
     )  # fmt: skip
 
@@ -159,6 +158,7 @@ def _free(envs: tuple[str, ...], models: tuple[str, ...], options: str) -> Recip
 
 
 ARMS = [arm for arm in adaptation.VARIANTS if arm != "standard"]
+TUNED = tuple(adaptation.BUDGETS)  # models that are adapted
 ROBOTS = ("Hopper-v5", "HalfCheetah-v5", PENDULUM)
 METRICS = "{runs}/paper/seed0/metrics"
 RECIPES = (  # in the order in which they are run: policies without a model before those that are compared with them
@@ -310,11 +310,11 @@ def page() -> str:
     rows, lines = shipped(), ['rows="python benchmarks/settings/rows.py" seed=0']
     for recipe in RECIPES:
         made = pd.concat([recipe.made(rows[name]) for name in recipe.tables if name in rows])
-        if made.empty and recipe.part:
+        if not (commands := recipe.commands(made, "$seed")):
             continue
         part = f" ({recipe.part})" if recipe.part else ""
         lines += ["", f"# {', '.join(recipe.tables)}{part}: {_seeds(recipe, made)}"]
-        for line in recipe.commands(made, "$seed"):
+        for line in commands:
             lines.append(line.replace(f"python {ROWS}", "$rows"))
     return "\n".join(
         ["```{code-block} bash", *lines, "", f"# {JUDGED}, the pages, and the checksums of all", CLAIMS, "```"]

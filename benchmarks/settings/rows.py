@@ -271,13 +271,8 @@ def parser() -> argparse.ArgumentParser:
                        help=f"of the arm that is adapted to (default {WEAK[1]})")  # fmt: skip
     found.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="of adaptation (default all)")
     found.add_argument("--episodes", nargs="+", type=int, default=[20], help="to adapt from (default 20)")
-    found.add_argument(
-        "--targets",
-        type=int,
-        default=0,
-        metavar="N",
-        help="of adaptation: plans to the first N frozen targets, in place of predictions",
-    )
+    found.add_argument("--targets", type=int, default=0, metavar="N",
+                       help="of adaptation: plans to the first N test targets, in place of predictions")  # fmt: skip
     found.add_argument("--copies", type=int, default=3, help="of a policy, side by side (default 3)")
     found.add_argument("--iterations", type=int, default=880, help="of learning a policy (default 880)")
     found.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")

@@ -44,7 +44,7 @@ WAYS: tuple[Way, ...] = ("zero-shot", "all", "head", "codes", "scratch")
 Reference = Literal["reference"]
 REFERENCE: Reference = results.REFERENCE
 PLANNING: tuple[Way, ...] = ("zero-shot", "all")  # ways whose models plan, too
-ITERATIONS = 5  # of the cross-entropy method, by which adapted models plan
+PLAN_ITERATIONS = 5  # of the cross-entropy method
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored
 EPISODES = (5, 20, 80)  # of the changed arm
@@ -191,7 +191,7 @@ def planned(run: Run, model: TrainedModel, env: str, n_targets: int) -> Trial:
     predict = expected_predictor(model, past, seed=drawn)
     plan = cem(
         predict, task.reward, space, len(task), candidates=candidates, elites=max(2, candidates // 10),
-        iterations=ITERATIONS, screened=plans.SCREENED, seed=run.seed,
+        iterations=PLAN_ITERATIONS, screened=plans.SCREENED, seed=run.seed,
     )  # fmt: skip
     return execute(task, reevaluate(plan, fresh_predictor(model, past, seed=drawn), task.reward))
 

@@ -475,7 +475,7 @@ def _adapted_plans(rows: pd.DataFrame) -> str:
         return ""
     return f"""
 What such models plan on those arms: the cross-entropy method, {plans.CANDIDATES["paper"]} candidates and
-{adaptation.ITERATIONS} iterations, over codes of the standard arm's prior, executed open loop, to the first n test
+{adaptation.PLAN_ITERATIONS} iterations, over codes of the standard arm's prior, executed open loop, to the first n test
 targets: the frozen ones, but where a link is longer, which draws its own. Candidates are judged by the mode and
 {JUDGING} samples, of an ensemble by its members, of the LSTM by its one rollout. Seeds are of the planner, too:
 

@@ -101,6 +101,7 @@ def _shared(ours: pd.DataFrame, theirs: pd.DataFrame) -> tuple[pd.DataFrame, pd.
 
 
 def _ratio(ours: pd.DataFrame, theirs: pd.DataFrame) -> float:
+    """Of the means of two such tables."""
     return float(ours.to_numpy().mean() / theirs.to_numpy().mean())
 
 
