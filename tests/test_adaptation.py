@@ -233,7 +233,7 @@ def test_what_plans_gain_by_adapting_is_paired_by_seed_and_of_as_many_targets() 
     assert (found["episodes"], found["seeds"], found["n"]) == ("20", "3", "50")
     page = pages.exploration_page(pd.concat([published("10_explore"), rows]))
     assert f"{adaptation.PLAN_ITERATIONS} iterations, over codes" in page
-    assert lines[-1] in page
+    assert "".join(lines[-1].split()) in "".join(page.split())  # beside published rows columns are wider
 
 
 def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> None:
