@@ -116,6 +116,21 @@ def test_a_stamp_names_the_worlds_and_the_models_of_which_there_are_fewer_seeds(
     )
 
 
+def test_a_stamp_names_models_that_have_fewer_seeds_in_one_world_than_elsewhere() -> None:
+    common = dict(metric="kl", value=1.0, scale="paper", n=100)
+    rows = [
+        dict(common, env=f"tsm/{arm}", model=word, seed=k)
+        for arm, word, n in (
+            ("Reacher-v0", "rtsm", 3), ("Reacher-v0", "lstm", 2), ("Reacher-v0", "onestep", 2),
+            ("ReacherPush-v1", "rtsm", 3), ("ReacherPush-v1", "lstm", 1), ("ReacherPush-v1", "onestep", 1),
+        )
+        for k in range(n)
+    ]  # fmt: skip
+    assert table.stamp(tables_storage.frame(rows).assign(source=table.YOURS), figure=True) == (
+        "scale paper, seeds 0, 1, 2 (LSTM, one-step: 0, 1; LSTM and one-step on ReacherPush: 0), n = 100"
+    )
+
+
 @pytest.mark.parametrize(("models", "said"), [(["tsm"], True), (["tsm", "rtsm"], False), (["onestep"], False)])
 def test_a_stamp_says_where_our_model_has_no_rows_beside_others_with_codes(models: list[str], said: bool) -> None:
     rows = tables_storage.frame(

@@ -247,18 +247,34 @@ def _origin(part: pd.DataFrame) -> str:
 
 def _fewer(part: pd.DataFrame) -> list[str]:
     """Worlds, environments with their noise and delay, that have not all the seeds of some rows, with those that they
-    have; then models that have not all of them in any world that does."""
+    have; then models that have not all of them in any world that does; then models that have fewer in one world than
+    both of these say."""
     known = part[part["seed"].notna()]
     seeds, known = set(known["seed"]), known.assign(noise=known["noise"].fillna(0), delay=known["delay"].fillna(0))
-    worlds = dict(groups(known, ["env", "noise", "delay"]))
-    whole = [own for own in worlds.values() if set(own["seed"]) == seeds]
-    models = groups(pd.concat(whole), "model") if whole else iter(())
-    named = {_world_name(*key): set(own["seed"]) for key, own in worlds.items()}
+    worlds = {_world_name(*key): own for key, own in groups(known, ["env", "noise", "delay"])}
+    of_world = {name: set(own["seed"]) for name, own in worlds.items()}
+    whole = [worlds[name] for name in worlds if of_world[name] == seeds]
+    of_model = _seeds_of_models(pd.concat(whole)) if whole else {}
+    of_both = dict[str, set[int]]()
+    for name, own in worlds.items():
+        here = _seeds_of_models(own)
+        few = {model: here[model] for model in here if here[model] < of_world[name] & of_model.get(model, seeds)}
+        of_both |= {f"{' and '.join(models)} on {name}": few[models[0]] for _, models in _by_value(_listed(few))}
     return [
         f"{', '.join(names)}: {few}"
-        for of in (named, {look(model).name: set(own["seed"]) for model, own in models if model in {**ZOO, **LOOKS}})
-        for few, names in _by_value({name: ", ".join(map(str, sorted(o))) for name, o in of.items() if o != seeds})
+        for of in (of_world, of_model, of_both)
+        for few, names in _by_value(_listed({name: own for name, own in of.items() if own != seeds}))
     ]
+
+
+def _listed(seeds: Mapping[str, set[int]]) -> dict[str, str]:
+    """Seeds in words."""
+    return {name: ", ".join(map(str, sorted(own))) for name, own in seeds.items()}
+
+
+def _seeds_of_models(rows: pd.DataFrame) -> dict[str, set[int]]:
+    """Of models and what is drawn beside them, by the names in figures."""
+    return {look(model).name: set(own["seed"]) for model, own in groups(rows, "model") if model in {**ZOO, **LOOKS}}
 
 
 def _by_value(texts: Mapping[str, str]) -> Iterator[tuple[str, list[str]]]:
