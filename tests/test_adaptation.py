@@ -261,17 +261,22 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
         (title, name, way.model): share.mean() for title, robots in shares.items() if title.endswith("80 steps")
         for name, ways in robots.items() for way, share in ways.items()
     }  # fmt: skip
-    harmed = [mean for (_, name, _), mean in means.items() if name in in_vain]
-    lows = [
-        mean - half for title, robots in shares.items() if title.endswith("80 steps") for name in in_vain
-        for mean, half in map(interval, robots.get(name, {}).values())
+    ends = [
+        (title, way.model, mean - half, mean + half) for title, robots in shares.items() if title.endswith("80 steps")
+        for name in in_vain for way, share in robots[name].items() for mean, half in [interval(share)]
     ]  # fmt: skip
-    assert sum(low > 1 for low in lows) == 3
-    assert min(harmed) > 1
-    assert len(harmed) == 3 * (3 + 2)  # arms; ways of the segment model and of the LSTM
+    assert len(ends) == 3 * (3 + 2 + 2)  # arms; ways of the segment model, of the LSTM and of the ensemble
+    assert [title for title, _, low, _ in ends if low > 1] == ["LSTM, 80 steps"] * 2
+    assert [(title, way) for title, way, _, high in ends if high < 1] == [
+        ("ensemble (squared error), 80 steps", "head")
+    ]
     helped = [mean for (_, name, way), mean in means.items() if way != "codes" and any(w in name for w in of_use)]
-    assert len(helped) == 4 * 2 * 2 + 2  # arms, models, ways; and an ensemble of the reaching arm
+    assert len(helped) == 4 * 3 * 2  # arms, models, ways
     assert max(helped) < 1
+    ours = {(name, way): mean for (title, name, way), mean in means.items() if title == "recurrent TSM, 80 steps"}
+    pushed = [name for name, way in ours if way == "all" and name.startswith("push") and any(w in name for w in of_use)]
+    assert len(pushed) == 3
+    assert all(ours[name, "head"] < ours[name, "all"] for name in pushed)
 
 
 def test_shares_left_are_drawn_with_a_mark_for_the_mean_and_a_dot_for_each_seed() -> None:
@@ -304,12 +309,20 @@ def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
 def test_the_notebook_says_of_plans_on_changed_arms_what_the_published_rows_say() -> None:
     rows = published("10_explore")
     pushed = rows["env"].str.startswith("tsm/ReacherPush-") & (rows["env"] != PUSH)
-    plans = rows[pushed & (rows["planner"] == "cem") & (rows["metric"] == "return_true") & (rows["seed"] == 0)]
-    wide = plans.pivot(index=["env", "model"], columns="configuration", values="value").loc[
-        (slice(None), ["rtsm", "lstm"]), :
-    ]
-    gained = wide["all"] - wide["zero-shot"]
-    assert len(gained) == 6 * 2
-    assert gained.min() >= 0
-    best = gained.idxmax()
-    assert (best[0].split("-")[1], round(gained.max(), 1)) == ("damping2", 2.8)
+    plans = rows[pushed & (rows["planner"] == "cem") & (rows["metric"] == "return_true")]
+    wide = plans.pivot(index=["env", "model", "seed"], columns="configuration", values="value")
+    gained = (wide["all"] - wide["zero-shot"]).groupby(level=["env", "model"])
+    assert gained.count().tolist() == [3] * 6 * 3  # arms and models
+    means = gained.mean().xs("rtsm", level="model")
+    assert [round(float(end), 1) for end in (means.min(), means.max())] == [0.1, 2.5]
+    assert means.idxmax().split("-")[1] == "damping2"
+    found = {key: interval(part) for key, part in gained}
+    off = {key for key, (mean, half) in found.items() if mean - half > 0}
+    changed = {
+        word: {env.split("-")[1] for env, model in off if model == word} for word in ("rtsm", "lstm", "ensemble+mse")
+    }
+    assert changed == {
+        "rtsm": {"damping0.5", "damping2", "links0.12x0.11", "gain0.7"}, "lstm": {"damping2"},
+        "ensemble+mse": {"damping0.5", "gain0.7"},
+    }  # fmt: skip
+    assert min(mean + half for mean, half in found.values()) > 0  # nowhere less

@@ -445,7 +445,7 @@ def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
     assert spec
     assert spec.loader
     spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
-    columns = ["claim", "check", "seeds", "margin"]
+    columns = ["claim", "check", "seeds", "margin", "truth", "why"]
     stored, now = pd.read_csv(pages.POWER), module.checks(1, np.random.default_rng(0))
     again = "checks.csv is of other rows than data/results; run: python benchmarks/verdicts/run.py checks"
     assert stored[columns].equals(now[columns]), again
@@ -457,11 +457,24 @@ def test_the_page_says_what_ten_seeds_would_find_as_the_table_does() -> None:
     said = re.search(r"Of (\d+) checks with .*?would find (\d+) in 95 % of", publish.CLAIMS_PAGE.read_text())
     assert said
     assert [int(number) for number in said.groups()] == [len(stored), sum(stored["power"] >= 0.95)]
-    few = pd.DataFrame({"claim": ["C1", "C2", "C2"], "seeds": 3, "power": [1.0, 0.5, 0.1]})
+    few = pd.DataFrame({"claim": ["C1", "C2", "C2"], "seeds": 3, "power": [1.0, 0.5, 0.1], "why": "beyond"})
     assert "Of 3 checks with 3 training seeds" in (told := pages.power_of_ten_seeds(few))
     assert told.endswith("would find 1 in 95 % of studies or more, were the truth as far beyond the margin as that is "
-                         "from zero; the others would be found in fewer: C2 (10 %, 50 %).")  # fmt: skip
-    assert "the others" not in pages.power_of_ten_seeds(few[:1])
+                         "from zero. The others would be found in fewer: C2 (10 %, 50 %).")  # fmt: skip
+    assert "The others" not in pages.power_of_ten_seeds(few[:1])
+    told = pages.power_of_ten_seeds(few.assign(why=["nearest", "midway", "midway"]))
+    assert "of 1 that cannot be, as near as can be" in told
+    assert "of 2 that are halves of tests of equivalence, midway" in told
+
+
+def test_the_truth_of_a_simulated_check_is_one_that_there_can_be() -> None:
+    stored = pd.read_csv(pages.POWER)
+    shares = stored["check"].str.contains(r"^share\(|success|within_data|recall|coverage|auc\(")
+    assert stored["truth"][shares].between(0, 1).all()
+    assert (stored["truth"][stored["check"].str.contains(r"auc\(.*<=")] == 0.5).all()
+    halves = stored[stored["why"] == "midway"].assign(number=stored["check"].str.rsplit(" ", n=2).str[0])
+    for _, pair in halves.groupby(["claim", "number"]):
+        assert pair["margin"].min() < pair["truth"].iloc[0] == pair["truth"].iloc[1] < pair["margin"].max()
 
 
 def test_a_claim_rests_on_the_fewest_seeds_of_any_check_and_says_which_have_no_rows() -> None:
@@ -476,6 +489,10 @@ def test_a_claim_rests_on_the_fewest_seeds_of_any_check_and_says_which_have_no_r
     assert "All of 3 checks have to hold; 1 of 3 checks have no rows." in report.in_full(part, part)
     lines = [[cell.strip() for cell in line.split("|")[1:4]] for line in report.seeds_table([whole, part]).splitlines()]
     assert lines[2:] == [["1", "1", "X1 (1 of 3 checks)"], ["3", "1", "X1 (1 of 3 checks have no rows)"]]
+    none = evaluate.judge(rule, study())
+    told = report.seeds_told([whole, part, none])
+    assert told == "Training seeds: 1 on 1, 1 on 3, 1 without rows; 1 lacks rows of some checks."
+    assert report.seeds_told([whole]) == "Training seeds: 1 on 1."
 
 
 def test_a_question_of_the_outlook_is_asked_of_our_model_and_has_published_rows() -> None:

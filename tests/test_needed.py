@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 
 from tsmlib import study
 from tsmlib.study import jobs, needed, runs
-from tsmlib.study.runs import resolve
+from tsmlib.study.comparison import published
+from tsmlib.study.results.table import select
+from tsmlib.study.runs import ROOT, resolve
 
 STEMS = [notebook.stem for notebook in runs.notebooks().values()]
 
@@ -72,3 +75,36 @@ def test_every_seed_learns_every_policy_and_those_that_take_long_for_fewer_itera
     assert {way.model for env, way, budget in asked if env == needed.REACH and budget == needed.ON_IMPERFECT} == {"tsm"}
     worlds = needed.robustness(resolve("06_robustness", scale="paper", seed=seed, run_dir=str(tmp_path)))
     assert {world for world, _ in worlds.policies} == {"clean", "noise", "delay"}
+
+
+def test_a_step_takes_about_as_long_as_the_rows_say_and_is_given_that_four_times(tmp_path: Path) -> None:
+    run, rows = resolve("05_control", scale="paper", seed=1, run_dir=str(tmp_path)), published("05_control")
+    spent, stated = [], []
+    for job in study.needs(run):
+        if not isinstance(job, jobs.Plan | jobs.Policy) or (isinstance(job, jobs.Plan) and job.iterations):
+            continue
+        about = {"env": job.env, "model": job.method.model, "search_space": job.method.search_space}
+        if isinstance(job, jobs.Policy):
+            found = select(rows, metric="seconds", **about)
+        else:
+            loop = "closed loop" if job.every else "open loop"
+            found = select(rows, metric="plan_seconds", planner=job.method.planner, execution=loop, **about)
+        if len(found):
+            spent.append(found["value"].max())
+            stated.append(job.seconds(run))
+    assert len(spent) > 40
+    assert all(seconds < 600 + 4 * each for seconds, each in zip(spent, stated, strict=True))
+    assert 0.5 < sum(spent) / sum(stated) < 2
+
+
+def test_the_hours_of_ten_seeds_are_those_of_the_estimates() -> None:
+    hours = sum(
+        {
+            job.name: job.seconds(run) / 3600
+            for run in (resolve(stem, scale="paper", seed=1) for stem in STEMS)
+            for job in study.needs(run)
+        }.values()
+    )
+    said = re.search(r"ten seeds are (\d+) hours of two cores", (ROOT / "docs" / "speed.md").read_text())
+    assert said
+    assert int(said.group(1)) == round(10 * hours / 2)

@@ -15,6 +15,8 @@ from tsmlib.envs.spec import ENV_IDS
 from tsmlib.storage.files import Json
 from tsmlib.study import runs
 from tsmlib.study.jobs import Job, Model, complete
+from tsmlib.study.parallel import cores
+from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import Run, RunError
 
 
@@ -45,6 +47,17 @@ class Write:
         (run.folder("made") / self.name).write_text(f"{os.getpid()} {torch.get_num_threads()}")
 
 
+@dataclass(frozen=True)
+class Keep(Write):
+    """A job that finds its file again."""
+
+    def make(self, run: Run) -> None:
+        run.dir.mkdir(parents=True, exist_ok=True)
+        with open(run.dir / "calls", "a") as file:
+            file.write(self.name)
+        (path := run.dir / f"{self.name}.safetensors").exists() or path.touch()
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return runs.resolve("02_train", scale="paper", run_dir=str(tmp_path))
@@ -60,6 +73,27 @@ def test_everything_is_made_by_other_processes_of_one_thread_each(run: Run) -> N
     made = {path.name: path.read_text().split() for path in run.folder("made").iterdir()}
     assert set(made) == set("abc")
     assert all(pid != str(os.getpid()) and threads == "1" for pid, threads in made.values())
+
+
+def test_no_process_is_started_where_nothing_is_left_to_make(run: Run) -> None:
+    jobs, calls = [Keep("a"), Keep("b")], run.dir / "calls"
+    study.precompute(run, jobs)
+    study.precompute(run, jobs)
+    assert sorted(calls.read_text()) == ["a", "b"]
+    (run.dir / "b.safetensors").unlink()
+    study.precompute(run, jobs)
+    assert sorted(calls.read_text()) == ["a", "a", "b", "b"]
+
+
+def test_the_processes_are_as_many_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TSM_JOBS", raising=False)
+    assert cores() >= 1
+    monkeypatch.setenv("TSM_JOBS", "3")
+    assert cores() == 3
+    for wrong in ("0", "-1", "1.5", "many", "٣", " 2"):
+        monkeypatch.setenv("TSM_JOBS", wrong)
+        with pytest.raises(ParameterError, match=r"TSM_JOBS is '.*', expected a whole number"):
+            cores()
 
 
 def test_an_error_reaches_the_notebook_and_only_what_was_under_way_is_finished(run: Run) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tsmlib.study.claims.ledger import claims
+from tsmlib.study.claims.ledger import claims, questions
 from tsmlib.study.runs import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks" / "settings"))
@@ -185,6 +185,23 @@ def test_what_needs_another_environment_is_refused_before_anything_runs(
     said = ended(monkeypatch, capsys, "peers_pets")
     assert "build/peers/bin/python" in said
     assert "benchmarks/peers/README.md" in said
+
+
+def test_the_page_says_how_other_environments_are_installed_and_what_needs_them(
+    shipped: dict[str, pd.DataFrame],
+) -> None:
+    page = PAGE.read_text()
+    for folder in ("model_free", "peers"):
+        readme = (ROOT / "benchmarks" / folder / "README.md").read_text()
+        steps = re.findall(rf"^(?:python3 -m venv )?build/{folder}(?:/bin/pip .*)?$", readme, re.MULTILINE)
+        assert len(steps) == 3
+        assert " && ".join(steps) in page
+    needing = {name: {name: table} for name, table in shipped.items()}
+    for one in (*claims(), *questions()):
+        needing[one.id] = reproduce.with_sources(reproduce.rows_of_claims([one], shipped), shipped)
+    others = {name for name, rows in needing.items() if "build/" in " ".join(reproduce.commands(rows))}
+    said = page[page.index("Without `build/model_free`") : page.index("without either `all` does")]
+    assert others == {*re.findall(r"`(\w+)`", said), *re.findall(r"\b[CQ]\d+\b", said)}
 
 
 def test_rows_that_came_out_the_same_are_no_difference_and_others_are_told(shipped: dict[str, pd.DataFrame]) -> None:

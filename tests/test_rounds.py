@@ -126,9 +126,21 @@ def test_contacts_beside_the_map_are_of_all_episodes_and_points_of_the_first() -
     figure, n = drawings.places(first, last, n=2)
     assert n == 2
     titles = [ax.get_title(loc="left") or ax.get_title() for ax in figure.axes]
-    found = rounds.of_pushes(first)["contacts_per_episode"]
-    assert titles[2] == f"object: random\n{found:.1f} contacts an\nepisode, of all 5"
+    found = rounds.of_pushes(first)["contact_share"]
+    assert titles[2] == f"object: random\ncontact in {found:.0%}\nof 5 episodes"
     assert len(figure.axes[2].lines[0].get_xdata()) == 2 * (rounds.HORIZON + 1)
+
+
+def test_states_of_random_episodes_of_both_priors_and_of_own_plans_are_drawn_beside_each_other() -> None:
+    random, own = (pendulum.first_episodes(n, seed=n) for n in (3, 2))
+    first, last = (tsmlib.ActionPrior.for_data(random, seed=seed, channels=4) for seed in (0, 1))
+    figure, n = drawings.visited(random, own, first, last, n=4)
+    assert n == 4
+    drawn = [ax.lines[0].get_xydata() for ax in figure.axes]
+    sources = (random, pendulum.walks(first, 4), pendulum.walks(last, 4), own)
+    for points, data in zip(drawn, sources, strict=True):
+        np.testing.assert_array_equal(points, pendulum.plane(data))
+    assert f"2 episodes, highest {pendulum.highest(own):.2f}" in (figure.axes[3].get_title(loc="left") or "")
 
 
 def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -505,6 +517,14 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
         assert own.idxmax().tolist() == [4, 4, 4]
         means = own.mean(axis=1)
         assert means[1] - means[0] > means[5] - means[1]  # most of it comes with the first round
+        if each is shares:
+            assert [f"{means[k]:.0%}" for k in (0, 5)] == ["58%", "82%"]
+    free = table.select(published("model_free"), env=PUSH, metric="return_true", subset="")
+    ends = free[free["env_steps"] == 1_000_000].groupby("model")["value"].mean()
+    before = table.select(returns, configuration=results.PLANNED, iteration=0)
+    assert set(ends.index) == {"ppo", "trpo", "sac"}
+    assert ends.max() < before["value"].mean()
+    assert set(before["env_steps"]) == {20_000}
     mean, half = interval(results.paired(gaps, 5)["round 0"])
     assert mean - half > 0
     ends = {what: interval(values) for what, values in results.paired(alone, 5).items()}
@@ -557,9 +577,22 @@ def test_the_notebook_says_of_torques_what_the_published_rows_say() -> None:
     plans = executed[executed["iteration"] > 0].groupby("seed")["value"].mean()
     assert (plans < last[results.PLANNED]).all()
     assert (last[results.PLANNED] < last[[results.RANDOM, results.NONE]].min(axis=1)).all()
-    assert [round(float(part.mean()), 3) for part in (plans, last[results.PLANNED], last[results.RANDOM])] == [
-        0.070, 0.076, 0.097,
+    first = table.select(rows, subset=results.FIRST_PRIOR)["value"]
+    assert [round(float(part.mean()), 3) for part in (first, plans, last[results.PLANNED], last[results.RANDOM])] == [
+        0.069, 0.070, 0.076, 0.097,
     ]  # fmt: skip
+    sizes = worlds.world(PUSH).sizes["paper"]
+    assert sizes.prior * 6 == sizes.prior + sizes.rounds * sizes.prior  # updates of the first prior and of the last
+
+
+def test_the_notebook_says_of_gaps_and_priors_of_the_pendulum_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PENDULUM, model="rtsm", execution="closed loop")
+    gaps, heights = (
+        table.select(rows, metric=metric).groupby(["configuration", "iteration"])["value"].mean()
+        for metric in ("gap_open_loop", "highest")
+    )
+    assert gaps[results.RANDOM, 4] < gaps[results.PLANNED, 4] < gaps[results.PLANNED, 0]
+    assert heights[results.PLANNED, 0] < heights[results.PLANNED, 4] < heights[results.RANDOM, 4] + 0.01
 
 
 def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_say() -> None:

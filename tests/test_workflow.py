@@ -6,12 +6,16 @@ import asyncio
 import importlib.util
 import json
 import os
+import re
+import subprocess
+import sys
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import nbformat
 import pytest
 import torch
 from reliability import cluster
@@ -39,6 +43,17 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a notebook or a job that is begun all the same is an error, and not hours of work."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("this was not refused")
+
+    for module, name in ((notebooks, "execute"), (workflow, "run_all"), (workflow, "step")):
+        monkeypatch.setattr(module, name, refuse)
+
+
 def table(
     scale: str = "smoke", seeds: tuple[int, ...] = (0, 2), *, device: str = "", **given: str
 ) -> dict[str, workflow.Step]:
@@ -54,13 +69,23 @@ def test_seeds_are_named_by_ranges_and_commas() -> None:
     assert parameters.parse_seeds("5,0, 2-3") == [5, 0, 2, 3]
 
 
+@pytest.mark.usefixtures("idle")
 @pytest.mark.parametrize(
     "text", ["", "3-1", "0,0", "0-2,2", "-1", "1.0", "0-", "a", "0;1", "0-99999", "4294967296", "٣"]
 )
 def test_other_words_for_seeds_are_refused(text: str, place: Path) -> None:
     with pytest.raises(ParameterError, match=r"(--seeds|seed) is .*(expected|once)"):
         parameters.parse_seeds(text)
-    assert not text or main(["run", "all", f"--seeds={text}", "--dry-run"]) == 2
+    assert main(["run", "all", f"--seeds={text}"]) == 2
+    assert not list(place.iterdir())
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize("seed", ["0", "4"])
+def test_seeds_are_named_in_one_way(seed: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["run", "all"], ["step", "train"]):
+        assert main([*command, "--seed", seed, "--seeds", "1-3"]) == 2
+        assert f"--seed {seed} and --seeds 1-3 are both given" in capsys.readouterr().err
     assert not list(place.iterdir())
 
 
@@ -74,6 +99,27 @@ def test_seeds_of_held_out_episodes_and_targets_are_refused(
     assert not list(place.iterdir())
     with pytest.raises(ParameterError, match="draws held-out episodes or targets"):  # without a workflow
         dataset(runs.resolve("01_collect", scale="smoke", seed=seed), "tsm/Reacher-v0", "train")
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize("seed", [401, 999, 1000, 1031])
+def test_seeds_that_train_a_notebook_on_the_starts_of_its_tests_are_refused(
+    seed: int, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for asked in ([f"--seeds=0,{seed}"], [f"--seed={seed}"]):
+        assert main(["run", "your_own", *asked]) == 2
+        assert "expected one below 401 or above 1031" in capsys.readouterr().err
+    assert not list(place.iterdir())
+    for other in (seed, 0, 9, 400, 1032):
+        runs.resolve("09_your_own" if other != seed else "02_train", seed=other)
+
+
+def test_the_seeds_that_are_refused_are_those_of_the_notebook() -> None:
+    source = "\n".join(cell.source for cell in nbformat.read(runs.notebooks()["your_own"].path, 4).cells)
+    episodes = max(int(n) for pair in re.findall(r"(?:smoke|laptop|paper)=\((\d+), (\d+)\)", source) for n in pair)
+    starts = max(int(n) for n in re.findall(r"paper=\((\d+), \(64", source))
+    (first,) = set(re.findall(r"Task\.from_env\([^)]*?seed=(\d+)", source))
+    assert range(int(first) - episodes + 1, int(first) + starts) == runs.TESTED
 
 
 # Steps ---------------------------------------------------------------------------------------------------------------
@@ -120,6 +166,39 @@ def test_a_change_of_a_schedule_reaches_what_was_made_with_it(monkeypatch: pytes
     changed = {name for name, step in table("paper", (0,)).items() if step.settings != before[name].settings}
     arms = ("", "Obstacle", "Push", "-noise0.25", "-delay5", "-noise0.1", "-noise0.25-delay5")
     assert changed == {f"seed0/models/Reacher{arm}/lstm" for arm in arms}
+
+
+def test_a_change_of_a_notebook_reaches_its_step_and_one_of_its_prose_or_outputs_does_not(place: Path) -> None:
+    own = runs.notebooks()["train"]
+
+    def settings(notebook: runs.Notebook) -> dict[str, str]:
+        prepared = workflow.prepare([notebook], [0], scale="paper", device="", given={})
+        return {name: step.settings for name, step in workflow.steps(prepared, {}).items()}
+
+    notebook, copy = nbformat.read(own.path, 4), runs.Notebook(own.name, place / own.path.name)
+    cells = {cell.cell_type: cell for cell in notebook.cells}  # the last of each type
+    cells["markdown"].source += " More."
+    cells["code"].outputs = [nbformat.v4.new_output("stream", text="1")]
+    nbformat.write(notebook, copy.path)
+    before = settings(own)
+    assert settings(copy) == before
+    cells["code"].source += "\n1 + 1"
+    nbformat.write(notebook, copy.path)
+    assert {name for name, stated in settings(copy).items() if stated != before[name]} == {"seed0/02_train"}
+
+
+def test_steps_find_the_folder_of_the_runs_in_the_environment(place: Path) -> None:
+    given = {"run_dir": "elsewhere", "env": "tsm/Reacher-v0"}
+    prepared = workflow.prepare([runs.notebooks()["train"]], [0], scale="smoke", device="", given=given)
+    for step in workflow.steps(prepared, given).values():
+        assert "run_dir" not in step.command
+        assert "env=tsm/Reacher-v0" in step.command
+
+
+def test_a_notebook_that_takes_hours_is_given_them() -> None:
+    minutes = {name: step.minutes for name, step in table("paper", (0,)).items() if step.kind == "notebook"}
+    assert minutes["seed0/10_explore"] > 4 * 155  # CPU minutes of its loops and of what it adapts
+    assert {each for name, each in minutes.items() if name != "seed0/10_explore"} == {130}
 
 
 def test_what_ships_is_there_and_no_step_that_is_to_be_done_again(place: Path) -> None:
@@ -271,6 +350,24 @@ def test_two_versions_of_the_code_are_refused_naming_both_unless_it_is_asked_for
     assert "02_train in" in capsys.readouterr().err
 
 
+def test_a_file_of_another_version_of_the_code_is_refused_too(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = place / "runs" / "smoke" / "seed2" / "data" / "ReacherPush" / "test.safetensors"
+    arrays = {"x": torch.zeros(1)}
+    artifacts.save(path, arrays, kind="trajectories", header={})
+    assert dry("--executor", "pool") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(artifacts, "provenance", lambda: {"code": "0.1.0+ccc"})
+        artifacts.save(path, arrays, kind="trajectories", header={})
+    assert artifacts.code(path) == "0.1.0+ccc"
+    assert dry("--executor", "pool") == 1
+    assert f"{path} was made by tsmlib 0.1.0+ccc" in capsys.readouterr().err
+    assert dry("--executor", "pool", "--any-code") == 0
+    path.write_bytes(b"damaged")  # which the step will say
+    assert artifacts.code(path) == ""
+
+
 def test_a_step_of_another_version_than_its_workflow_is_refused(place: Path) -> None:
     manifest.write_json(place / "runs" / "smoke" / "workflow" / "code.json", {"codes": ["0.1.0+aaa"]})
     (execution, *_) = workflow.prepare(NOTEBOOKS[1:2], [0], scale="smoke", device="", given={})
@@ -325,14 +422,90 @@ def test_without_snakemake_models_of_several_seeds_are_trained_before_the_notebo
         assert artifacts.read_header(execution.run.dir / f"{job}.safetensors")["copies"] == 2
 
 
+# Without Snakemake ---------------------------------------------------------------------------------------------------
+
+TRIED = """import os
+open({tried!r}, 'a').write(f"{stem} {{seed}} {{os.environ['TSM_JOBS']}},")
+assert seed != 0 or os.path.exists({mended!r}), "not yet"
+"""
+
+
+def small(folder: Path, stem: str, *more: str) -> None:
+    """A notebook that lists its executions, and fails with seed 0 until it is mended."""
+    source = TRIED.format(stem=stem, tried=str(folder / "tried"), mended=str(folder / "mended"))
+    notebook = nbformat.v4.new_notebook(metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}})
+    given = 'scale = ""\nseed = 0\nrun_dir = ""\nenv = "tsm/Reacher-v0"\nmodels = "prior"'
+    notebook.cells = [nbformat.v4.new_code_cell(cell) for cell in (given, source, *more)]
+    notebook.cells[0].metadata["tags"] = ["parameters"]
+    (folder / "notebooks").mkdir(exist_ok=True)
+    nbformat.write(notebook, folder / "notebooks" / f"{stem}.ipynb")
+
+
+def test_without_snakemake_a_failure_ends_nothing_else_and_what_is_complete_is_not_executed_again(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    small(place, "00_first")
+    small(place, "08_claims")
+    tried = place / "tried"
+
+    def run(seeds: str, *options: str) -> list[str]:
+        tried.write_text("")
+        options = ("--scale", "smoke", "--seeds", seeds, "--executor", "pool", *options)
+        assert main(["run", "all", *options]) == (0 if (place / "mended").exists() else 1)
+        return tried.read_text().rstrip(",").split(",")
+
+    assert run("0,2", "--jobs", "3") == ["00_first 0 3", "00_first 2 3"]
+    told = capsys.readouterr().err
+    assert "3 of 4 notebooks are not complete; the same command goes on with them:\n" in told
+    assert re.search(r"^  seed0/00_first: 00_first failed: .*AssertionError: not yet", told, re.MULTILINE)
+    for seed in (0, 2):
+        assert f"  seed{seed}/08_claims: not executed, since it needs seed0/00_first\n" in told
+    (place / "mended").touch()
+    assert run("0,2", "--jobs", "1") == ["00_first 0 1", "08_claims 0 1", "08_claims 2 1"]
+    assert "seed2/00_first is complete" in capsys.readouterr().out
+    assert run("0,2") == [""]
+    small(place, "00_first", "1 + 1")
+    assert [word.rpartition(" ")[0] for word in run("2")] == ["00_first 2", "08_claims 2"]
+
+
+def test_without_snakemake_a_notebook_is_executed_again_where_what_it_needs_is_gone(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    small(place, "02_train")
+    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    made = [place / "runs" / "smoke" / file for step in workflow.steps(prepared, {}).values() for file in step.files]
+    assert len(made) == 4
+    for path in made:  # as if the notebook did
+        files.write_bytes(path, b"")
+    for times, gone in ((1, None), (1, made[0]), (2, None)):
+        assert workflow.run_all(prepared, {}, executor="pool") == 0
+        assert (place / "tried").read_text().count("02_train 2") == times
+        if gone:
+            gone.unlink()
+
+
 # Whole workflows -----------------------------------------------------------------------------------------------------
+
+
+@needs_snakemake
+def test_the_folder_of_the_runs_is_handed_on_by_every_executor(place: Path) -> None:
+    (place / "steps.json").write_text("{}")
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(workflow.SNAKEFILE), "--dry-run"]
+    command += ["--directory", str(place), "--config", f"steps={place / 'steps.json'}"]
+    without = {name: value for name, value in os.environ.items() if name != "TSM_RUN_DIR"}
+    for environment, status in ((os.environ, 0), (without, 1)):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert ("TSM_RUN_DIR" in done.stdout + done.stderr) == bool(status)  # declared, so that it is passed on
 
 
 @needs_snakemake
 def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
     found: dict[str, Any] = {}
-    for executor in ("pool", "local"):
-        process = cluster.workflow(place / executor, "--executor", executor)
+    for executor, more in (("pool", ()), ("local", ("--", "--printshellcmds"))):
+        process = cluster.workflow(place / executor, "--executor", executor, *more)
         assert process.wait(600) == 0, (place / executor / "log").read_text()
         found[executor] = cluster.made(place / executor)
     assert found["local"] == found["pool"]
@@ -343,6 +516,7 @@ def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
     steps = json.loads((folder / "steps.json").read_text())
     assert all((folder / step["done"]).exists() for step in steps.values())
     assert cluster.steps_done(place / "local") == len(steps) > cluster.STEPS
+    assert "OMP_NUM_THREADS=1 TSM_JOBS=1 " in (place / "local" / "log").read_text()
     again = cluster.workflow(place / "local", "--executor", "local")
     assert again.wait(600) == 0
     assert "Nothing to be done" in (place / "local" / "log").read_text()

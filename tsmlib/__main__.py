@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     run.add_argument("notebook", nargs="?", default="", help=f"{names}, all, or the path of a copy")
     run.add_argument("-h", "--help", action="store_true", help="show this, and the parameters of NOTEBOOK, and end")
     run.add_argument("--scale", default="", help="smoke, laptop (default) or paper")
-    run.add_argument("--seed", default="0", help="0 .. 2147483647 (default 0)")
+    run.add_argument("--seed", help="0 .. 2147483647 (default 0)")
     run.add_argument("--device", default="", help="where to train, learn, plan and roll out: cpu (default) or cuda")
     run.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[], help="a notebook parameter")
     flow = run.add_argument_group(
@@ -43,11 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     flow.add_argument(
         "--seeds",
-        default="",
         help="such as 0-9 or 0,2,5: a job for each model, policy (on a GPU one for all seeds), score, plan, notebook",
     )
     flow.add_argument("--executor", default="", help="local, slurm or another plugin of Snakemake's; pool: without it")
-    flow.add_argument("--jobs", type=int, default=0, help="at a time (default: one for each core; elsewhere 100)")
+    flow.add_argument(
+        "--jobs", type=int, default=0, help="at a time (default: TSM_JOBS, else one for each core; elsewhere 100)"
+    )
     flow.add_argument("--dry-run", action="store_true", help="list the jobs, and do nothing")
     flow.add_argument("--any-code", action="store_true", help="go on with what another version of tsmlib has made")
     step = commands.add_parser(
@@ -56,8 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     step.add_argument("notebook")
     step.add_argument("--job", default="", help="what the notebook needs, by its name; default: the notebook itself")
     for option in ("--scale", "--seed", "--device"):
-        step.add_argument(option, default="0" if option == "--seed" else "")
-    step.add_argument("--seeds", default="", help="of a model or policy that is made with several as one")
+        step.add_argument(option, default=None if option == "--seed" else "")
+    step.add_argument("--seeds", help="of a model or policy that is made with several as one")
     step.add_argument("-p", dest="given", metavar="NAME=VALUE", action="append", default=[])
     copy = commands.add_parser("notebooks", help="copy the notebooks into a folder")
     copy.add_argument("folder", type=Path)
@@ -159,18 +160,17 @@ def _given(arguments: argparse.Namespace) -> dict[str, str]:
 def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
     chosen, given = _chosen(arguments.notebook), _given(arguments)
     notebooks.require_tools()
-    scale, seed, device = arguments.scale, cast(int, parameters.convert("seed", arguments.seed)), arguments.device
-    if arguments.seeds or arguments.executor or arguments.dry_run or arguments.jobs or arguments.any_code or more:
+    scale, device = arguments.scale, arguments.device
+    options = (arguments.executor, arguments.dry_run, arguments.jobs, arguments.any_code, more)
+    if arguments.seeds is not None or any(options):
         from tsmlib.study import workflow
 
-        if arguments.seeds and arguments.seed != "0":
-            raise parameters.ParameterError("--seed and --seeds are both given; name the seeds once.")
-        seeds = parameters.parse_seeds(arguments.seeds or arguments.seed)
-        prepared = workflow.prepare(chosen, seeds, scale=scale, device=device, given=given)
+        prepared = workflow.prepare(chosen, _seeds(arguments), scale=scale, device=device, given=given)
         return workflow.run_all(
             prepared, given, executor=arguments.executor, jobs=arguments.jobs, dry_run=arguments.dry_run,
             any_code=arguments.any_code, more=more,
         )  # fmt: skip
+    seed = cast(int, parameters.convert("seed", _seed(arguments)))
     executions = [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one in chosen]
     from tsmlib.study.data import require_other_seed  # heavy, and not needed to refuse a parameter
 
@@ -182,16 +182,29 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
     return 0
 
 
+def _seed(arguments: argparse.Namespace) -> str:
+    """One seed, as typed."""
+    return "0" if arguments.seed is None else str(arguments.seed)
+
+
+def _seeds(arguments: argparse.Namespace) -> list[int]:
+    """The seeds of a workflow; ParameterError where none is named, as by a shell variable that is not set."""
+    if arguments.seeds is None:
+        return parameters.parse_seeds(_seed(arguments))
+    if arguments.seed is not None:
+        raise parameters.ParameterError(
+            f"--seed {arguments.seed} and --seeds {arguments.seeds} are both given; name all seeds with --seeds."
+        )
+    return parameters.parse_seeds(arguments.seeds)
+
+
 def _step(arguments: argparse.Namespace) -> int:
     from tsmlib.study import workflow
 
     chosen, given = _chosen(arguments.notebook), _given(arguments)
     if len(chosen) > 1:
         raise parameters.ParameterError("a step is of one notebook; name it in place of all.")
-    if arguments.seeds and arguments.seed != "0":
-        raise parameters.ParameterError("--seed and --seeds are both given; name the seeds once.")
-    seeds = parameters.parse_seeds(arguments.seeds or arguments.seed)
-    prepared = workflow.prepare(chosen, seeds, scale=arguments.scale, device=arguments.device, given=given)
+    prepared = workflow.prepare(chosen, _seeds(arguments), scale=arguments.scale, device=arguments.device, given=given)
     workflow.step(prepared, arguments.job)
     return 0
 

@@ -5,10 +5,12 @@
     python benchmarks/settings/reproduce.py all --list
 
 RECIPES has a command for every row that ships; run are those with the environments, models and seeds of the rows that
-are wanted. Models, scores, plans and policies that are missing in runs/paper/seed<k> are made first, here, one after
-another: hours, or days (docs/claims.md says how many). What is there is used: name an empty TSM_RUN_DIR to make all
-anew. What was made stays, so that a command that was stopped goes on; those of other libraries begin again. --list
-prints the commands, to run some of them, or side by side.
+are wanted. Some need build/model_free and build/peers, which docs/reproducing.md says how to install: where they are
+missing it stops before it begins. Models, scores, plans and policies that are missing in runs/paper/seed<k> are made
+first, here, one after another: hours, or days (docs/claims.md says how many); models that were trained on a GPU are not
+the same bits then. What is there is used: name an empty TSM_RUN_DIR to make all anew. What was made stays, so that a
+command that was stopped goes on; those of other libraries begin again. --list prints the commands, to run some of them,
+or side by side.
 
 The new rows take the place of those in data/results, claims are judged, pages and their figure made anew; then it says
 how far new values lie from those before, which are kept in runs/reproduce until then. ``git checkout data docs figures

@@ -39,7 +39,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable
-from functools import partial
+from functools import partial, reduce
 from itertools import product
 from pathlib import Path
 
@@ -57,6 +57,7 @@ from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.exploration import PENDULUM
 from tsmlib.study.results.table import Row, select
 from tsmlib.study.runs import RESULTS
+from tsmlib.trajectory import Trajectories
 
 KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 LOOP = ("env", "model", "configuration", "seed", "scale")
@@ -69,7 +70,7 @@ WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
 WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
-MAPPED = (exploration.PUSH, "rtsm", exploration.PLANNED, 0, "paper")  # the loop whose episodes are drawn
+MAPPED = ("rtsm", exploration.PLANNED, 0, "paper")  # the loops whose episodes are drawn
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
 
 
@@ -194,6 +195,18 @@ def adapted(
                 else:
                     rows += adaptation.score_rows(run, word, env, way, found, n_test=100)
     return rows
+
+
+def draw(run: runs.Run, env: str, loop: rounds.Loop) -> None:
+    """Where a loop has been, as a figure that ships."""
+    first, *own = [data for data in loop.episodes if data is not None]
+    if env == PENDULUM:
+        assert loop.priors is not None
+        stem, (figure, n) = "10_visited", drawings.visited(first, reduce(Trajectories.joined, own), *loop.priors)
+    else:
+        stem, (figure, n) = "10_places", drawings.places(first, own[-1])
+    media.stamp_run(run, figure, n)
+    figures.save(figure, runs.ROOT / "figures" / stem)
 
 
 def wanted_rounds(options: argparse.ArgumentParser, given: argparse.Namespace) -> list[tuple[str, str, str]]:
@@ -325,10 +338,8 @@ def main() -> None:
         for env, word, data in wanted_rounds(options, given):
             loop = rounds.loop(run, word, env=env, data=data, folder=run.folder("rounds"))
             publish(notebook, [*loop.rows, *loop.seconds], loops=True)
-            if (env, word, data, run.seed, run.scale) == MAPPED:
-                figure, n = drawings.places(loop.episodes[0], loop.episodes[-1])
-                media.stamp_run(run, figure, n)
-                figures.save(figure, runs.ROOT / "figures" / "10_places")
+            if (word, data, run.seed, run.scale) == MAPPED:
+                draw(run, env, loop)
     elif given.part == "adaptation":
         for env in wanted_arms(options, given):
             publish(notebook, adapted(run, given.models, [env], given.ways, given.episodes, given.targets))

@@ -10,8 +10,8 @@ effect: in units of the margin; at 1 the claim is false, and true by any larger 
 an effect of 1, and NOT REPLICATED at an effect of 1 as well, where the truth is just not on the wrong side.
 
 checks.csv: every check of the ledger whose published rows have two seeds or more, and a margin: the deviation of its
-values over seeds, and the share of simulated studies of ten seeds, with that deviation and an effect as far beyond the
-margin as that is from zero, in which it holds.
+values over seeds, and the share of simulated studies of ten seeds in which it holds, if its truth is as ``truth`` says.
+Seeds, and targets where they are the same in every seed, differ there as they do in the rows.
 """
 
 from __future__ import annotations
@@ -34,10 +34,16 @@ from tsmlib.study.zoo import PAPERS
 
 HERE = Path(__file__).resolve().parent
 MARGIN, SEEDS = 1.0, 10
+SHARES = (  # metrics that lie between 0 and 1
+    "cells_visited", "contact_share", "coverage50", "coverage80", "coverage95", "deflection_coverage80", "diverged",
+    "moves_untouched", "penetrates", "recall", "success50", "violations_worst", "within_data",
+)  # fmt: skip
+POSSIBLE = {"auc": (0.5, 1.0)} | dict.fromkeys(SHARES, (0.0, 1.0))
+BEYOND, NEAREST, MIDWAY = "beyond", "nearest", "midway"  # where the truth of a check is taken to be
 
 
 class Deviations(NamedTuple):
-    """Standard deviations of a check's value, in units of the margin; targets: how many, 1 for scores."""
+    """Standard deviations of a check's value, in worlds in units of the margin; targets: how many, 1 for scores."""
 
     seed: float
     target: float
@@ -49,16 +55,19 @@ SCORES = Deviations(0.5, 0.0, 0.0, 1)
 PLANS = Deviations(0.5, 2.5, 2.5, 100)
 
 
+def drawn(effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator) -> np.ndarray:
+    """Values (effects, seeds, targets) of studies."""
+    shape = (len(effects), seeds, how.targets)
+    values = effects[:, None, None] + how.seed * rng.standard_normal((*shape[:2], 1))
+    return values + how.target * rng.standard_normal((shape[0], 1, shape[2])) + how.rest * rng.standard_normal(shape)
+
+
 class World(evaluate.Tables):
     """Rows of a world: a value (seeds, targets) of each rival, and 0 for the paper's model."""
 
     def __init__(self, effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator) -> None:
-        shape = (len(effects), seeds, how.targets)
-        values = effects[:, None, None] + how.seed * rng.standard_normal((*shape[:2], 1))
-        values = (
-            values + how.target * rng.standard_normal((shape[0], 1, shape[2])) + how.rest * rng.standard_normal(shape)
-        )
-        self.values = {f"rival{i}": -each for i, each in enumerate(values)} | {PAPERS: np.zeros(shape[1:])}
+        values = drawn(effects, seeds, how, rng)
+        self.values = {f"rival{i}": -each for i, each in enumerate(values)} | {PAPERS: np.zeros(values.shape[1:])}
 
     def ask(self, term: Term) -> pd.DataFrame:
         return pd.DataFrame(self.values[term.model])
@@ -81,7 +90,7 @@ def worlds(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     """A line for each kind of rows, number of seeds, of checks, and effect."""
     lines = []
     for (kind, how), seeds, n_checks, effect in product(
-        {"scores": SCORES, "plans": PLANS}.items(), (1, 3, 10), (1, 8), (1.0, 2.0)
+        {"scores": SCORES, "plans": PLANS}.items(), (1, 3, 5, 6, 10), (1, 8), (1.0, 2.0)
     ):
         asked, effects = superiority(n_checks, trials=how.targets > 1), np.full(n_checks, effect)
         words = [evaluate.judge(asked, World(effects, seeds, how, rng)).word for _ in range(studies)]
@@ -94,24 +103,51 @@ def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     """A line for each check of the ledger with rows of several seeds and a margin."""
     claims, lines = ledger.claims(PAPERS), []
     rows = evaluate.tables(claims)
-    for name, check in ((claim.id, check) for claim in claims for check in claim.checks[""]):
+    for one, check in ((each, check) for each in claims for check in each.checks[""]):
         if not check.margin or check.op == "==" or not check.number.terms:
             continue
         try:
-            values, _ = evaluate.of_seeds(check, rows.asked(check))
+            values, _ = evaluate.of_seeds(check, asked := rows.asked(check))
         except evaluate.ClaimError:
             continue
         if len(values) < 2:
             continue
-        effect = check.margin + abs(check.margin) * (-1 if check.op[0] == "<" else 1)
-        deviation = float(values.mean(1).std(ddof=1))
-        drawn = effect + deviation * rng.standard_normal((studies, SEEDS, 1))
-        holds = [evaluate.compared(check, random_effects(study), "").state == "holds" for study in drawn]
+        other = [each.margin for each in one.checks[""] if each.number is check.number and each is not check]
+        value, why = truth(check, other)
+        how = deviations(values, crossed=not any(term.curve for term in asked))
+        found = (random_effects(study) for study in drawn(np.full(studies, value), SEEDS, how, rng))
+        holds = [evaluate.compared(check, each, "").state == "holds" for each in found]
         lines.append({
-            "claim": name, "check": check.text, "seeds": len(values), "deviation": f"{deviation:.3g}",
-            "margin": check.margin, "power": f"{np.mean(holds):.3f}", "studies": studies,
+            "claim": one.id, "check": check.text, "seeds": len(values),
+            "deviation": f"{values.mean(1).std(ddof=1):.3g}", "margin": check.margin, "truth": round(value, 6),
+            "why": why, "power": f"{np.mean(holds):.3f}", "studies": studies,
         })  # fmt: skip
     return pd.DataFrame(lines)
+
+
+def truth(check: Check, other: list[float]) -> tuple[float, str]:
+    """What the truth is taken to be, and one of BEYOND, NEAREST and MIDWAY.
+
+    As far beyond the margin as that is from zero; where it cannot be, the nearest that it can. other: the margin on the
+    other side, where a check is half of a test of equivalence: midway between both, since both halves have to hold.
+    """
+    if other:
+        return (check.margin + other[0]) / 2, MIDWAY
+    value = check.margin + abs(check.margin) * (-1 if check.op[0] == "<" else 1)
+    share = check.number.text.startswith("share(")
+    low, high = (0.0, 1.0) if share else POSSIBLE.get(check.number.terms[0].metric, (-np.inf, np.inf))
+    return (value, BEYOND) if low <= value <= high else (low if value < low else high, NEAREST)
+
+
+def deviations(values: np.ndarray, *, crossed: bool) -> Deviations:
+    """Of a check's values (seeds, trials). crossed: the trials are the same in every seed, else their means count."""
+    seeds, trials = values.shape
+    rows, columns = values.mean(1, keepdims=True), values.mean(0, keepdims=True)
+    if trials == 1 or not crossed:
+        return Deviations(float(rows.std(ddof=1)), 0.0, 0.0, 1)
+    rest = ((values - rows - columns + values.mean()) ** 2).sum() / ((seeds - 1) * (trials - 1))
+    of_seeds, of_trials = rows.var(ddof=1) - rest / trials, columns.var(ddof=1) - rest / seeds
+    return Deviations(*(float(max(part, 0.0) ** 0.5) for part in (of_seeds, of_trials, rest)), trials)
 
 
 PARTS = {"checks": checks, "worlds": worlds}

@@ -98,12 +98,12 @@ def rounds(
 
 
 @styled
-def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
+def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None, *, robot: str = "the changed robot") -> Figure:
     """Errors of adapted models against the episodes that they know of the changed robot, on logarithmic axes.
 
     curves: title -> way -> episodes (R,) and errors (k, R), all above 0; yours: as curves, drawn over them as hollow
-    diamonds. A mark for the mean over seeds, a dot for each seed; marks at the same number of episodes stand a little
-    beside each other.
+    diamonds. robot: what the axis of episodes calls it. A mark for the mean over seeds, a dot for each seed; marks at
+    the same number of episodes stand a little beside each other.
     """
     own, look_of = yours or {}, axes.looks(curves, yours or {})
     figure, grid = panels(len(curves), len(curves), 2.1, head=0, sharex=True, sharey=True)
@@ -127,7 +127,7 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None) -> Figure:
             at, found = _checked(f"{title}, {way.label}, yours", *row)
             axes.diamonds(ax, "y", at, found.mean(0), way)
         ax.grid(axis="y", color=GRID, lw=0.6)
-        ax.set(title=title, xlabel="episodes of the changed arm")
+        ax.set(title=title, xlabel=f"episodes of {robot}")
     grid[0].set_ylabel(ylabel)
     dots = [_dots()] * any(len(found) > 1 for found in every)
     handles = [*axes.entries(look_of), *dots, *axes.yours_entry(*own.values())]

@@ -91,6 +91,15 @@ def read_header(path: PathLike) -> dict[str, Json]:
     return _read_checked(Path(path))[1]["header"]
 
 
+def code(path: PathLike) -> str:
+    """The version of the code that wrote an artefact, as it says itself; '' where it says none. Nothing is checked."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:  # the header alone is read
+            return str(json.loads(file.metadata()["tsmlib"])["provenance"]["code"])
+    except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
+
+
 def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Arrays, not yet known to be finite, and everything that the ``tsmlib`` entry says."""
     data, about = _read_checked(path, kind)

@@ -16,10 +16,11 @@ from tsmlib import figures
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation import scoring
 from tsmlib.figures.method import Method
+from tsmlib.models.action_prior import ActionPrior
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.study import pendulum, zoo
 from tsmlib.study import rounds as rounds_study
-from tsmlib.study import zoo
 from tsmlib.study.results import adaptation, exploration, latent, planning, policies, prediction, robustness, table
 from tsmlib.trajectory import Trajectories
 
@@ -204,16 +205,29 @@ def rounds(
         yield Drawing(figures.rounds(panels, ylabels, yours=own, lowest=lowest, levels=levels), stem, rows)
 
 
+def visited(
+    random: Trajectories, own: Trajectories, first: ActionPrior, last: ActionPrior, n: int = 24
+) -> tuple[Figure, int]:
+    """States of pendulums, and episodes in each panel at most: the random episodes that a loop began with, codes of the
+    prior before it and after, and the loop's own episodes."""
+    seen = {
+        "random episodes": random, "codes of the first prior": pendulum.walks(first, n),
+        "codes of the last prior": pendulum.walks(last, n), "own plans": own,
+    }  # fmt: skip
+    planes = {title: pendulum.plane(data) for title, data in seen.items()}
+    notes = {title: f"{len(data)} episodes, highest {pendulum.highest(data):.2f}" for title, data in seen.items()}
+    return figures.visited(planes, ("angle (rad)", "speed (rad/s)"), notes), max(len(data) for data in seen.values())
+
+
 def places(first: Trajectories, last: Trajectories, n: int = 24) -> tuple[Figure, int]:
-    """Where fingertip and object are, in how many episodes of each; and the contacts per episode of all.
+    """Where fingertip and object are, in how many episodes of each; and the share of all that have a contact.
 
     first, last: episodes that a loop of pushes began with, and those of its last round; the first ``n`` are drawn.
     """
     n, seen = min(n, len(first), len(last)), {"random": first, "own plans": last}
-    contacts = {title: rounds_study.of_pushes(each)["contacts_per_episode"] for title, each in seen.items()}
+    touched = {title: rounds_study.of_pushes(each)["contact_share"] for title, each in seen.items()}
     notes = {
-        f"object: {title}": f"{contacts[title]:.1f} contacts an\nepisode, of all {len(each)}"
-        for title, each in seen.items()
+        f"object: {title}": f"contact in {touched[title]:.0%}\nof {len(each)} episodes" for title, each in seen.items()
     }
     drawn = {title: each.take(slice(n)) for title, each in seen.items()}
     return figures.visited(rounds_study.places(drawn), ("x (m)", "y (m)"), notes, equal=True), n
@@ -225,7 +239,7 @@ def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:
     several = [word for word, part in table.groups(rows, "model") if part["env"].nunique() > 1]
     rows = table.select(rows, model=several)
     if shares := adaptation.shares_left(rows, episodes):
-        what = f"share left by {episodes} episodes"
+        what = f"energy score after {episodes} episodes / before"
         yield Drawing(figures.shares_left(shares, what), "10_arms", rows)
 
 
@@ -234,6 +248,5 @@ def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawi
     rows = table.select(found, execution=planning.OPEN, planner="none", env=env)
     curves, yours = table.pair(rows, partial(adaptation.way_curves, steps_ahead=steps_ahead))
     if curves:
-        yield Drawing(
-            figures.adapted(curves, f"energy score, {steps_ahead} steps (data's s.d.)", yours=yours), "10_ways", rows
-        )
+        ylabel, arm = f"energy score, {steps_ahead} steps (data's s.d.)", EnvSpec.parse(env).physics.label
+        yield Drawing(figures.adapted(curves, ylabel, yours=yours, robot=f"the arm, {arm}"), "10_ways", rows)

@@ -146,7 +146,7 @@ class Scores:
         return {"version": prediction.VERSION, "rows": prediction.ROWS, **predictions.score_sizes(run)}
 
     def seconds(self, run: Run) -> float:
-        return run.pick(smoke=1, laptop=20, paper=200)
+        return run.pick(smoke=1, laptop=4, paper=40)
 
     def ships(self, run: Run) -> bool:
         return False
@@ -180,8 +180,9 @@ class Plan:
         return {"version": plans.VERSION, "n": self.n, "candidates": CANDIDATES[run.scale], "iterations": iterations}
 
     def seconds(self, run: Run) -> float:
-        each = 12.0 if self.method.model == "oracle" else 3.0  # for each target
-        return self.n * each * (10 if self.every else 1) * run.pick(smoke=0.01, laptop=0.5, paper=1)
+        each = 5.0 if self.method.model == "oracle" else 1.0  # for each target, as rows of 05_control say
+        longer = self.iterations / plans.usual_iterations(run, self.method) if self.iterations else 1
+        return self.n * each * longer * (3 if self.every else 1) * run.pick(smoke=0.01, laptop=0.5, paper=1)
 
     def ships(self, run: Run) -> bool:
         file = plans.file_name(self.env, self.method, iterations=self.iterations, every=self.every)
@@ -216,7 +217,8 @@ class Policy:
         return {**asdict(policies.complete(run, self.budget)), "episodes": EPISODES[run.scale]}
 
     def seconds(self, run: Run) -> float:
-        return policies.complete(run, self.budget).iterations * run.pick(smoke=0.5, laptop=1.0, paper=1.0)
+        each = 0.4 if self.method.search_space == "latent" else 0.1  # for each update, as rows of 05_control say
+        return policies.complete(run, self.budget).iterations * each * run.pick(smoke=0.5, laptop=1.0, paper=1.0)
 
     def ships(self, run: Run) -> bool:
         return _shipped(run, self.env, policies.file_name(self.method))

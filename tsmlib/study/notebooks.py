@@ -1,6 +1,7 @@
 """Execution of notebooks, and the status of what they made."""
 
 import contextlib
+import hashlib
 import importlib.util
 import json
 import os
@@ -43,6 +44,13 @@ def prepare(
     values = {name: asked[name] for name in parameters.declared(notebook.path) if name in asked}
     run = resolve(notebook.stem, device=device, **values)  # type: ignore[arg-type]  # which it checks
     return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
+
+
+def code_sha256(notebook: Path) -> str:
+    """SHA-256 of a notebook's code cells as they are typed, without prose, outputs and metadata."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    typed = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    return hashlib.sha256(json.dumps(typed).encode()).hexdigest()
 
 
 def codes(run: Run) -> dict[str, str]:
@@ -94,11 +102,12 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
         raise RunError(str(error)) from None
     record = run.dir / f".{run.notebook}.written"
     record.unlink(missing_ok=True)
-    with hold, terminable(), _environment(TSM_DEVICE=run.device, TSM_WRITTEN=str(record)):
+    with hold, terminable(), environment(TSM_DEVICE=run.device, TSM_WRITTEN=str(record)):
         began = time.monotonic()
         status: dict[str, Json] = {
             "pid": os.getpid(), "host": socket.gethostname(), "started": _now(), "parameters": execution.values,
             "scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance(),
+            "notebook": code_sha256(execution.notebook.path),
         }  # fmt: skip
         _note(run, {**status, "state": "running"})
         ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
@@ -113,6 +122,27 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
             _note(run, {**status, **ended, "finished": _now(), "seconds": seconds})
             record.unlink(missing_ok=True)
     return executed
+
+
+def completed(execution: Execution) -> str:
+    """When the execution began that made what the run holds of a notebook; '' where it holds nothing, or that was made
+    by other code, cells or values or on another device, or is not as it was left."""
+    from tsmlib.storage import manifest
+    from tsmlib.storage.provenance import provenance
+
+    run = execution.run
+    entry = manifest.statuses(run.dir).get(run.notebook)
+    sha256 = code_sha256(execution.notebook.path)
+    asked: dict[str, Json] = {"parameters": dict(execution.values), "device": run.device, "notebook": sha256}
+    if not isinstance(entry, dict) or any(entry.get(name) != value for name, value in asked.items()):
+        return ""
+    if entry["provenance"]["code"] != provenance()["code"] or not (run.dir / execution.notebook.path.name).exists():
+        return ""
+    try:
+        require(run, run.notebook)
+    except RunError:
+        return ""
+    return str(entry["started"])
 
 
 def require(run: Run, notebook: str) -> Mapping[str, Json]:
@@ -228,7 +258,7 @@ def _note(run: Run, entry: Mapping[str, Json]) -> None:
 
 
 @contextlib.contextmanager
-def _environment(**values: str) -> Iterator[None]:
+def environment(**values: str) -> Iterator[None]:
     """Processes that start meanwhile, a kernel for one, have ``values`` in their environment."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)

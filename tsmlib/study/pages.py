@@ -74,7 +74,7 @@ def readme_results() -> str:
 
 *`{env}`; means over {" to ".join(map(str, sorted(seeds)))} training seeds ± half the 95 % t interval.
 {episodes:,} test episodes, 90 steps open loop: error over the data's deviation (nRMSE), energy score of 32 samples,
-truths in 80 % intervals of samples, or, without samples, of a fitted Gaussian. {targets} targets, CEM over codes:
+truths in 80 % intervals, of samples or else a fitted Gaussian. {targets} targets, CEM over codes:
 share, 1 by the simulator, 0 for doing nothing; gap, mean size of predicted minus executed return.*
 {readme_loops(env)}"""
 
@@ -114,8 +114,7 @@ def readme_plans(env: str) -> str:
         return ""
     others = ", ".join(f"`{each}`" for each in there)
     return (
-        f"Cost of plans (m) minus that of {others}, ± 95 % over targets (in brackets over targets and seeds): "
-        f"{'; '.join(said)}. "
+        f"Cost of plans (m) minus that of {others}, ± 95 % over targets (over targets and seeds): {'; '.join(said)}. "
     )
 
 
@@ -124,7 +123,8 @@ def readme_loops(env: str) -> str:
     closed = planning_results.plans_of(published("05_control"), env=env, execution=planning_results.CLOSED)
     hits = table.values(table.select(closed, metric="success"))
     loops = ", ".join(f"`{model}` {found.mean():.0%}" for model, found in hits.items())
-    again = f"Planned again every ten steps, it ends within 5 cm by {loops}."
+    seeds = " to ".join(str(n) for n in sorted({len(found) for found in hits.values()}))
+    again = f"Planned again every ten steps ({seeds} training seeds), within 5 cm: {loops}."
     return f"{readme_plans(env)}{again} {readme_scores(env)}".rstrip()
 
 
@@ -159,10 +159,10 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
         f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" + _leaning(verdict)
         for verdict in named
     )
-    theirs = f"{claims_report.counts(papers)}. {claims_report.seeds_told(papers)}"
+    theirs, instead = (f"{claims_report.counts(each)}. {claims_report.seeds_told(each)}" for each in (papers, ours))
     return f"""**What replicated.** With the paper's model, {theirs}
-With `{OURS}` in its place, {claims_report.counts(ours)}.
-Of the {len(carrying)} that carry the paper, with its own model: {given}. So {said}."""
+With `{OURS}` in its place, {instead}
+Of the {len(carrying)} that carry the paper, with its model: {given}. So {said}."""
 
 
 def _clause(statement: str) -> str:
@@ -195,8 +195,8 @@ def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) ->
     by_definition = ", ".join(verdict.claim.id for verdict in papers if verdict.word == DEFINITIONAL)
     return f"""Written by `python -m tsmlib publish --claims` from the rows in `data/results`.
 
-- The paper's model: {claims_report.counts(papers)}.
-- `{OURS}` in its place: {claims_report.counts(ours)}.
+- The paper's model: {claims_report.counts(papers)}. {claims_report.seeds_told(papers)}
+- `{OURS}` in its place: {claims_report.counts(ours)}. {claims_report.seeds_told(ours)}
 - Not counted, since they hold by definition: {by_definition}.
 
 ## How many training seeds each figure and claim rests on
@@ -205,7 +205,13 @@ A claim rests on the least number of training seeds that any of its checks has; 
 
 {claims_report.seeds_table(papers)}
 
-{cost_of_a_seed()} {power_of_ten_seeds(pd.read_csv(POWER))}
+With `{OURS}` in the place of the paper's model:
+
+{claims_report.seeds_table(ours)}
+
+{cost_of_a_seed()} {time_of_a_seed(published("05_control"), published("06_robustness"))}
+
+{power_of_ten_seeds(pd.read_csv(POWER))} {without_margin()}
 
 ## The {headlines} claims that carry the paper
 
@@ -229,11 +235,29 @@ def cost_of_a_seed() -> str:
     for each in runs.notebooks().values():
         run = runs.resolve(each.stem, scale="paper", seed=1)
         hours |= {f"{job.kind} {job.name}": job.seconds(run) / 3600 for job in needed.needs(run)}
-    policies = sum(each for name, each in hours.items() if name.startswith("policy "))
+    spent = pd.Series(hours).groupby(lambda name: name.partition(" ")[0]).sum()
+    parts = ", ".join(f"{spent[kind]:.1f} {told}" for kind, told in (
+        ("model", "for models"), ("scores", "scores"), ("plan", "plans"), ("policy", "policies"),
+    ))  # fmt: skip
     return (
-        f"More seeds are more hours: by the nominal budgets of its steps (`study.needs`), without those of 09 and 10, "
-        f"one seed takes about {sum(hours.values()):.0f} hours of one core at scale paper, {policies:.0f} of them for "
-        "policies."
+        f"More seeds are more hours: by the estimates of its steps (`study.needs`), without those of 09 and 10, one "
+        f"seed takes about {spent.sum():.0f} hours of one core at scale paper: {parts}."
+    )
+
+
+def time_of_a_seed(control: pd.DataFrame, robustness: pd.DataFrame) -> str:
+    """A sentence: how long policies and plans of one seed took, by the rows that were timed."""
+    clean = robustness["noise"].isna() & robustness["delay"].isna()  # the policies of 05_control again
+    learned = table.select(pd.concat([control, robustness[~clean]]), metric="seconds")
+    way = ["env", "noise", "delay", "model", "search_space", "planner", "execution"]
+    curves = learned.groupby([*way, "seed"], dropna=False)["value"].max()  # seconds of a curve are those until then
+    policies = curves.groupby(way, dropna=False).mean()
+    plans_ = table.select(control, metric="plan_seconds").groupby(way, dropna=False)["value"].mean()
+    seeds = learned["seed"].unique()
+    return (
+        f"In the rows that ship {len(policies)} policies took {policies.sum() / 3600:.1f} hours (CPU seconds, "
+        f"seeds {min(seeds)} to {max(seeds)}) and {len(plans_)} plans {plans_.sum() / 3600:.1f} (by the clock, closed "
+        "loops with the plan that they begin with); of scores no seconds are kept."
     )
 
 
@@ -244,13 +268,27 @@ def power_of_ten_seeds(checks: pd.DataFrame) -> str:
         f"{claim} ({', '.join(f'{power:.0%}'.replace('%', ' %') for power in sorted(each['power']))})"
         for claim, each in checks[~found].groupby("claim")
     ]  # fmt: skip
-    others = f"; the others would be found in fewer: {', '.join(weak)}" * bool(weak)
+    nearest, midway = ((checks["why"] == why).sum() for why in ("nearest", "midway"))
+    where = f"; of {nearest} that cannot be, as near as can be (a share or AUC of 1, an AUC of 0.5)" * bool(nearest)
+    where += f"; of {midway} that are halves of tests of equivalence, midway between both margins" * bool(midway)
+    others = f". The others would be found in fewer: {', '.join(weak)}" * bool(weak)
     which = " to ".join(str(count) for count in sorted({seeds[0], seeds[-1]}))
     return (
         f"Of {len(checks)} checks with {which} training seeds and a margin that is not zero "
         f"(`benchmarks/verdicts/checks.csv`), ten seeds that differ as these do would find {found.sum()} in "
-        f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{others}."
+        f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{where}{others}."
     ).replace("95%", "95 %")
+
+
+def without_margin() -> str:
+    """A sentence: how many checks have a margin of zero, so that their power is not known."""
+    own = [check for claim in ledger.claims(PAPERS) if not claim.definition for check in claim.checks[""]]
+    own = [check for check in own if not check.premise]
+    zero = sum(not check.margin and check.op != "==" for check in own)
+    return (
+        f"The power of {zero} others, of {len(own)} checks in all, is not known: their margin is zero, since they ask "
+        "which of two is ahead, and names no difference that would have to be found."
+    )
 
 
 def full_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
@@ -416,11 +454,17 @@ mbrl-lib's PETS plans the pendulum anew after every step and is trained before e
 the pushing arm, like the others here, every ten steps and once a round (`benchmarks/peers`).
 
 {exploration_results.rounds_table(rows)}
-{_steps_of_policies(rows, free, exploration_results.PENDULUM)}{_pushing_rounds(rows, free)}
+{_steps_of_policies(rows, free, exploration_results.PENDULUM)}
+![States of random episodes, of codes of the first prior and of the last, of own plans](../figures/10_visited.png)
+
+States (upright is 0) of a loop of `rtsm`, seed 0, and of codes that its priors draw at random; above, the mean over
+episodes of the greatest height, -1 to 1.
+{_pushing_rounds(rows, free)}
 The id of an arm says what has changed: `gain0.7` has lost 30 % of its torque, of `mass0.5` the object has half its
 mass, of `damping2` the joints have twice their damping, and of `links0.12x0.11` the upper link is 20 % longer. n test
 episodes, open loop after ten observed steps, in units of the standard arm.
-Seeds are of the few episodes and of the updates on them: all begin from one model, as it ships.
+Seeds are of the few episodes and of the updates on them: all begin from one model, as it ships. Rates of fine-tuning
+were chosen, those of training from scratch were not.
 
 ![Energy scores of models of the weak reaching arm against the episodes that they know](../figures/10_ways.png)
 
@@ -494,7 +538,8 @@ same training on the first random episodes alone:
 ![Return, share within 5 cm and open-loop gap of the pushing arm against environment steps](../figures/10_pushing.png)
 
 Steps are on a logarithmic axis. Axes end a little below the lowest of round 0 and of the policies; dotted across is
-what training alone ends with, and what the same search finds through the true simulator, open loop.
+what training alone ends with, and what plans through the true simulator return (oracle): the longer search of study
+05, open loop, in codes of its prior.
 
 {found}
 

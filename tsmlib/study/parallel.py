@@ -3,31 +3,40 @@
 Two threads on one small network may stand in each other's way; two networks on a thread each use both cores.
 """
 
+import json
 import multiprocessing
 import os
+import re
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 
 import torch
 from tqdm.auto import tqdm
 
+from tsmlib.storage import files
+from tsmlib.storage.provenance import provenance
 from tsmlib.study.jobs import Job, complete
+from tsmlib.study.parameters import ParameterError
 from tsmlib.study.runs import Run, RunError
 
 
 def precompute(run: Run, jobs: Iterable[Job], *, progress: str = "jobs") -> None:
-    """Make jobs, and what they need before them, as many at a time as there are cores.
+    """Make jobs, and what they need before them, as many at a time as ``cores`` says.
 
     Of those that could begin, the longest first. At scale paper alone; elsewhere the notebook makes each thing when it
-    comes to it. The first error, or an interrupt, ends it when the jobs under way have ended; what they made is kept.
-    Raises RunError where a worker died.
+    comes to it. No process is started where the last call for the notebook made the same jobs and no file changed since
+    (``_state``). The first error, or an interrupt, ends it when the jobs under way have ended; what they made is kept.
+    Raises RunError where a worker died, ParameterError for a wrong TSM_JOBS.
     """
     wanted = complete(run, jobs)
     workers = min(cores(), len(wanted), 61)  # Windows allows no more
     if run.scale != "paper" or workers < 2:
+        return
+    last = run.dir / ".precomputed" / f"{run.notebook}.json"
+    if last.exists() and last.read_text() == _state(run, wanted):
         return
     waiting = dict(sorted(wanted.items(), key=lambda item: -item[1].seconds(run)))
     under_way: dict[Future[None], str] = {}
@@ -52,6 +61,15 @@ def precompute(run: Run, jobs: Iterable[Job], *, progress: str = "jobs") -> None
                     ) from error
                 del under_way[call]
                 bar.update()
+    files.write_bytes(last, _state(run, wanted).encode())
+
+
+def _state(run: Run, jobs: Mapping[str, Job]) -> str:
+    """All that decides whether jobs are still made: the code, their settings, and when their files were written."""
+    paths = {name: run.dir / f"{name}.safetensors" for name in jobs}
+    written = {name: path.stat().st_mtime_ns if path.exists() else None for name, path in paths.items()}
+    stated = {name: [job.settings(run), written[name]] for name, job in jobs.items()}
+    return json.dumps({"code": provenance()["code"], "jobs": stated}, sort_keys=True)
 
 
 def _make(run: Run, job: Job) -> None:
@@ -77,5 +95,9 @@ def _end_with_parent() -> None:
 
 
 def cores() -> int:
-    """CPU cores that this process may use."""
+    """Processes at a time: TSM_JOBS, else the CPU cores that this process may use."""
+    if text := os.environ.get("TSM_JOBS", ""):
+        if not re.fullmatch("[1-9][0-9]{0,5}", text, re.ASCII):
+            raise ParameterError(f"TSM_JOBS is {text!r:.80}, expected a whole number from 1 to 999999, or nothing.")
+        return int(text)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

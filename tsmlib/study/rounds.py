@@ -6,6 +6,7 @@ on as many random episodes, and on no new ones, trained as often. What differs b
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -183,12 +184,14 @@ def space_of(prior: ActionPrior | None, env: str = PENDULUM) -> SearchSpace:
 class Loop(NamedTuple):
     """What a loop leaves: rows, and the episodes of each round, the random ones first; None: it had no new ones.
 
-    seconds: rows of what each round took, the only ones that another run of the same loop has not again.
+    seconds: rows of what each round took, the only ones that another run of the same loop has not again. priors: before
+    round 1 and after the last; None of a learner without one.
     """
 
     rows: list[Row]
     episodes: list[Trajectories | None]
     seconds: Sequence[Row] = ()
+    priors: tuple[ActionPrior, ActionPrior] | None = None
 
 
 class Learner(NamedTuple):
@@ -245,7 +248,7 @@ def loop(
     zero = _once(own and own / "round-0.json", made_from, lambda: dict(measured(model, prior)))
     if prior and sizes.searches:
         curves[FIRST_PRIOR] = _once(own and own / "prior-0.json", made_from, lambda: search(prior, sizes, seed, env))
-    torques = {FIRST_PRIOR: torques_of(prior)} if prior else {}
+    torques, first = {FIRST_PRIOR: torques_of(prior)} if prior else {}, copy.deepcopy(prior)
     found = explore(
         model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
         options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
@@ -271,7 +274,7 @@ def loop(
         n, steps = min(sizes.starts, SEARCHED), began * HORIZON + int(records[-1]["env_steps"])
         torques[LAST_PRIOR] = torques_of(prior)
         rows += results.prior_rows(run, word, curves, n, torques=torques, env_steps=steps, env=env, data=data)
-    return Loop(rows, episodes, seconds)
+    return Loop(rows, episodes, seconds, (first, prior) if first and prior else None)
 
 
 def _seed(seed: int, k: int) -> int:

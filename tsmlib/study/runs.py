@@ -26,6 +26,7 @@ INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
 ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
 NOTEBOOKS = ROOT / "notebooks"
 RESULTS = ROOT / "data" / "results"  # the published tables
+TESTED = range(401, 1032)  # seeds whose episodes in 09_your_own, up to 600, begin by resets that are for its tests
 
 T = TypeVar("T")
 
@@ -156,6 +157,11 @@ def resolve(
         parameters.require_declared(shell.user_ns.get("In", []), notebook)
         _record_written()
     parameters.check("seed", seed)
+    if notebook == "09_your_own" and seed in TESTED:
+        raise ParameterError(
+            f"seed is {seed}, with which 09_your_own may train on the resets that it is tested from (1000 to 1031); "
+            f"expected one below {TESTED.start} or above {TESTED.stop - 1}."
+        )
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
     device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
     base = home() / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")

@@ -1,7 +1,8 @@
 """A workflow: notebooks of several seeds, and each job that they need, as steps of processes of their own.
 
 With the extra ``cluster`` Snakemake runs the steps, on this machine or through any of its executor plugins; without it
-the notebooks run here one after another, and make ahead what they need (``parallel``). Either way the same files.
+the notebooks that are not complete run here one after another, and make ahead what they need (``parallel``). Either way
+the same files, and one that fails ends nothing but what needs it.
 
 The workflow of a scale has a folder beside its seeds, ``runs/<scale>/workflow``: ``steps.json``, a log and a benchmark
 of each step, markers of those that are done, and the versions of the code that made them.
@@ -26,14 +27,14 @@ from pathlib import Path
 
 import psutil
 
-from tsmlib.storage import files, manifest
+from tsmlib.storage import artifacts, files, manifest
 from tsmlib.storage.files import writer_lock
 from tsmlib.storage.provenance import provenance
 from tsmlib.study import notebooks
 from tsmlib.study.data import require_other_seed
 from tsmlib.study.jobs import Job, SeedsJob, complete
 from tsmlib.study.needed import needs
-from tsmlib.study.notebooks import Execution, terminable
+from tsmlib.study.notebooks import Execution, code_sha256, environment, terminable
 from tsmlib.study.parallel import cores, precompute
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.remote_jobs import ask_again
@@ -46,6 +47,8 @@ MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2
 COPY = 500  # MB more for each further seed of a training of several: its data
 AT_ONCE = 10  # seeds of a group
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
+MINUTES = {"10_explore": 160}  # that a notebook takes at scale paper on one core, where it is more than USUAL_MINUTES
+USUAL_MINUTES = 30
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
 
@@ -53,9 +56,9 @@ CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 class Step:
     """One process: a job, of one seed or of several at once, or a notebook.
 
-    done: its marker. command: of ``python -m tsmlib step``. minutes: until the first try is given up. files: what
-    a job makes, relative to the folder of the scale. ships: whether something that comes with the package is taken in
-    place of that.
+    done: its marker. settings: where they change it is done again; of a notebook, ``code_sha256``. command: of ``python
+    -m tsmlib step``. minutes: until the first try is given up. files: what a job makes, relative to the folder of the
+    scale. ships: whether something that comes with the package is taken in place of that.
     """
 
     kind: str
@@ -70,7 +73,8 @@ class Step:
 
 
 def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str, Step]:
-    """Name -> step, of notebooks and all that they need. given: parameters of the notebooks, as typed.
+    """Name -> step, of notebooks and all that they need. given: parameters of the notebooks, as typed; the folder of
+    the runs is not repeated, since steps find it in TSM_RUN_DIR.
 
     A job that two notebooks need with other settings, plans for more targets for instance, is made for the first; the
     other makes its own when it comes to it, once the first is done. What several seeds make as one
@@ -79,7 +83,7 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
     found: dict[str, Step] = {}
     made_for: dict[str, str] = {}  # step of a job -> step of the notebook that it is made for
     groups = seed_groups(executions)
-    options = [word for name, text in given.items() for word in ("-p", f"{name}={text}")]
+    options = [word for name, text in given.items() if name != "run_dir" for word in ("-p", f"{name}={text}")]
 
     def at(run: Run, *seeds: str) -> list[str]:
         return ["--scale", run.scale, *seeds, "--device", run.device, *options]
@@ -100,12 +104,12 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
             step = _step(run, job.kind, name, before, _settings(run, job), command, job.seconds(run), len(group))
             written = [f"seed{seed}/{job.name}.safetensors" for seed in seeds]
             found[name] = replace(step, files=written, ships=job.ships(run))
-            made_for[name] = f"seed{run.seed}/{run.notebook}"
+            made_for[name] = _name(run)
         return name
 
     for execution in executions:
         run = execution.run
-        notebook, seed = f"seed{run.seed}/{run.notebook}", f"seed{run.seed}"
+        notebook, seed = _name(run), f"seed{run.seed}"
         inputs: dict[str, None] = {}
         for job in (wanted := needs(run)):
             inputs[name := add(execution, job)] = None
@@ -119,7 +123,8 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
             reads = [name for name in found if found[name].kind == "notebook" and not name.endswith(CLAIMS)]
         inputs |= dict.fromkeys(name for name in reads if name in found)
         command = [_word(execution.notebook), *at(run, "--seed", str(run.seed))]
-        found[notebook] = _step(run, "notebook", notebook, list(inputs), "", command, 1800.0)
+        seconds, typed = 60 * MINUTES.get(run.notebook, USUAL_MINUTES), code_sha256(execution.notebook.path)
+        found[notebook] = _step(run, "notebook", notebook, list(inputs), typed, command, seconds)
     return found
 
 
@@ -147,6 +152,11 @@ def seed_groups(executions: Sequence[Execution]) -> dict[tuple[int, str], list[E
 
 def _settings(run: Run, job: Job) -> str:
     return json.dumps(job.settings(run), sort_keys=True)
+
+
+def _name(run: Run) -> str:
+    """Of the step of a notebook."""
+    return f"seed{run.seed}/{run.notebook}"
 
 
 def _word(notebook: Notebook) -> str:
@@ -187,10 +197,10 @@ def run_all(
     """Run notebooks and what they need as a workflow. Returns an exit status.
 
     executor: a plugin of Snakemake's, 'local' (this machine), or 'pool' (this machine without Snakemake); '' is local
-    where Snakemake is installed, else pool. jobs: at a time; 0 is one for each core here, 100 elsewhere. dry_run: list
-    the steps, and do nothing. any_code: go on with what another version of the code made. more: options of Snakemake.
-    Raises ParameterError for a negative number of jobs and for options of Snakemake's without it, RunError where
-    another process holds the workflow, the code changed or something is not installed.
+    where Snakemake is installed, else pool. jobs: at a time; 0 is as many as ``cores`` says here, 100 elsewhere.
+    dry_run: list the steps, and do nothing. any_code: go on with what another version of the code made. more: options
+    of Snakemake. Raises ParameterError for a negative number of jobs and for options of Snakemake's without it,
+    RunError where another process holds the workflow, the code changed or something is not installed.
     """
     executor = executor or ("local" if importlib.util.find_spec("snakemake") else POOL)
     if jobs < 0:
@@ -198,11 +208,12 @@ def run_all(
     if more and executor == POOL:
         raise ParameterError(f"{' '.join(more)!r:.80} are options of Snakemake's, which the pool does without.")
     _require_executor(executor)
+    here = jobs or cores()
     table, folder = steps(executions, given), executions[0].run.dir.parent / "workflow"
     runs = list({execution.run.dir: execution.run for execution in executions}.values())
     os.environ["TSM_RUN_DIR"] = str(folder.parents[1])
     if dry_run:
-        _require_code(folder, runs, any_code=any_code)
+        _require_code(folder, runs, table, any_code=any_code)
         _list(table, folder)
         if executor == POOL:
             return 0
@@ -212,19 +223,57 @@ def run_all(
                 table, where, Path(place) / "steps.json", executor, jobs, ["--dry-run", "--quiet", "rules", *more]
             )
     with _held(folder, [run.seed for run in runs]):
-        codes = _require_code(folder, runs, any_code=any_code)
+        codes = _require_code(folder, runs, table, any_code=any_code)
         manifest.write_json(folder / "code.json", {"codes": codes})
         if executor == POOL:
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
-            _precompute_groups(executions)
-            for execution in executions:
-                print(notebooks.execute(execution))
-            return 0
+            with environment(TSM_JOBS=str(here)):
+                return _run_here(executions, table)
         return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
 
 
+def _run_here(executions: Sequence[Execution], table: Mapping[str, Step]) -> int:
+    """Without Snakemake: the notebooks that are not complete, one after another. Returns an exit status.
+
+    One is executed again, too, where something that it needs is gone, or another whose tables it shows was executed
+    since it began. Where one fails, those that need it are left out.
+    """
+    folder = executions[0].run.dir.parent / "workflow"
+    _precompute_groups([each for each in executions if not notebooks.completed(each)])
+    ended: dict[str, str] = {}  # when, of those that are complete
+    failed: dict[str, str] = {}  # why
+    for execution in executions:
+        run, name = execution.run, _name(execution.run)
+        before = [other for other in table[name].needs if table[other].kind == "notebook"]
+        if lacking := [other for other in before if other in failed]:
+            failed[name] = f"not executed, since it needs {lacking[0]}"
+            continue
+        began = notebooks.completed(execution)
+        there = all(_made(other, table[other], folder) for other in _jobs(table, name))
+        if began and there and all(ended[other] <= began for other in before):
+            print(f"{name} is complete")
+        else:
+            try:
+                print(notebooks.execute(execution))
+            except (RunError, ValueError) as error:  # ValueError: StoreError
+                print(f"error: {error}", file=sys.stderr)
+                failed[name] = str(error).partition("\n")[0]
+                continue
+        ended[name] = str(manifest.statuses(run.dir)[run.notebook]["finished"])
+    if failed:
+        said = [f"{len(failed)} of {len(executions)} notebooks are not complete; the same command goes on with them:"]
+        print(*said, *(f"{name}: {why}" for name, why in failed.items()), sep="\n  ", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _jobs(table: Mapping[str, Step], name: str) -> set[str]:
+    """Steps of all jobs that a step needs, and that these need."""
+    own = {other for other in table[name].needs if table[other].kind != "notebook"}
+    return own.union(*(_jobs(table, other) for other in own))
+
+
 def _precompute_groups(executions: Sequence[Execution]) -> None:
-    """What several seeds make as one, before the notebooks that need it."""
+    """What several seeds make as one, before the notebooks that need it, which meet an error again."""
     groups = seed_groups(executions)
     for (seed, name), group in groups.items():
         runs = [each.run for each in group]
@@ -232,10 +281,13 @@ def _precompute_groups(executions: Sequence[Execution]) -> None:
             continue
         job = complete(runs[0], needs(runs[0]))[name]
         assert isinstance(job, SeedsJob)
-        for run in runs:
-            before = [each for each in job.needs(run) if (run.seed, each.name) not in groups]
-            precompute(run, before, progress=f"before {job.name}, seed {run.seed}")
-        _make_as_one(job, runs)
+        try:
+            for run in runs:
+                before = [each for each in job.needs(run) if (run.seed, each.name) not in groups]
+                precompute(run, before, progress=f"before {job.name}, seed {run.seed}")
+            _make_as_one(job, runs)
+        except Exception as error:  # whatever a training may raise
+            print(f"error: {job.name} of seeds {seed} to {runs[-1].seed}: {error!r}", file=sys.stderr)
 
 
 def step(executions: Sequence[Execution], job: str) -> None:
@@ -306,8 +358,9 @@ def _codes(folder: Path) -> list[str]:
     return [str(code) for code in found] if isinstance(found, list) else []
 
 
-def _require_code(folder: Path, runs: Sequence[Run], *, any_code: bool) -> list[str]:
-    """The versions of the code in a workflow's folder and in its seeds, this one at the end.
+def _require_code(folder: Path, runs: Sequence[Run], table: Mapping[str, Step], *, any_code: bool) -> list[str]:
+    """The versions of the code in a workflow's folder, in the notebooks' statuses and in the files of steps, this one
+    at the end.
 
     RunError naming both where it differs, unless ``any_code``.
     """
@@ -317,6 +370,9 @@ def _require_code(folder: Path, runs: Sequence[Run], *, any_code: bool) -> list[
         for name, code in notebooks.codes(run).items():
             if code not in (now, *accepted):
                 others[code] = f"{name} in {run.dir}"
+    for file in (folder.parent / name for step in table.values() for name in step.files):
+        if file.exists() and (code := artifacts.code(file)) not in ("", now, *accepted):
+            others.setdefault(code, str(file))
     if others and not any_code:
         code, where = next(iter(others.items()))
         raise RunError(
@@ -353,7 +409,7 @@ def _made(name: str, step: Step, folder: Path) -> bool:
     if step.kind == "notebook":
         seed, _, rest = name.partition("/")
         entry = manifest.statuses(folder.parent / seed).get(rest, {})
-        return isinstance(entry, dict) and entry.get("state") == "complete"
+        return isinstance(entry, dict) and (entry.get("state"), entry.get("notebook")) == ("complete", step.settings)
     return step.ships or all((folder.parent / file).exists() for file in step.files)
 
 

@@ -55,6 +55,7 @@ class Place(NamedTuple):
 TSM, LAP = Model(PAPERS), Model(PAPERS, "latent")  # without and with its latent action prior
 ONE_STEP, MULTI_STEP, LSTM = Model("onestep"), Model("multistep"), Model("lstm")
 PETS = Model("pets")  # mbrl-lib's
+ENSEMBLE = Model("ensemble+mse")
 ONE_STEPS, BASELINES = (ONE_STEP, MULTI_STEP), (ONE_STEP, MULTI_STEP, LSTM)
 
 REACHER, OBSTACLE, PUSH = map(Place, ("tsm/Reacher-v0", "tsm/ReacherObstacle-v0", "tsm/ReacherPush-v1"))

@@ -79,10 +79,13 @@ def seeds_table(verdicts: Sequence[Verdict]) -> str:
 
 
 def seeds_told(verdicts: Sequence[Verdict]) -> str:
-    """How many training seeds claims rest on, in a sentence."""
-    seeds = [verdict.seeds for verdict in verdicts if verdict.word != DEFINITIONAL]
-    told = ", ".join(f"{seeds.count(n)} on {n}" for n in sorted(set(seeds)))
-    return f"These claims rest on few training seeds: {told}."
+    """How many training seeds claims rest on, and how many have no rows of some or all checks, in a sentence."""
+    counted = [verdict for verdict in verdicts if verdict.word != DEFINITIONAL]
+    seeds, some = [verdict.seeds for verdict in counted], sum(bool(unmeasured(verdict)) for verdict in counted)
+    told = [f"{seeds.count(n)} on {n}" for n in sorted({*seeds} - {0})]
+    told += [f"{seeds.count(0)} without rows"] * (0 in seeds)
+    lacking = f"; {some} lack{'s' * (some == 1)} rows of some checks" * bool(some)
+    return f"Training seeds: {', '.join(told)}{lacking}."
 
 
 def _resting(verdict: Verdict) -> str:

@@ -30,13 +30,14 @@ DRAWN = {
 TASKS = {PENDULUM: "swing up", PUSH: "push"}
 PLANNED, RANDOM, NONE = "own plans", "random episodes", "no new episodes"
 DATA = (PLANNED, RANDOM, NONE)  # of each round; the last is training alone
-_BOTH = {
-    "return_true": "executed return", "gap_absolute": "size of the first plan's gap",
-    "gap_open_loop": "the first plan's gap open loop", "lost": "unstable episodes",
+_GAPS = {
+    "gap_absolute": "size of the first plan's gap", "gap_open_loop": "the first plan's gap open loop",
+    "lost": "unstable episodes",
 }  # fmt: skip
+_RETURN = "executed return"
 ROUNDS = {
-    PENDULUM: {**_BOTH, "success": "share upright", "highest": "highest by random codes"},
-    PUSH: {**_BOTH, "success": "share within 5 cm", "final_distance": "final distance (m)"},
+    PENDULUM: {"return_true": _RETURN, "success": "share upright", **_GAPS, "highest": "highest by random codes"},
+    PUSH: {"return_true": _RETURN, "success": "share within 5 cm", "final_distance": "final distance (m)", **_GAPS},
 }
 SECONDS = {"cpu_seconds": "CPU s", "wall_seconds": "wall s"}  # of a round, without what is measured after it
 EPISODES = {

@@ -2,7 +2,7 @@
 
     Q1    an iterative procedure, guided by the model's predictions, gathers better data than random actions
     Q2    few-shot learning adapts a dynamics model
-    Q3    a segment model adapts better than another model
+    Q3    a segment model adapts better than other models
     Q4    as Q1, on the arm that pushes
     Q5    a prior that is learned from plans is a better space to plan in
     Q6    a segment model that explores is ahead of PETS, as mbrl-lib runs it
@@ -13,13 +13,15 @@ rounds of seed 0 had been seen, that of Q6 when PETS was known to be ahead on se
 study from the start, but the question was written when the rows of all three seeds were known. Its "same total of
 training" is read both ways: before the first round, where training had not gone on, and the same training alone. Rows
 of Q1 and Q4 to Q7 were made anew, of the same seeds and targets, with candidates judged by an expectation, when those
-judged by the mode were known: by these Q4 and Q7 were open. No margin was changed.
+judged by the mode were known: by these Q4 and Q7 were open. No margin was changed. Q3 asked of the LSTM alone until
+rows of the ensemble were known. Seeds of Q2 and Q3 are draws of the few episodes and of the updates on them: all begin
+from the model that ships.
 """
 # fmt: off
 # isort: off
 
 from tsmlib.study.claims.claim import Claim
-from tsmlib.study.claims.query import LSTM, PETS, TSM, WEAK_MOTORS, PENDULUM, Checks, Query
+from tsmlib.study.claims.query import ENSEMBLE, LSTM, PETS, TSM, WEAK_MOTORS, PENDULUM, Checks, Query
 from tsmlib.study.claims.shown import ADAPTED, PUSHED, ROUNDS
 
 FEW = 2000  # steps: 20 episodes of 100
@@ -44,12 +46,14 @@ def q2(q: Query) -> Checks:
     yield adapted < new
 
 @Claim("Q3", "section 6, last question", ADAPTED,
-       statistic="energy score after 80 steps, fine-tuned on 20 episodes: the segment model minus the LSTM")
+       statistic="energy score after 80 steps, fine-tuned on 20 episodes: the segment model minus LSTM, and ensemble")
 def q3(q: Query) -> Checks:
-    """Does a segment model adapt to a changed arm better than an LSTM?"""
-    ours, theirs = (q.explored("energy_score_noise", model, WEAK_MOTORS, "all", env_steps=FEW, steps_ahead=80)
-                    for model in (TSM, LSTM))
-    yield ours < theirs
+    """Does a segment model adapt to a changed arm better than an LSTM, or than an ensemble of one-step models?"""
+    ours, lstm, ensemble = (
+        q.explored("energy_score_noise", model, WEAK_MOTORS, "all", env_steps=FEW, steps_ahead=80)
+        for model in (TSM, LSTM, ENSEMBLE))
+    yield ours < lstm
+    yield ours < ensemble
 
 @Claim("Q4", "section 6, first question", PUSHED,
        statistic="executed return after five rounds of pushing: own plans minus training alone, minus random episodes")
