@@ -604,7 +604,13 @@ def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_
     assert own.tolist() == [1, 1, 1]
     assert (random.sort_index() < own.sort_index()).all()
     pushed = table.select(rows, env=PUSH, model="lstm", metric="return_true")
-    assert (pushed.groupby("iteration")["value"].mean().diff().iloc[1:] < 0).all()
+    own, alone = (
+        table.select(pushed, configuration=data).pivot(index="iteration", columns="seed", values="value")
+        for data in (results.PLANNED, results.NONE)
+    )
+    assert (own.mean(axis=1).diff().iloc[1:] < 0).all()
+    assert len(alone.columns) > 1
+    assert (alone.loc[5] < alone.loc[0] - (own.loc[0] - own.loc[5]) / 2).all()  # more than half as much
 
 
 def test_rounds_are_drawn_with_their_task_their_units_and_single_seeds() -> None:

@@ -202,7 +202,7 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     )),
     _rounds((PENDULUM, PUSH), (OURS, "lstm", "ensemble+mse"), "own plans"),
     _rounds((PENDULUM, PUSH), (OURS,), "random episodes"),
-    _rounds((PUSH,), (OURS,), "no new episodes"),
+    _rounds((PUSH,), (OURS, "lstm"), "no new episodes"),
     *map(_loop, (PENDULUM, PUSH)),
     _adapted(REACH, "gain0.7", ""),
     _plans(REACH, "gain0.7"),

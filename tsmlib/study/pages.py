@@ -495,7 +495,7 @@ def _exploration_aims(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
     """The part of that page on what was aimed at."""
     found = aims_results.of_exploration(rows, tables_storage.frame([]) if free is None else free)
     return f"""
-What this study aims at; "not measured" has not been run, for want of hours:
+What this study aims at; "not measured" has not been run:
 
 {table.markdown(found)}
 """
