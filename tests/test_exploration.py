@@ -22,6 +22,7 @@ from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.storage import artifacts
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import StoreError
+from tsmlib.training.fit import fixed_windows, validate
 from tsmlib.trajectory import TrajectoryError
 
 ARM, EPISODES, HORIZON = "tsm/Reacher-v0", 3, 20
@@ -107,7 +108,8 @@ def test_a_killed_loop_goes_on_with_the_same_bits(
             return self.call(*given, **named)
 
     where, n = {
-        "episodes": ("mpc", 2), "prior": ("fit", 3), "model": ("fit", 4), "record": ("_trained", 2), "next": ("mpc", 1),
+        "episodes": ("mpc", 2), "prior": ("fine_tune", 3), "model": ("fine_tune", 4),
+        "record": ("_trained", 2), "next": ("mpc", 1),
     }[killed_at]  # fmt: skip
     with monkeypatch.context() as patched:
         patched.setattr(exploration, where, Once(getattr(exploration, where), n))
@@ -166,14 +168,28 @@ def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> N
         explored(*learners(), folder=tmp_path)
 
 
+def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as_it_was() -> None:
+    (model, prior), worse = learners(), replace(options().model, lr=1.0, warmup=0)
+    tsm.fit(model, model.loss, data(), data(), replace(options().model, steps=100, lr=1e-2))
+    before = bits(model)
+    found = explored(model, prior, options=options(rounds=1, model=worse))
+    assert bits(model) == before
+    windows = fixed_windows(found.held_out, worse.past_len, worse.future_len)
+    assert found.records[0]["validation"] == validate(model.loss, windows, 3 + 1)
+    other = learners()[0]
+    other.load_state_dict(model.state_dict())
+    tsm.fit(other, other.loss, found.train, found.held_out, worse, seed=3 + 1)
+    assert validate(other.loss, windows, 3 + 1) > found.records[0]["validation"]  # it was worse indeed
+
+
 def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, seen = exploration.fit, []
+    fine_tune, seen = exploration.fine_tune, []
 
     def watched(part: Any, loss: Any, train: tsm.Trajectories, *given: Any, **named: Any) -> Any:
         seen.append((type(part), len(train)))
-        return fit(part, loss, train, *given, **named)
+        return fine_tune(part, loss, train, *given, **named)
 
-    monkeypatch.setattr(exploration, "fit", watched)
+    monkeypatch.setattr(exploration, "fine_tune", watched)
     explored(*learners(), options=options(rounds=1), augmented=lambda data: data.joined(data))
     n = 6 + EPISODES - 1
     assert seen == [(tsm.ActionPrior, n), (tsm.RecurrentTSM, 2 * n)]

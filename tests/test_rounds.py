@@ -514,11 +514,13 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
         assert ends.keys() == {"round 0", results.NONE, results.RANDOM}
         assert all(mean - half > 0 for mean, half in ends.values())  # shown
         own = table.select(each, configuration=results.PLANNED).pivot(index="iteration", columns="seed", values="value")
-        assert own.idxmax().tolist() == [4, 4, 4]
         means = own.mean(axis=1)
         assert means[1] - means[0] > means[5] - means[1]  # most of it comes with the first round
         if each is shares:
             assert [f"{means[k]:.0%}" for k in (0, 5)] == ["58%", "82%"]
+            assert (own.loc[5] > own.max() - 0.025).all()
+            least = {what: mean - half for what, (mean, half) in ends.items()}
+            assert least[results.NONE] < 0.1 < least["round 0"]  # ten points: open against training alone
     free = table.select(published("model_free"), env=PUSH, metric="return_true", subset="")
     ends = free[free["env_steps"] == 1_000_000].groupby("model")["value"].mean()
     before = table.select(returns, configuration=results.PLANNED, iteration=0)
@@ -526,7 +528,7 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     assert ends.max() < before["value"].mean()
     assert set(before["env_steps"]) == {20_000}
     mean, half = interval(results.paired(gaps, 5)["round 0"])
-    assert mean - half > 0
+    assert 0 < mean < half  # not shown
     ends = {what: interval(values) for what, values in results.paired(alone, 5).items()}
     mean, half = ends["round 0"]
     assert mean + half < 0
@@ -608,9 +610,9 @@ def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_
         table.select(pushed, configuration=data).pivot(index="iteration", columns="seed", values="value")
         for data in (results.PLANNED, results.NONE)
     )
-    assert (own.mean(axis=1).diff().iloc[1:] < 0).all()
-    assert len(alone.columns) > 1
-    assert (alone.loc[5] < alone.loc[0] - (own.loc[0] - own.loc[5]) / 2).all()  # more than half as much
+    assert own.columns.tolist() == alone.columns.tolist() == [0, 1, 2]
+    assert ((own.loc[5] - own.loc[0]).abs() < 1).all()  # where it was; of a round of `rtsm` it is 2 m
+    assert ((alone.loc[5] - alone.loc[0]).abs() < 1).all()
 
 
 def test_rounds_are_drawn_with_their_task_their_units_and_single_seeds() -> None:

@@ -1,7 +1,7 @@
 """Exploration: a model and an action prior that collect the data they learn from (section 6, future work).
 
     repeat: draw tasks; plan again and again through the model and its prior (``mpc``); execute;
-            append the episodes to the data; go on training the model and the prior
+            append the episodes to the data; go on training the model and the prior (``fine_tune``)
 
 What the first data hold is where a model is right; plans lead elsewhere, so that data of plans are worth more than as
 many random ones.
@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from tsmlib.fine_tuning import fine_tune
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics
 from tsmlib.models.features import require_robot
@@ -37,7 +38,7 @@ from tsmlib.rewards import Reward, rewarded
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
-from tsmlib.training.fit import Loss, TrainingOptions, fit, require_past
+from tsmlib.training.fit import Loss, TrainingOptions, fixed_windows, require_past, validate
 from tsmlib.trajectory import Trajectories
 
 
@@ -145,7 +146,8 @@ def explore(
 ) -> Exploration:
     """Rounds of planning, executing and learning, by a ``model`` and a ``prior`` that were trained on ``train``.
 
-    Both go on being trained, in place, on all data so far. prior=None: the actions themselves are searched. tasks(k):
+    Both go on being trained, in place, on all data so far, and keep the weights that they begin a round with where no
+    others do better on the held-out data. prior=None: the actions themselves are searched. tasks(k):
     those of round k = 1, 2, ..., one episode each. Given a ``folder``, a loop that was killed goes on from there with
     the same bits; StoreError for the folder of another loop. ValueError for a model, a prior or tasks of another robot
     than the data's, windows with another past than the model's, and a bonus where the model has no samples;
@@ -267,8 +269,9 @@ def _trained(
     parts.append(("validation", cast(nn.Module, model), model.loss, augmented, options.model))
     for name, part, loss, data, training in parts:
         checkpoint = None if place is None else place.folder / f"{name}.checkpoint"
-        curve = fit(part, loss, data, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
-        record[name] = min(curve.validation)
+        fine_tune(part, loss, data, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
+        windows = fixed_windows(found.held_out, training.past_len, training.future_len)
+        record[name] = validate(loss, windows, seed + k)
     record |= {name: record.get(name, 0.0) + spent for name, spent in _since(began).items()}
     if measure is not None:
         record |= measure(model, prior)
