@@ -605,6 +605,12 @@ def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_
     )
     assert own.tolist() == [1, 1, 1]
     assert (random.sort_index() < own.sort_index()).all()
+    returns = table.select(rows, env=PENDULUM, model="rtsm", metric="return_true", configuration=results.NONE)
+    means = returns.groupby("iteration")["value"].mean()
+    assert means[4] < means[0]
+    swung = table.select(rows, env=PENDULUM, model="ensemble+mse", metric="success", iteration=0)
+    assert sorted(table.select(swung, configuration=results.PLANNED)["value"]) == [0.75, 1, 1]
+    assert set(swung["n"]) == {8}
     pushed = table.select(rows, env=PUSH, model="lstm", metric="return_true")
     own, alone = (
         table.select(pushed, configuration=data).pivot(index="iteration", columns="seed", values="value")
@@ -684,8 +690,11 @@ def test_a_learner_of_which_every_seed_lacks_a_round_is_not_drawn() -> None:
     assert results.round_panels(alone, ["executed return"], PUSH) == {}
 
 
-def test_training_alone_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
-    panel = results.round_panels(pushing_rows(-15.0), ["executed return"], PUSH, alone=True)["executed return"]
+def test_training_alone_of_our_model_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
+    rows = pushing_rows(-15.0)
+    others = table.select(rows, model="rtsm", configuration=results.NONE).assign(model="lstm")
+    rows = pd.concat([rows, others])
+    panel = results.round_panels(rows, ["executed return"], PUSH, alone=True)["executed return"]
     drawn = {(method.model, method.variant): at.tolist() for method, (at, _) in panel.items()}
     alone = ("rtsm", "no new episodes, round 2")
     assert drawn == {("rtsm", results.PLANNED): [20_000, 35_000, 50_000], alone: [20_000],

@@ -132,15 +132,15 @@ def round_panels(
     """Title of ROUNDS -> learner and data -> environment steps (R,) and values (k, R), for ``figures.rounds``.
 
     Seeds are compared round by round: lost episodes leave one with fewer steps, and steps are means over seeds. Without
-    those that take no steps; alone: of these the last round, training alone, at the steps of the first. A seed that
-    lacks a round is left out, and a learner of which no seed is whole.
+    those that take no steps; alone: of these the last round of the study's own model, training alone, at the steps of
+    the first. A seed that lacks a round is left out, and a learner of which no seed is whole.
     """
     found: dict[str, dict[Method, tuple[np.ndarray, np.ndarray]]] = {}
     rounds = table.select(rows, env=env, execution=CLOSED, configuration=[PLANNED, RANDOM, NONE][: 2 + alone])
     for metric, title in ROUNDS[env].items():
         learners = table.groups(table.select(rounds, metric=metric), ["model", "configuration"])
         for (word, data), own in sorted(learners, key=lambda of: (of[0][0], DATA.index(of[0][1]))):
-            if title in titles:
+            if title in titles and (data != NONE or word == zoo.OURS):
                 wide = own.pivot(index="seed", columns="iteration", values="value").dropna()
                 if wide.empty:
                     continue
