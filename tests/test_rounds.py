@@ -617,7 +617,7 @@ def test_the_notebook_says_of_the_pendulum_and_the_lstm_what_the_published_rows_
         for data in (results.PLANNED, results.NONE)
     )
     assert own.columns.tolist() == alone.columns.tolist() == [0, 1, 2]
-    assert ((own.loc[5] - own.loc[0]).abs() < 1).all()  # where it was; of a round of `rtsm` it is 2 m
+    assert ((own.loc[5] - own.loc[0]).abs() < 1).all()  # where it was; `rtsm` gains 2
     assert ((alone.loc[5] - alone.loc[0]).abs() < 1).all()
 
 

@@ -38,12 +38,12 @@ import numpy as np
 import pandas as pd
 
 from tsmlib.storage import files, tables
-from tsmlib.study import adaptation, runs
+from tsmlib.study import adaptation, runs, worlds
 from tsmlib.study.claims import evaluate
 from tsmlib.study.claims.claim import Claim
 from tsmlib.study.claims.ledger import claims, questions
 from tsmlib.study.publish import between
-from tsmlib.study.results import policies
+from tsmlib.study.results import exploration, policies
 from tsmlib.study.results.table import select
 from tsmlib.study.runs import RESULTS, ROOT
 from tsmlib.study.zoo import OURS, PAPERS
@@ -161,6 +161,7 @@ def _free(envs: tuple[str, ...], models: tuple[str, ...], options: str) -> Recip
 
 ARMS = [arm for arm in adaptation.VARIANTS if arm != "standard"]
 TUNED = tuple(adaptation.BUDGETS)  # models that are adapted
+EXPLORING = tuple(worlds.world(PUSH).learners)  # of rounds
 ROBOTS = ("Hopper-v5", "HalfCheetah-v5", PENDULUM)
 METRICS = "{runs}/paper/seed0/metrics"
 RECIPES = (  # in the order in which they are run: policies without a model before those that are compared with them
@@ -200,10 +201,10 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(("09_your_own",), "", ROBOTS, (OURS, "onestep", "lstm", "ensemble+mse"), FLOORS, script=(
         "python -m tsmlib run your_own --scale paper", "python -m tsmlib publish --table your_own",
     )),
-    _rounds((PENDULUM, PUSH), (OURS, "lstm", "ensemble+mse"), "own plans"),
-    *(_rounds((PENDULUM,), (OURS, "lstm", "ensemble+mse"), data) for data in ("random episodes", "no new episodes")),
-    _rounds((PUSH,), (OURS,), "random episodes"),
-    _rounds((PUSH,), (OURS, "lstm"), "no new episodes"),
+    *(_rounds((PENDULUM,), EXPLORING, data) for data in exploration.DATA),
+    _rounds((PUSH,), EXPLORING, exploration.PLANNED),
+    _rounds((PUSH,), EXPLORING[:1], exploration.RANDOM),
+    _rounds((PUSH,), EXPLORING[:2], exploration.NONE),
     *map(_loop, (PENDULUM, PUSH)),
     _adapted(REACH, "gain0.7", ""),
     _plans(REACH, "gain0.7"),

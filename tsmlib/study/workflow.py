@@ -47,7 +47,7 @@ MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2
 COPY = 500  # MB more for each further seed of a training of several: its data
 AT_ONCE = 10  # seeds of a group
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
-MINUTES = {"10_explore": 200}  # that a notebook takes at scale paper on one core, where it is more than USUAL_MINUTES
+MINUTES = {"10_explore": 240}  # that a notebook takes at scale paper on one core, where it is more than USUAL_MINUTES
 USUAL_MINUTES = 30
 CLAIMS = "08_claims"  # reads the tables of all, at scale paper of every seed
 
