@@ -239,7 +239,7 @@ def test_what_plans_gain_by_adapting_is_paired_by_seed_and_of_as_many_targets() 
 
 def test_the_share_left_is_of_the_same_seed_and_of_adapted_models_alone() -> None:
     common = dict(env=WEAK, model="lstm", planner="none", execution="open loop", metric="energy_score_noise",
-                  steps_ahead=10, scale="paper")  # fmt: skip
+                  steps_ahead=10, scale="paper", n=8)  # fmt: skip
     rows = tables.frame(
         common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
         for way, steps, values in (
@@ -282,7 +282,7 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
 
 def test_shares_left_are_drawn_with_a_mark_for_the_mean_and_a_dot_for_each_seed() -> None:
     ((_, robots),) = list(adaptation_results.shares_left(published("10_explore"), 20).items())[:1]
-    (ax,) = figures.shares_left({"LSTM": robots}, "share").axes
+    (ax,) = figures.arms({"LSTM": robots}, "share", ratio=True).axes
     ways = next(iter(robots.values()))
     dots = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."]
     assert [share.tolist() for share in ways.values()] == dots[: len(ways)]
@@ -293,9 +293,29 @@ def test_shares_left_of_three_models_stand_in_two_rows() -> None:
     way = next(
         iter(adaptation_results.shares_left(published("10_explore"), 20)["LSTM, 10 steps"]["reach, torque × 0.7"])
     )
-    figure = figures.shares_left({str(title): {"arm": {way: np.array([0.5, 2.0])}} for title in range(6)}, "share")
+    figure = figures.arms({str(title): {"arm": {way: np.array([0.5, 2.0])}} for title in range(6)}, "share", ratio=True)
     assert {ax.get_subplotspec().get_gridspec().get_geometry() for ax in figure.axes} == {(2, 3)}
     assert [ax.get_xlabel() for ax in figure.axes] == [""] * 3 + ["share"] * 3
+
+
+def test_what_plans_gain_is_minus_zero_shot_of_the_same_seed() -> None:
+    common = dict(env=WEAK, model="lstm", planner="cem", execution="open loop", metric="return_true", n=8)
+    rows = tables.frame(
+        common | dict(configuration=way, env_steps=steps, seed=seed, value=value)
+        for way, steps, values in (
+            ("zero-shot", 0, [-4.0, -6.0]), ("all", 2000, [-3.0, -3.0]), ("all", 500, [9.0, 9.0]),
+            ("scratch", 2000, [-5.0]),
+        )
+        for seed, value in enumerate(values)
+    )  # fmt: skip
+    gains = adaptation_results.gains(rows, 20)["LSTM"]["reach, torque × 0.7"]
+    assert {way.model: gained.tolist() for way, gained in gains.items()} == {"all": [1.0, 3.0], "scratch": [-1.0]}
+    fewer = rows.assign(n=rows["n"].where(rows["configuration"] != "all", 4))  # other targets
+    assert [way.model for way in adaptation_results.gains(fewer, 20)["LSTM"]["reach, torque × 0.7"]] == ["scratch"]
+    (ax,) = figures.arms({"LSTM": {"arm": gains}}, "gained", ratio=False).axes
+    assert next(line.get_xdata() for line in ax.lines) == [0, 0]
+    assert [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "."] == [[1.0, 3.0], [-1.0]]
+    assert ax.get_xscale() == "linear"
 
 
 def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
@@ -310,7 +330,8 @@ def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
 def test_the_notebook_says_of_plans_on_changed_arms_what_the_published_rows_say() -> None:
     rows = published("10_explore")
     pushed = rows["env"].str.startswith("tsm/ReacherPush-") & (rows["env"] != PUSH)
-    plans = rows[pushed & (rows["planner"] == "cem") & (rows["metric"] == "return_true")]
+    of_twenty = (rows["planner"] == "cem") & (rows["metric"] == "return_true") & rows["env_steps"].isin([0, 2000])
+    plans = rows[pushed & of_twenty]
     wide = plans.pivot(index=["env", "model", "seed"], columns="configuration", values="value")
     gained = (wide["all"] - wide["zero-shot"]).groupby(level=["env", "model"])
     assert gained.count().tolist() == [3] * 6 * 3  # arms and models

@@ -400,6 +400,12 @@ def test_a_limit_of_time_ends_an_episode_without_terminating_it(monkeypatch: pyt
     assert found.train.terminated == ()
 
 
+def test_a_measure_by_a_name_that_the_record_has_is_refused() -> None:
+    said = "measure gave 'lost', 'success', which the record of a round has of its own episodes.*'tested_lost'"
+    with pytest.raises(ValueError, match=said):
+        explored(*learners(), measure=lambda model, prior: {"success": 1.0, "lost": 0.0})
+
+
 def test_some_episodes_of_a_round_are_always_trained_on() -> None:
     found = explored(*learners(), options=options(rounds=1, held_out=0.99))
     assert (len(found.train), len(found.held_out)) == (6 + 1, 2 + EPISODES - 1)
@@ -433,7 +439,8 @@ def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned()
     ({"rounds": True}, "rounds is True"), ({"every": 0}, "every is 0; .*at least 1"), ({"iterations": 2.5}, "is 2.5"),
     ({"candidates": 1}, "at least 2"), ({"elites": 5}, "elites is 5, of 4 candidates"), ({"judging": 1.5}, "is 1.5"),
     ({"samples": 1}, "samples is 1; .*at least 2"), ({"samples": 2.5}, "is 2.5"), ({"noise": -1}, "zero or above"),
-    ({"bonus": math.nan}, "zero or above"), ({"held_out": 1.0}, "a share between 0 and 1"),
+    ({"bonus": math.nan}, "bonus is nan; expected a finite number, zero or above"),
+    ({"held_out": 1.0}, "held_out is 1.0; expected a share between 0 and 1"),
     ({"judging": -1}, "judging is -1; .*at least 0"), ({"screened": 2.0}, "from 0 to 1"),
 ])  # fmt: skip
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:

@@ -16,6 +16,7 @@ from scripts import run_script
 import tsmlib
 from tsmlib import figures
 from tsmlib.envs.unstable import SimulationUnstable
+from tsmlib.exploration import Exploration
 from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
@@ -173,6 +174,15 @@ def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does(
         assert torch.equal(found.closed.actions, again.actions)
         assert torch.equal(found.closed.gap, again.gap)
         assert torch.equal(found.first.found.actions[:, :50], again.actions[:, :50])
+
+
+def test_rounds_that_were_measured_by_other_names_have_no_rows() -> None:
+    record = {"round": 1.0, "env_steps": 8.0, "tested_success": 0.5, "success": 0.25}
+    found = Exploration(*[pendulum.first_episodes(3, 0)] * 2, [record], seconds=[{"cpu_seconds": 2.0}])
+    assert rounds.tested_records(found) == [{"round": 1, "env_steps": 8, "success": 0.5, "cpu_seconds": 2}]
+    del record["tested_success"]
+    with pytest.raises(ValueError, match=r"round 1 has round, env_steps, success, and nothing named tested_"):
+        rounds.tested_records(found)
 
 
 @pytest.mark.parametrize("judging", [0, 1, 8])

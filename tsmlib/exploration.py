@@ -98,11 +98,11 @@ class ExplorationOptions:
             raise ValueError(f"elites is {self.elites}, of {self.candidates} candidates; expected no more than these")
         if not 0 < self.rms < math.inf:
             raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
-        if not (0 <= self.noise < math.inf and 0 <= self.bonus < math.inf and 0 < self.held_out < 1):
-            raise ValueError(
-                f"noise {self.noise}, bonus {self.bonus}, held_out {self.held_out}: expected zero or above, and "
-                "a share between 0 and 1"
-            )
+        for name in ("noise", "bonus"):
+            if not 0 <= (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"{name} is {value}; expected a finite number, zero or above")
+        if not 0 < self.held_out < 1:
+            raise ValueError(f"held_out is {self.held_out}; expected a share between 0 and 1")
         if not 0 <= self.screened <= 1:
             raise ValueError(f"screened is {self.screened}; expected a share from 0 to 1")
 
@@ -115,8 +115,8 @@ class Exploration:
     ``success`` and ``final_distance``, means over its episodes; without a bonus ``predicted_return`` and the mean size
     of the ``gap``; ``lost``, episodes in which the simulation became unstable, whereupon the others begin anew
     (``discarded_steps``, what all had executed until then, which ``env_steps`` counts); after training the losses on
-    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave. Of a round that lost all its
-    episodes the means are NaN.
+    held-out data, ``validation`` and ``prior_validation``, and what ``measure`` gave, by names of its own. Of a round
+    that lost all its episodes the means are NaN.
     seconds: of each round, to plan, execute and train, without ``measure``: ``cpu_seconds`` and ``wall_seconds``; of a
     training that was stopped what was spent on it since. Rounds from a folder that has no seconds have none.
     """
@@ -139,7 +139,7 @@ def explore(
     seed: int = 0,
     folder: Path | None = None,  # of its own
     progress: str = "",
-    measure: Measure | None = None,  # of model and prior, after every round
+    measure: Measure | None = None,  # of model and prior, after every round, by names that no record has
     callback: Callback | None = None,  # at every round
     augmented: Callable[[Trajectories], Trajectories] | None = None,  # of what the model is trained on
     episodes: Episodes | None = None,  # in place of plans, to compare with
@@ -274,7 +274,13 @@ def _trained(
         record[name] = validate(loss, windows, seed + k)
     record |= {name: record.get(name, 0.0) + spent for name, spent in _since(began).items()}
     if measure is not None:
-        record |= measure(model, prior)
+        measured = measure(model, prior)
+        if taken := sorted(record.keys() & measured):
+            raise ValueError(
+                f"measure gave {', '.join(map(repr, taken))}, which the record of a round has of its own episodes; "
+                f"return it by another name, such as 'tested_{taken[0]}'"
+            )
+        record |= measured
     if place is not None:
         place.keep_models(model, prior, record)
     return record

@@ -135,14 +135,11 @@ def _adapted(env: str, variant: str, options: str) -> Recipe:
     )  # fmt: skip
 
 
-def _plans(env: str, variant: str) -> Recipe:
+def _plans(env: str, variant: str, episodes: str = "20") -> Recipe:
     """What models adapted to a changed arm plan there."""
-    options = f"--ways {' '.join(adaptation.PLANNING)} --episodes 20 --targets 50"
-    only = {"planner": ("cem",), "execution": ("open loop",), "configuration": adaptation.PLANNING}
-    return Recipe(
-        ("10_explore",), "adaptation", (env,), TUNED, options=options, variant=variant,
-        only=only | {"env_steps": (0, 2000)},
-    )  # fmt: skip
+    options = f"--ways {' '.join(adaptation.WAYS)} --episodes {episodes} --targets 50"
+    only = {"planner": ("cem",), "execution": ("open loop",), "configuration": adaptation.WAYS}
+    return Recipe(("10_explore",), "adaptation", (env,), TUNED, options=options, variant=variant, only=only)
 
 
 def _loop(env: str) -> Recipe:
@@ -209,7 +206,7 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     _adapted(REACH, "gain0.7", ""),
     _plans(REACH, "gain0.7"),
     *(_adapted(PUSH, arm, "--ways zero-shot all head codes scratch") for arm in ARMS),
-    *(_plans(PUSH, arm) for arm in ARMS),
+    *(_plans(PUSH, arm, "5 20 80" if arm == "gain0.7" else "20") for arm in ARMS),
 )  # fmt: skip
 
 

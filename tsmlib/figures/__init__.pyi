@@ -12,8 +12,8 @@ from .diagrams import figure1 as figure1
 from .diagrams import figure2 as figure2
 from .diagrams import figure3 as figure3
 from .exploration import adapted as adapted
+from .exploration import arms as arms
 from .exploration import rounds as rounds
-from .exploration import shares_left as shares_left
 from .exploration import visited as visited
 from .latent import around_touch as around_touch
 from .latent import code_fan as code_fan

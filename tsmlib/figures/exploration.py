@@ -135,27 +135,29 @@ def adapted(curves: Rounds, ylabel: str, yours: Rounds | None = None, *, robot: 
 
 
 @styled
-def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]], xlabel: str) -> Figure:
-    """What is left of an error, as a share of what it was, on a logarithmic axis: a mark for the mean over seeds, a dot
-    for each seed; left of the line at 1 is better than before.
+def arms(changes: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]], xlabel: str, *, ratio: bool) -> Figure:
+    """What a change brings, robot by robot: a mark for the mean over seeds, a dot for each seed.
 
-    shares: title -> name of a robot, a line each -> way -> shares (k,), all above 0.
+    changes: title -> name of a robot, a line each -> way -> values (k,). ratio: they are what is left of a quantity, as
+    a share of what it was, all above 0, on a logarithmic axis with a line at 1; else differences, with a line at 0.
     """
-    names = [*dict.fromkeys(name for robots in shares.values() for name in robots)]
-    look_of = axes.looks(*shares.values())
-    columns = len(shares) if len(shares) <= 4 else -(-len(shares) // 2)  # two rows where one would be too narrow
-    figure, grid = panels(len(shares), columns, 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
+    names = [*dict.fromkeys(name for robots in changes.values() for name in robots)]
+    look_of = axes.looks(*changes.values())
+    columns = len(changes) if len(changes) <= 4 else -(-len(changes) // 2)  # two rows where one would be too narrow
+    figure, grid = panels(len(changes), columns, 0.6 + 0.3 * len(names), head=0, sharex=True, sharey=True)
     every = np.concatenate([
         np.ravel(finite(f"{title}, {name}", values, "k"))
-        for title, robots in shares.items() for name, ways in robots.items() for values in ways.values()
+        for title, robots in changes.items() for name, ways in robots.items() for values in ways.values()
     ])  # fmt: skip
-    low, high = axes.limits(every, every, log=True)
-    for ax, (title, robots) in zip(grid, shares.items(), strict=True):
-        axes.log_axis(ax, low, high, "x")
-        ax.axvline(1, color=DARK, lw=0.8, zorder=1)
+    low, high = axes.limits(every, every, log=ratio)
+    apart = 0.66 / max(3, len(look_of))
+    for ax, (title, robots) in zip(grid, changes.items(), strict=True):
+        if ratio:
+            axes.log_axis(ax, low, high, "x")
+        ax.axvline(1 if ratio else 0, color=DARK, lw=0.8, zorder=1)
         for name, ways in robots.items():
             for way, seeds in ways.items():
-                at = names.index(name) + 0.22 * ([*look_of].index(way) - (len(look_of) - 1) / 2)
+                at = names.index(name) + apart * ([*look_of].index(way) - (len(look_of) - 1) / 2)
                 ax.plot(seeds, np.full(len(seeds), at), ".", color=DARK, ms=2.5, mew=0, zorder=4)
                 ax.plot(seeds.mean(), at, **look_of[way] | {"ls": "", "ms": 5, "mew": 1}, zorder=3)
         ax.set(title=title, xlim=(low, high), ylim=(len(names) - 0.5, -0.5))
@@ -163,7 +165,7 @@ def shares_left(shares: Mapping[str, Mapping[str, Mapping[Method, np.ndarray]]],
         ax.grid(axis="x", color=GRID, lw=0.6)
     for ax in grid[-columns:]:
         ax.set_xlabel(xlabel)
-    return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), _dots()], 4)
+    return axes.finish(figure, [grid], [*axes.entries(look_of, ls=""), _dots()], len(look_of) + 1)
 
 
 def _dots() -> Line2D:

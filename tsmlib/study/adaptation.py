@@ -43,7 +43,6 @@ Way = Literal["zero-shot", "all", "head", "codes", "scratch"]
 WAYS: tuple[Way, ...] = ("zero-shot", "all", "head", "codes", "scratch")
 Reference = Literal["reference"]
 REFERENCE: Reference = results.REFERENCE
-PLANNING: tuple[Way, ...] = ("zero-shot", "all")  # ways whose models plan, too
 PLAN_ITERATIONS = 5  # of the cross-entropy method
 SEEN, AHEAD, SAMPLES = 10, (10, 80), 32  # steps observed before a prediction; predicted; samples of each
 FEATURES_OF = "lstm"  # the shipped model in whose units all models of an arm are scored

@@ -234,13 +234,25 @@ def places(first: Trajectories, last: Trajectories, n: int = 24) -> tuple[Figure
 
 
 def shares_left(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:
-    """What adapting leaves of the zero-shot energy score, arm by arm, by the models that ship rows of several arms."""
-    rows = table.select(table.drawn(found), execution=planning.OPEN, planner="none")
-    several = [word for word, part in table.groups(rows, "model") if part["env"].nunique() > 1]
-    rows = table.select(rows, model=several)
+    """What adapting leaves of the zero-shot energy score, arm by arm."""
+    rows = _of_several_arms(table.select(table.drawn(found), execution=planning.OPEN, planner="none"))
     if shares := adaptation.shares_left(rows, episodes):
         what = f"energy score after {episodes} episodes / before"
-        yield Drawing(figures.shares_left(shares, what), "10_arms", rows)
+        yield Drawing(figures.arms(shares, what, ratio=True), "10_arms", rows)
+
+
+def gains(found: pd.DataFrame, episodes: int = 20) -> Iterator[Drawing]:
+    """What adapting brings to plans, arm by arm."""
+    own = table.select(table.drawn(found), execution=planning.OPEN, planner="cem", configuration=[*adaptation.WAYS])
+    rows = _of_several_arms(own)
+    if gained := adaptation.gains(rows, episodes):
+        what = f"executed return after {episodes} episodes\nminus before (m)"
+        yield Drawing(figures.arms(gained, what, ratio=False), "10_plans", rows)
+
+
+def _of_several_arms(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those of models that have rows of several arms."""
+    return table.select(rows, model=[word for word, own in table.groups(rows, "model") if own["env"].nunique() > 1])
 
 
 def ways(found: pd.DataFrame, env: str, steps_ahead: int = 80) -> Iterator[Drawing]:

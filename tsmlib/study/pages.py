@@ -472,6 +472,10 @@ were chosen, those of training from scratch were not.
 
 Right of the line adapting made a model worse.
 
+![What plans of adapted models return, minus those of the model as it ships, arm by arm](../figures/10_plans.png)
+
+Right of the line plans return more than those of the model as it ships.
+
 {adaptation_results.ways_table(rows)}
 {_recovered(rows)}{_adapted_plans(rows)}
 {exploration_results.sentences(rows)}

@@ -215,3 +215,4 @@ def drawings_of_rows() -> Iterator[Drawing]:
         yield from drawings.rounds(explored, env, titles, free, control)
     yield from drawings.ways(explored, WEAK_MOTORS.env)
     yield from drawings.shares_left(explored)
+    yield from drawings.gains(explored)

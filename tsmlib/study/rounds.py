@@ -7,7 +7,6 @@ on as many random episodes, and on no new ones, trained as often. What differs b
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -19,7 +18,7 @@ import torch
 
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation.data import contact_counts, shares
-from tsmlib.exploration import BY_MODE, Measure, Trainable, explore
+from tsmlib.exploration import BY_MODE, SECONDS, Exploration, Measure, Trainable, explore
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics, members
 from tsmlib.models.recurrent import RecurrentTSM
@@ -42,6 +41,7 @@ from tsmlib.training.fit import fit
 from tsmlib.trajectory import Trajectories
 
 WITHOUT_PRIOR = ("ensemble+mse",)  # as PETS plans
+TESTED = "tested_"  # before the names of what is measured after a round, in its record
 SEARCHED = 25  # starts of the searches in which two priors are compared, at most
 T = TypeVar("T")
 
@@ -153,8 +153,6 @@ def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
     def measured(model: DynamicsModel, prior: ActionPrior | None) -> dict[str, float]:
         stable = planned(task, model, prior, sizes, seed, env)
         found = {"lost": float(stable.lost), "success": 0.0}
-        if task.position is not None:
-            found["final_distance"] = math.nan  # not that of the round's own episodes, which its record has
         if stable.found is not None:
             trial, first = stable.found
             assert trial.success is not None
@@ -173,6 +171,26 @@ def measure(sizes: Sizes, seed: int, env: str = PENDULUM) -> Measure:
         return found
 
     return measured
+
+
+def tested(measured: Measure) -> Measure:
+    """The same by names that no record of ``explore`` has of a round's own episodes."""
+    return lambda model, prior: {f"{TESTED}{name}": value for name, value in measured(model, prior).items()}
+
+
+def tested_records(found: Exploration) -> list[dict[str, float]]:
+    """Of each round its number, its steps, its seconds and what was ``tested``, for ``results.round_rows``. ValueError
+    for rounds that were measured by other names."""
+    records = []
+    for record, seconds in zip(found.records, found.seconds, strict=True):
+        own = {name.removeprefix(TESTED): value for name, value in record.items() if name.startswith(TESTED)}
+        if not own:
+            raise ValueError(
+                f"the record of round {record['round']:.0f} has {', '.join(record)}, and nothing named {TESTED}...; "
+                "pass measure=tested(...) to explore, or delete the folder of a loop of an earlier version"
+            )
+        records.append({"round": record["round"], "env_steps": record["env_steps"], **own, **seconds})
+    return records
 
 
 def space_of(prior: ActionPrior | None, env: str = PENDULUM) -> SearchSpace:
@@ -251,19 +269,19 @@ def loop(
     torques, first = {FIRST_PRIOR: torques_of(prior)} if prior else {}, copy.deepcopy(prior)
     found = explore(
         model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
-        options if prior else replace(options, prior=None), seed=seed if data == PLANNED else 1000 * seed,
-        progress=f"{env} {word}: {data}", measure=measured, augmented=here.augmented,
+        options if prior else replace(options, prior=None),
+        seed=seed if data == PLANNED else 1000 * seed,  # of the planner and of updates; of seed 0 the same for all data
+        progress=f"{env} {word}: {data}", measure=tested(measured), augmented=here.augmented,
         episodes=None if data == PLANNED else new, folder=own and own / slug,
     )  # fmt: skip
-    records: list[Mapping[str, float]] = [{"round": 0, "env_steps": 0, **zero}, *found.records]
+    records = [{"round": 0, "env_steps": 0, **zero}, *tested_records(found)]
     rows_of = partial(
         results.round_rows, run, word, n=sizes.starts, first=began * HORIZON, env=env, data=data,
         space="direct" if prior is None else "latent", samples=sizes.judging if members(model) == 1 else 0,
     )  # fmt: skip
-    rows, seconds = rows_of(records), rows_of([
-        {"round": record["round"], "env_steps": record["env_steps"], **spent}
-        for record, spent in zip(found.records, found.seconds, strict=True)
-    ])  # fmt: skip
+    measured_rows = rows_of(records)
+    rows = [row for row in measured_rows if row["metric"] not in SECONDS]
+    seconds = [row for row in measured_rows if row["metric"] in SECONDS]
     episodes = [train.joined(held_out), *found.episodes]
     if env == PUSH:
         counted = [(k, len(each), of_pushes(each)) for k, each in enumerate(episodes) if each is not None]
@@ -278,7 +296,7 @@ def loop(
 
 
 def _seed(seed: int, k: int) -> int:
-    """Of the tasks, or the random episodes, of round k."""
+    """The seed of the tasks, or of the random episodes, of round k."""
     return 100_000 * (seed + 1) + 1000 * k
 
 

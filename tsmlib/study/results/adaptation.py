@@ -6,7 +6,7 @@ knows, and ``configuration`` is the way (``study.adaptation``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -90,20 +90,40 @@ def way_curves(rows: pd.DataFrame, steps_ahead: int) -> dict[str, dict[Method, t
 
 def shares_left(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
     """Model and steps ahead -> arm -> way -> the share of the zero-shot energy score that is left (k,), paired by seed,
-    for ``figures.shares_left``. What is adapted alone, not what is trained anew."""
-    found: dict[tuple[int, str], dict[str, dict[Method, np.ndarray]]] = {}
-    here = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise")
-    for (word, ahead, env), own in table.groups(here, ["model", "steps_ahead", "env"]):
-        before = table.select(own, configuration="zero-shot").set_index("seed")["value"]
-        ways = {}
-        for way in ("all", "head", "codes"):
-            after = table.select(own, configuration=way, env_steps=100 * episodes).set_index("seed")["value"]
-            if len(share := (after / before).dropna()):
-                ways[Method(way, look=WAYS[way])] = share.to_numpy(float)
-        if ways:
-            spec = EnvSpec.parse(env)
-            found.setdefault((int(ahead), zoo.look(word).name), {})[f"{spec.task}, {spec.physics.label}"] = ways
-    return {f"{word}, {ahead} steps": found[ahead, word] for ahead, word in sorted(found)}
+    for ``figures.arms``. What is adapted alone, not what is trained anew."""
+    here, found = table.select(rows, execution=OPEN, planner="none", metric="energy_score_noise"), {}
+    for (ahead, word), own in sorted(
+        table.groups(here, ["steps_ahead", "model"]), key=lambda of: (of[0][0], zoo.look(of[0][1]).name)
+    ):
+        if arms := _by_arm(own, ("all", "head", "codes"), episodes, np.divide):
+            found[f"{zoo.look(word).name}, {ahead} steps"] = arms
+    return found
+
+
+def gains(rows: pd.DataFrame, episodes: int) -> dict[str, dict[str, dict[Method, np.ndarray]]]:
+    """Model -> arm -> way -> executed return of plans minus zero-shot (k,), paired by seed, for ``figures.arms``."""
+    here, found = table.select(rows, execution=OPEN, planner="cem", metric="return_true"), {}
+    for word, own in sorted(table.groups(here, "model"), key=lambda of: zoo.look(of[0]).name):
+        if arms := _by_arm(own, ("all", "head", "codes", "scratch"), episodes, np.subtract):
+            found[zoo.look(word).name] = arms
+    return found
+
+
+def _by_arm(
+    rows: pd.DataFrame, ways: Sequence[str], episodes: int, change: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> dict[str, dict[Method, np.ndarray]]:
+    """Arm -> way -> ``change`` of a value from that of zero-shot, of the same seed and the same n."""
+    found = {}
+    for env, own in table.groups(rows, "env"):
+        before, spec, changed = table.select(own, configuration="zero-shot"), EnvSpec.parse(env), {}
+        for way in ways:
+            after = table.select(own, configuration=way, env_steps=100 * episodes)
+            both = after.merge(before, on=["seed", "n"], suffixes=("", "_before"))
+            if len(both):
+                changed[Method(way, look=WAYS[way])] = change(*both[["value", "value_before"]].to_numpy(float).T)
+        if changed:
+            found[f"{spec.task}, {spec.physics.label}"] = changed
+    return found
 
 
 @table.sourced
