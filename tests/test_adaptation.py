@@ -20,6 +20,7 @@ from tsmlib.study import adaptation, pages, runs, zoo
 from tsmlib.study.comparison import published
 from tsmlib.study.models import Trained, load_pretrained
 from tsmlib.study.results import adaptation as adaptation_results
+from tsmlib.study.results import table
 from tsmlib.study.results.exploration import PUSH
 from tsmlib.study.runs import ROOT, Run
 
@@ -271,6 +272,9 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
     assert [(title, way) for title, way, _, high in ends if high < 1] == [
         ("ensemble (squared error), 80 steps", "head")
     ]
+    worse = [mean for (_, name, _), mean in means.items() if name in in_vain and mean >= 1]
+    assert len(worse) == 17  # docs/howto/fine_tune.md
+    assert round(float(means["ensemble (squared error), 80 steps", "push, mass × 2", "head"]), 2) == 0.75
     helped = [mean for (_, name, way), mean in means.items() if way != "codes" and any(w in name for w in of_use)]
     assert len(helped) == 4 * 3 * 2  # arms, models, ways
     assert max(helped) < 1
@@ -278,6 +282,12 @@ def test_the_notebook_says_which_arms_are_adapted_to_in_vain_80_steps_ahead() ->
     pushed = [name for name, way in ours if way == "all" and name.startswith("push") and any(w in name for w in of_use)]
     assert len(pushed) == 3
     assert all(ours[name, "head"] < ours[name, "all"] for name in pushed)
+    codes = sorted(ours[name, "codes"] for name in pushed)
+    assert [f"{codes[0]:.0%}", f"{codes[-1]:.0%}"] == ["78%", "100%"]
+    weak = table.select(published("10_explore"), env=WEAK, model="rtsm", planner="none", metric="energy_score_noise",
+                        steps_ahead=80)  # fmt: skip
+    means = adaptation_results.recovered(weak).mean()
+    assert [f"{means[way, 2000]:.0%}" for way in ("all", "codes")] == ["95%", "29%"]
 
 
 def test_shares_left_are_drawn_with_a_mark_for_the_mean_and_a_dot_for_each_seed() -> None:

@@ -546,6 +546,12 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     assert mean + half > 0  # not shown
 
 
+def test_the_notebook_says_of_contacts_what_the_published_rows_say() -> None:
+    rows = table.select(published("10_explore"), env=PUSH, metric="contact_share", configuration=results.PLANNED)
+    assert f"{rows[rows['iteration'] == 0]['value'].mean():.0%}" == "64%"
+    assert rows[rows["iteration"] > 0].groupby("iteration")["value"].mean().min() > 0.85
+
+
 def test_the_notebook_says_of_the_loop_of_mbrl_lib_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), execution="closed loop", metric="return_true", model=["pets", "rtsm"])
     last = {env: own[own["iteration"] == own["iteration"].max()] for env, own in table.groups(rows, "env")}

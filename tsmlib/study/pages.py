@@ -499,7 +499,9 @@ def _exploration_aims(rows: pd.DataFrame, free: pd.DataFrame | None) -> str:
     """The part of that page on what was aimed at."""
     found = aims_results.of_exploration(rows, tables_storage.frame([]) if free is None else free)
     return f"""
-What this study aims at; "not measured" has not been run:
+What this study aims at; "not measured" has not been run. Steps to what PPO, TRPO and SAC return at their end count the
+random episodes, and are all reached by these alone, so that they say nothing of rounds. On the arm that pushes PETS
+returns what no torque does; one setting of it was run, without symmetric copies.
 
 {table.markdown(found)}
 """

@@ -22,7 +22,8 @@ from tsmlib.study.results.planning import BASELINES, CLOSED, ORACLE, PUSH, REACH
 from tsmlib.study.zoo import OURS
 
 OBSTACLE = "tsm/ReacherObstacle-v0"
-WEAK, FEW = "tsm/Reacher-gain0.7-v0", 2000  # steps: 20 episodes
+WEAK, WEAK_PUSH = "tsm/Reacher-gain0.7-v0", "tsm/ReacherPush-gain0.7-v1"
+FEW = 2000  # steps: 20 episodes
 ENERGY = "energy_score_noise"
 Line = tuple[str, str, float, float, str]  # of table.thresholds
 
@@ -236,22 +237,24 @@ def _iterations(rows: pd.DataFrame) -> float:
 
 
 def _of_adaptation(rows: pd.DataFrame) -> list[Line]:
-    here = table.select(rows, env=WEAK, execution=planning.OPEN, planner="none", metric=ENERGY)
-    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
-    shares = dict[str, pd.Series]()
-    for word, own in table.groups(here, "model"):
-        found = adaptation.recovered(own)
-        if ("all", FEW) in found:
-            shares[word] = 100 * found["all", FEW]
+    reaching, pushing = _recovered(rows, WEAK), _recovered(rows, WEAK_PUSH)
     none = pd.Series(dtype=float)
-    ours = shares.pop(OURS, none)
+    ours = reaching.pop(OURS, none)
     return [
-        (f"percent of its loss on a weak arm, against a model trained on 500 of its episodes, that `{OURS}` recovers "
-         "from 20, all weights", "at least", 70.0,
-         float(ours.mean()), "{:.1f}"),
-        *((f"percent that `{OURS}` recovers minus that of `{word}` (points), lower end", "at least", 0.0,
-           _lower(ours - shares.get(word, none)), "{:.1f}") for word in ("lstm", "ensemble+mse")),
+        *((f"percent of its loss on {arm} with weak motors, against a model trained on {n} of its episodes, that "
+           f"`{OURS}` recovers from 20, all weights", "at least", 70.0, float(found.mean()), "{:.1f}")
+          for arm, n, found in (("a reaching arm", 500, ours), ("a pushing arm", "5,000", pushing.get(OURS, none)))),
+        *((f"percent that `{OURS}` recovers on the reaching arm minus that of `{word}` (points), lower end", "at least",
+           0.0, _lower(ours - reaching.get(word, none)), "{:.1f}") for word in ("lstm", "ensemble+mse")),
     ]  # fmt: skip
+
+
+def _recovered(rows: pd.DataFrame, env: str) -> dict[str, pd.Series]:
+    """Model -> percent of its loss on an arm that all weights recover from FEW steps, by seed."""
+    here = table.select(rows, env=env, execution=planning.OPEN, planner="none", metric=ENERGY)
+    here = here[here["steps_ahead"] == here["steps_ahead"].max()]
+    shares = {word: adaptation.recovered(own) for word, own in table.groups(here, "model")}
+    return {word: 100 * found["all", FEW] for word, found in shares.items() if ("all", FEW) in found}
 
 
 def _lower(values: pd.Series) -> float:
