@@ -127,11 +127,11 @@ def _rounds(envs: tuple[str, ...], models: tuple[str, ...], data: str) -> Recipe
     return Recipe(("10_explore",), "rounds", envs, models, options=f"--data '{data}'", only=only)
 
 
-def _adapted(env: str, variant: str, options: str) -> Recipe:
-    """Models adapted to a changed arm."""
+def _adapted(env: str, variant: str, ways: tuple[str, ...], models: tuple[str, ...]) -> Recipe:
+    """Models adapted to a changed arm, or trained in full on it."""
     return Recipe(
-        ("10_explore",), "adaptation", (env,), TUNED, options=f"{options} --episodes 5 20 80", variant=variant,
-        only={"planner": ("none",)},
+        ("10_explore",), "adaptation", (env,), models, options=f"--ways {' '.join(ways)} --episodes 5 20 80",
+        variant=variant, only={"planner": ("none",), "configuration": ways},
     )  # fmt: skip
 
 
@@ -203,9 +203,10 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     _rounds((PUSH,), EXPLORING[:1], exploration.RANDOM),
     _rounds((PUSH,), EXPLORING[:2], exploration.NONE),
     *map(_loop, (PENDULUM, PUSH)),
-    _adapted(REACH, "gain0.7", ""),
+    _adapted(REACH, "gain0.7", (*adaptation.WAYS, adaptation.REFERENCE), TUNED),
     _plans(REACH, "gain0.7"),
-    *(_adapted(PUSH, arm, "--ways zero-shot all head codes scratch") for arm in ARMS),
+    *(_adapted(PUSH, arm, adaptation.WAYS, TUNED) for arm in ARMS),
+    _adapted(PUSH, "gain0.7", (adaptation.REFERENCE,), (OURS,)),
     *(_plans(PUSH, arm, "5 20 80" if arm == "gain0.7" else "20") for arm in ARMS),
 )  # fmt: skip
 
