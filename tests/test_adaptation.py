@@ -360,3 +360,17 @@ def test_the_notebook_says_of_plans_on_changed_arms_what_the_published_rows_say(
         "ensemble+mse": {"damping0.5", "gain0.7"},
     }  # fmt: skip
     assert min(mean + half for mean, half in found.values()) > 0  # nowhere less
+    ways = adaptation_results.gains(rows, 20)
+    ours = [{way.model: gained for way, gained in arm.items()} for name, arm in ways["recurrent TSM"].items()
+            if name.startswith("push")]  # fmt: skip
+    assert len(ours) == 6
+    for arm in ours:
+        for difference in (arm["head"] - arm["all"], arm["codes"]):
+            mean, half = interval(difference)
+            assert abs(mean) < half  # not shown
+    anew = [
+        gained.mean() for arms in ways.values() for name, arm in arms.items() if name.startswith("push")
+        for way, gained in arm.items() if way.model == "scratch"
+    ]  # fmt: skip
+    assert len(anew) == 6 * 3
+    assert [round(float(end), 1) for end in (min(anew), max(anew))] == [-5.9, -2.2]
