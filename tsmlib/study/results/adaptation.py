@@ -218,10 +218,13 @@ def sentences(rows: pd.DataFrame) -> Iterator[str]:
                 f"`{env}`, `{word}`: of the zero-shot energy score at {ahead} steps is left, with n episodes, by "
                 f"{_by_way(shares)}."
             )
-            lost = zero - next((value for (way, _), value in left.items() if way == REFERENCE), zero)
-            if lost > 0:
-                shares = {key: (zero - value) / lost for key, value in left.items() if key[0] != REFERENCE}
-                yield f"`{env}`, `{word}`: of what training in full takes off it is taken off by {_by_way(shares)}."
+            if len(found := recovered(own)):
+                means = found.mean().dropna()
+                shares = {(str(key[0]), int(key[1])): float(mean) for key, mean in zip(means.index, means, strict=True)}
+                yield (
+                    f"`{env}`, `{word}`: of what training in full takes off it is taken off by {_by_way(shares)} "
+                    f"(paired, seeds: {len(found)})."
+                )
 
 
 def _by_way(shares: Mapping[tuple[str, int], float]) -> str:
