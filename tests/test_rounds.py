@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from tsmlib.exploration import Exploration
 from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
-from tsmlib.study import drawings, pendulum, rounds, runs, worlds
+from tsmlib.study import adaptation, drawings, pendulum, rounds, runs, worlds
 from tsmlib.study.comparison import published
 from tsmlib.study.results import adaptation as adaptation_results
 from tsmlib.study.results import exploration as results
@@ -353,6 +354,29 @@ def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_
         run_script(script, "rtsm", "--updates", str(updates), "--out", str(place))
     assert pd.read_csv(place)["updates"].tolist() == [4, 2]
     assert all(seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen)
+
+
+def test_rates_of_rounds_are_chosen_on_episodes_that_no_training_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script, place, judged = ROOT / "benchmarks" / "exploration" / "rates.py", tmp_path / "rates.csv", []
+    here = worlds.world(PUSH)
+    monkeypatch.setitem(worlds.WORLDS, PUSH, replace(here, sizes={"paper": here.sizes["smoke"]}))
+
+    def scored(model: tsmlib.DynamicsModel, env: str, data: tuple[tsmlib.Trajectories, tsmlib.Trajectories]) -> Any:
+        judged.append(data[0].states[:, 0])
+        return SimpleNamespace(against_horizon=lambda: {"energy_score_noise": np.ones(80)})
+
+    monkeypatch.setattr(adaptation, "scored", scored)
+    for _ in range(2):  # the second time without any work
+        run_script(script, "--models", "ensemble+mse", "--out", str(place))
+    found = pd.read_csv(place)
+    assert found["rate"].tolist() == [0.0] * 3 + [0.01] * 3 + [0.02] * 3
+    assert found["stage"].tolist() == ["before the first round", results.NONE, results.RANDOM] * 3
+    assert np.isfinite(found["loss"]).all()
+    assert len(judged) == 9
+    seen = np.concatenate([here.first(200, 10).states[:, 0], here.random(150, 1_101_000).states[:, 0]])
+    assert not (judged[0][:, None] == seen).all(-1).any()
 
 
 @pytest.mark.parametrize(("given", "said"), [

@@ -52,7 +52,7 @@ def measured(word: str, rate: float) -> Iterator[dict[str, object]]:
         model, _, train, held_out = rounds.learner(word, sizes, SEED, PUSH)
     yield {"stage": BEFORE, **judged(model)}
     new = here.random(sizes.episodes, 100_000 * (SEED + 1) + 1000)
-    n = len(new) // 10
+    n = max(1, len(new) // 10)
     with_new = train.joined(new.take(slice(n, None))), held_out.joined(new.take(slice(n)))
     for stage, (data, validation) in {NONE: (train, held_out), RANDOM: with_new}.items():
         net = copy.deepcopy(model)
