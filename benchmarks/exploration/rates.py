@@ -4,7 +4,7 @@
 
 Learners of notebook 10 at scale paper, of training seed 10, which no published row has, by several rates (0: Adam
 alone): as they are before the first round, and after the training of one round with no new episodes and with 150 more
-random ones (``fine_tune``: where nothing is better on the held-out episodes, the weights stay). All are judged on 100
+random ones (``explore``: where nothing is better on the held-out episodes, the weights stay). All are judged on 100
 other random episodes: the mean loss over their windows, and energy scores 10 and 80 steps ahead. A rate is chosen by
 that loss after the round with random episodes. A line that is there is not measured again.
 """
@@ -16,15 +16,12 @@ import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 from unittest.mock import patch
 
 import pandas as pd
 import torch
-from torch import nn
 
-from tsmlib.exploration import Trainable
-from tsmlib.fine_tuning import fine_tune
+from tsmlib.exploration import Trainable, explore
 from tsmlib.study import adaptation, rounds, worlds
 from tsmlib.study.data import random_data
 from tsmlib.study.results.exploration import NONE, PUSH, RANDOM
@@ -51,15 +48,14 @@ def measured(word: str, rate: float) -> Iterator[dict[str, object]]:
     with patch.dict(worlds.WORLDS, {PUSH: replace(here, muon={**here.muon, word: rate})}):
         model, _, train, held_out = rounds.learner(word, sizes, SEED, PUSH)
     yield {"stage": BEFORE, **judged(model)}
-    new = here.random(sizes.episodes, 100_000 * (SEED + 1) + 1000)
-    n = max(1, len(new) // 10)
-    with_new = train.joined(new.take(slice(n, None))), held_out.joined(new.take(slice(n)))
-    for stage, (data, validation) in {NONE: (train, held_out), RANDOM: with_new}.items():
+    new = here.random(sizes.episodes, rounds.round_seed(SEED, 1))
+    how = replace(sizes.options(model.past_len, muon=rate), rounds=1, prior=None)
+    for stage, episodes in ((NONE, None), (RANDOM, new)):
         net = copy.deepcopy(model)
-        assert here.augmented is not None
-        how = sizes.training(net.past_len, 20, muon=rate)
-        fine_tune(cast(nn.Module, net), net.loss, here.augmented(data), validation, how, seed=SEED + 1,
-                  progress=f"{word} {rate:g}: {stage}")  # fmt: skip
+        explore(
+            net, None, train, held_out, here.tested, how, seed=SEED, augmented=here.augmented,
+            episodes=lambda _, found=episodes: found, progress=f"{word} {rate:g}: {stage}",
+        )  # fmt: skip
         yield {"stage": stage, **judged(net)}
 
 

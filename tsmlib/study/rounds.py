@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 def tasks(episodes: int, seed: int) -> Callable[[int], Task]:
     """Round -> its starts."""
-    return lambda k: pendulum.swing_up(episodes, seed=_seed(seed, k))
+    return lambda k: pendulum.swing_up(episodes, seed=round_seed(seed, k))
 
 
 def divided(data: Trajectories) -> tuple[Trajectories, Trajectories]:
@@ -259,7 +259,7 @@ def loop(
     options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0), rms=here.rms)
 
     def new(k: int) -> Trajectories | None:
-        return here.random(sizes.episodes, _seed(seed, k)) if data == RANDOM else None
+        return here.random(sizes.episodes, round_seed(seed, k)) if data == RANDOM else None
 
     made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed}
     slug, curves = data.replace(" ", "-"), dict[str, list[float]]()
@@ -268,7 +268,7 @@ def loop(
         curves[FIRST_PRIOR] = _once(own and own / "prior-0.json", made_from, lambda: search(prior, sizes, seed, env))
     torques, first = {FIRST_PRIOR: torques_of(prior)} if prior else {}, copy.deepcopy(prior)
     found = explore(
-        model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, _seed(seed, k)),
+        model, prior, train, held_out, lambda k: here.drawn(sizes.episodes, round_seed(seed, k)),
         options if prior else replace(options, prior=None),
         seed=seed if data == PLANNED else 1000 * seed,  # of the planner and of updates; of seed 0 the same for all data
         progress=f"{env} {word}: {data}", measure=tested(measured), augmented=here.augmented,
@@ -295,7 +295,7 @@ def loop(
     return Loop(rows, episodes, seconds, (first, prior) if first and prior else None)
 
 
-def _seed(seed: int, k: int) -> int:
+def round_seed(seed: int, k: int) -> int:
     """The seed of the tasks, or of the random episodes, of round k."""
     return 100_000 * (seed + 1) + 1000 * k
 
