@@ -112,7 +112,7 @@ WORLDS = {
         tested=lambda n: load_task(PUSH).take(n), drawn=lambda n, seed: draw_task(PUSH, seed=seed, n=n),
         random=lambda n, seed: random_data(PUSH, n, seed=seed),
         first=lambda n, seed: random_data(PUSH, n, seed=1000 * seed), action_dim=2, rms=0.1,
-        muon={"rtsm": 0.01, "lstm": 0.02}, augmented=symmetric,  # twice the study's rates
+        muon={"rtsm": 0.01, "lstm": 0.01, "ensemble+mse": 0.01}, augmented=symmetric,  # benchmarks/exploration/rates.py
     ),
 }  # fmt: skip
 
