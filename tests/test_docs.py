@@ -147,6 +147,12 @@ def test_a_notebook_is_shown_as_it_was_executed_unless_it_has_changed_since(
     assert "what came out" not in str(shown)
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_links_to_no_picture_that_is_not_beside_its_executed_copy(path: Path) -> None:
+    cells = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown"]
+    assert not re.findall(r"!\[[^\]]*\]\((?!https:)[^)]+\)", "\n".join(cells))
+
+
 @pytest.mark.parametrize("page", sorted((DOCS / "explanation").glob("*.md")), ids=lambda page: page.stem)
 def test_the_equation_that_a_piece_of_code_is_stands_above_it(page: Path) -> None:
     above = re.split(r"^```\{literalinclude\}[^`]*^```\n", page.read_text(), flags=re.MULTILINE)[:-1]

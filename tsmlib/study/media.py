@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import torch
 from gymnasium.spaces import Box
-from IPython.display import Markdown, display
+from IPython.display import Image, Markdown, display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -27,7 +27,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
 from tsmlib.study.results import table
-from tsmlib.study.runs import Run
+from tsmlib.study.runs import ROOT, Run
 from tsmlib.trajectory import Trajectories, Window
 
 if TYPE_CHECKING:
@@ -46,6 +46,13 @@ def show(run: Run, figure: Figure, stem: str, rows: pd.DataFrame | None = None, 
         stamp_run(run, figure, n)
     figures.save(figure, run.figures / stem)
     display(figure)
+
+
+def show_published(stem: str) -> None:
+    """Display a figure of the published rows, in a clone of the repository; an installation has no pictures."""
+    path = ROOT / "figures" / f"{stem}.png"
+    if path.exists():
+        display(Image(path.read_bytes(), format="png"))
 
 
 def stamp_run(run: Run, figure: Figure, n: int) -> None:
