@@ -148,7 +148,7 @@ def test_a_notebook_is_shown_as_it_was_executed_unless_it_has_changed_since(
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
-def test_a_notebook_links_to_no_picture_that_is_not_beside_its_executed_copy(path: Path) -> None:
+def test_no_notebook_links_to_a_local_picture(path: Path) -> None:
     cells = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown"]
     assert not re.findall(r"!\[[^\]]*\]\((?!https:)[^)]+\)", "\n".join(cells))
 

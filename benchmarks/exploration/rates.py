@@ -16,7 +16,6 @@ import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import pandas as pd
 import torch
@@ -45,8 +44,7 @@ def measured(word: str, rate: float) -> Iterator[dict[str, object]]:
     """A line for each stage of one learner."""
     here = worlds.world(PUSH)
     sizes = here.sizes["paper"]
-    with patch.dict(worlds.WORLDS, {PUSH: replace(here, muon={**here.muon, word: rate})}):
-        model, _, train, held_out = rounds.learner(word, sizes, SEED, PUSH)
+    model, _, train, held_out = rounds.learner(word, sizes, SEED, PUSH, muon=rate)
     yield {"stage": BEFORE, **judged(model)}
     new = here.random(sizes.episodes, rounds.round_seed(SEED, 1))
     how = replace(sizes.options(model.past_len, muon=rate), rounds=1, prior=None)

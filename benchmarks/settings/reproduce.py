@@ -135,9 +135,9 @@ def _adapted(env: str, variant: str, ways: tuple[str, ...], models: tuple[str, .
     )  # fmt: skip
 
 
-def _plans(env: str, variant: str) -> Recipe:
+def _plans(env: str, variant: str, episodes: str = "20") -> Recipe:
     """What models adapted to a changed arm plan there."""
-    options = f"--ways {' '.join(adaptation.WAYS)} --episodes 20 --targets 50"
+    options = f"--ways {' '.join(adaptation.WAYS)} --episodes {episodes} --targets 50"
     only = {"planner": ("cem",), "execution": ("open loop",), "configuration": adaptation.WAYS}
     return Recipe(("10_explore",), "adaptation", (env,), TUNED, options=options, variant=variant, only=only)
 
@@ -207,7 +207,7 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     _plans(REACH, "gain0.7"),
     *(_adapted(PUSH, arm, adaptation.WAYS, TUNED) for arm in ARMS),
     _adapted(PUSH, "gain0.7", (adaptation.REFERENCE,), (OURS,)),
-    *(_plans(PUSH, arm) for arm in ARMS),
+    *(_plans(PUSH, arm, "5 20 80" if arm == "gain0.7" else "20") for arm in ARMS),
 )  # fmt: skip
 
 

@@ -52,7 +52,7 @@ def show_published(stem: str) -> None:
     """Display a figure of the published rows, in a clone of the repository; an installation has no pictures."""
     path = ROOT / "figures" / f"{stem}.png"
     if path.exists():
-        display(Image(path.read_bytes(), format="png"))
+        display(Image(filename=path))
 
 
 def stamp_run(run: Run, figure: Figure, n: int) -> None:

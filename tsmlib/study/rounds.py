@@ -221,8 +221,13 @@ class Learner(NamedTuple):
     held_out: Trajectories
 
 
-def learner(word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None) -> Learner:
-    """One of a world's learners as a loop begins; a training that was stopped goes on from ``folder``."""
+def learner(
+    word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None, *, muon: float | None = None
+) -> Learner:
+    """One of a world's learners as a loop begins; a training that was stopped goes on from ``folder``.
+
+    muon: rate of Muon, 0 for Adam alone; by default the world's.
+    """
     here = require(env, word)
     train, held_out = divided(here.first(sizes.first, seed))
     made_for = cast(type[RecurrentTSM], zoo.find(word).load())  # what is used here of one, all have
@@ -232,7 +237,8 @@ def learner(word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Pat
     if prior is not None:
         how = sizes.training(10, 10, updates=sizes.prior)
         fit(prior, prior.loss, train, held_out, how, seed=seed, checkpoint=kept["prior"])
-    how = sizes.training(model.past_len, 20, updates=sizes.before, muon=here.muon.get(word, 0.0))
+    rate = here.muon.get(word, 0.0) if muon is None else muon
+    how = sizes.training(model.past_len, 20, updates=sizes.before, muon=rate)
     data = train if here.augmented is None else here.augmented(train)
     fit(model, model.loss, data, held_out, how, seed=seed, checkpoint=kept["model"])
     return Learner(model, prior, train, held_out)
@@ -261,7 +267,7 @@ def loop(
     def new(k: int) -> Trajectories | None:
         return here.random(sizes.episodes, round_seed(seed, k)) if data == RANDOM else None
 
-    made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed}
+    made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed, "muon": here.muon.get(word, 0.0)}
     slug, curves = data.replace(" ", "-"), dict[str, list[float]]()
     zero = _once(own and own / "round-0.json", made_from, lambda: dict(measured(model, prior)))
     if prior and sizes.searches:
