@@ -339,6 +339,27 @@ def test_errors_of_adapted_models_are_drawn_with_every_seed() -> None:
     assert sorted(marks) == [[1.0, 2.0], [2.0, 3.0], [3.0, 4.0]]
 
 
+def test_the_notebook_says_of_plans_from_five_and_from_eighty_episodes_what_the_published_rows_say() -> None:
+    rows = published("10_explore")
+    weak = table.select(rows, planner="cem", metric="return_true", env="tsm/ReacherPush-gain0.7-v1")
+    five, eighty = (
+        {
+            (word, way.model): gained for word, arms in adaptation_results.gains(weak, n).items()
+            for ways in arms.values() for way, gained in ways.items()
+        }
+        for n in (5, 80)
+    )  # fmt: skip
+    assert len(five) == len(eighty) == 10
+    assert {len(gained) for gained in (*five.values(), *eighty.values())} == {3}
+    ours = ("recurrent TSM", "all")
+    assert f"{five[ours].mean():.1f}" == "2.4"
+    mean, half = interval(eighty[ours] - five[ours])
+    assert [round(float(end), 1) + 0.0 for end in (mean, mean - half, mean + half)] == [0.0, -0.1, 0.2]
+    assert all(gained[word, "scratch"].mean() < 0 for gained in (five, eighty) for word, _ in gained)
+    elsewhere = table.select(rows, planner="cem", metric="return_true", env_steps=[500, 8000])
+    assert set(elsewhere["env"][elsewhere["env"].str.startswith("tsm/ReacherPush-")]) == {"tsm/ReacherPush-gain0.7-v1"}
+
+
 def test_the_notebook_says_of_plans_on_changed_arms_what_the_published_rows_say() -> None:
     rows = published("10_explore")
     pushed = rows["env"].str.startswith("tsm/ReacherPush-") & (rows["env"] != PUSH)

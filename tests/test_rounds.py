@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -354,6 +356,23 @@ def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_
         run_script(script, "rtsm", "--updates", str(updates), "--out", str(place))
     assert pd.read_csv(place)["updates"].tolist() == [4, 2]
     assert all(seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen)
+
+
+@pytest.mark.parametrize("way", ["planned", "random"])
+def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = importlib.util.spec_from_file_location("exploration_run", ROOT / "benchmarks" / "exploration" / "run.py")
+    assert spec
+    assert spec.loader
+    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    for name, size in (("FIRST", 10), ("ROUNDS", 1), ("EPISODES", 3), ("TARGETS", 2)):
+        monkeypatch.setattr(module, name, size)
+    monkeypatch.setattr(module, "SEARCH", dict(candidates=4, elites=2, iterations=1, screened=0.25))
+    monkeypatch.setattr(module, "training", lambda past, future, _: tsmlib.TrainingOptions(past, future, 1))
+    lines = module.rounds(way, 0)
+    assert [(line["round"], line["env_steps"]) for line in lines] == [(0, 500), (1, 650)]
+    found = pd.read_csv(io.StringIO(pd.DataFrame(lines).to_csv()))
+    assert np.isfinite(found[["cost", "within_3cm", "absolute_gap"]]).all(axis=None)
+    assert "3 cm" in module.summary(found)
 
 
 def test_rates_of_rounds_are_chosen_on_episodes_that_no_training_has(
