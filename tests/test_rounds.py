@@ -358,6 +358,15 @@ def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_
     assert all(seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen)
 
 
+def test_the_notebook_says_of_noise_and_disagreement_what_their_table_says() -> None:
+    rows = pd.read_csv(ROOT / "benchmarks" / "exploration" / "table.csv")
+    wide = rows[rows["round"] == 5].pivot(index="seed", columns="way", values="within_3cm")
+    assert wide.index.tolist() == [0, 1, 2]
+    found = {way: interval(100 * (wide["planned"] - wide[way])) for way in ("random", "bonus", "noise")}
+    ends = {way: [round(float(end)) for end in (mean, mean - half, mean + half)] for way, (mean, half) in found.items()}
+    assert ends == {"random": [21, 10, 31], "bonus": [11, 4, 19], "noise": [-4, -21, 13]}
+
+
 @pytest.mark.parametrize("way", ["planned", "random"])
 def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = importlib.util.spec_from_file_location("exploration_run", ROOT / "benchmarks" / "exploration" / "run.py")
