@@ -3,6 +3,7 @@ in a process that has only what their requirements name."""
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import os
 import runpy
@@ -11,6 +12,7 @@ import sys
 from collections.abc import Iterable
 from contextlib import redirect_stdout
 from pathlib import Path
+from types import ModuleType
 from unittest.mock import patch
 
 
@@ -20,6 +22,17 @@ def run_script(path: Path, *options: str) -> str:
     with patch.object(sys, "argv", [str(path), *options]), redirect_stdout(printed):
         runpy.run_path(str(path), run_name="__main__")
     return printed.getvalue()
+
+
+def load_script(path: Path, name: str = "") -> ModuleType:
+    """The script as a module, by its own name unless another is given, without running it."""
+    spec = importlib.util.spec_from_file_location(name or path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses find their module, and scripts each other
+    spec.loader.exec_module(module)
+    return module
 
 
 def pins(path: Path) -> dict[str, str]:

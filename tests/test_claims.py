@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import subprocess
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scripts import run_script
+from scripts import load_script, run_script
 
 from tsmlib import figures
 from tsmlib.statistics import Estimate, holm, interval, random_effects
@@ -441,10 +440,7 @@ def test_the_page_says_how_often_simulated_verdicts_were_wrong() -> None:
 
 
 def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
-    spec = importlib.util.spec_from_file_location("verdicts_run", ROOT / "benchmarks" / "verdicts" / "run.py")
-    assert spec
-    assert spec.loader
-    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
     columns = ["claim", "check", "seeds", "margin", "truth", "why"]
     stored, now = pd.read_csv(pages.POWER), module.checks(1, np.random.default_rng(0))
     again = "checks.csv is of other rows than data/results; run: python benchmarks/verdicts/run.py checks"

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from scripts import pins, start_with_only
+from scripts import load_script, pins, start_with_only
 
 from tsmlib import study
 from tsmlib.models.features import Features
@@ -36,17 +34,7 @@ needs_sbx = pytest.mark.skipif(
 )
 
 
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("model_free", FOLDER / "model_free.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look there
-    spec.loader.exec_module(module)
-    return module
-
-
-model_free = load()
+model_free = load_script(FOLDER / "model_free.py")
 
 
 def driven(episodes: Any, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

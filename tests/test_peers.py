@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import sys
 from dataclasses import replace
 from itertools import count, pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scripts import pins, start_with_only
+from scripts import load_script, pins, start_with_only
 from torch import Tensor
 
 from tsmlib import study
@@ -31,19 +29,9 @@ FOLDER = ROOT / "benchmarks" / "peers"
 MEMBERS, DX, DU, FIXED = 5, 8, 2, (6, 7)  # an arm and an obstacle, which never moves
 
 
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # where speed finds pets, and dataclasses their module
-    spec.loader.exec_module(module)
-    return module
-
-
-pets = load("pets")
-speed = load("speed")
-loop = load("loop")
+pets = load_script(FOLDER / "pets.py")
+speed = load_script(FOLDER / "speed.py")
+loop = load_script(FOLDER / "loop.py")
 needs_mbrl = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("mbrl", "hydra")), reason="mbrl-lib is not installed; README.md"
 )

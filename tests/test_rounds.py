@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
 from dataclasses import asdict, replace
@@ -14,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from scripts import run_script
+from scripts import load_script, run_script
 
 import tsmlib
 from tsmlib import figures
@@ -369,10 +368,7 @@ def test_the_notebook_says_of_noise_and_disagreement_what_their_table_says() -> 
 
 @pytest.mark.parametrize("way", ["planned", "random"])
 def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = importlib.util.spec_from_file_location("exploration_run", ROOT / "benchmarks" / "exploration" / "run.py")
-    assert spec
-    assert spec.loader
-    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    module = load_script(ROOT / "benchmarks" / "exploration" / "run.py", "exploration_run")
     for name, size in (("FIRST", 10), ("ROUNDS", 1), ("EPISODES", 3), ("TARGETS", 2)):
         monkeypatch.setattr(module, name, size)
     monkeypatch.setattr(module, "SEARCH", dict(candidates=4, elites=2, iterations=1, screened=0.25))

@@ -27,7 +27,7 @@ from tsmlib.figures.method import Method
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
 from tsmlib.study.results import table
-from tsmlib.study.runs import ROOT, Run
+from tsmlib.study.runs import FIGURES, Run
 from tsmlib.trajectory import Trajectories, Window
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ def show(run: Run, figure: Figure, stem: str, rows: pd.DataFrame | None = None, 
 
 
 def show_published(stem: str) -> None:
-    """Display a figure of the published rows, in a clone of the repository; an installation has no pictures."""
-    path = ROOT / "figures" / f"{stem}.png"
+    """Display a figure of the published rows; nothing where there are none, as in an installation."""
+    path = FIGURES / f"{stem}.png"
     if path.exists():
         display(Image(filename=path))
 

@@ -24,11 +24,11 @@ from tsmlib.study.notebooks import require
 from tsmlib.study.results import exploration, table
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.planning import PUSH, REACH
-from tsmlib.study.runs import RESULTS, ROOT, Notebook, Run, RunError
+from tsmlib.study.runs import FIGURES, RESULTS, ROOT, Notebook, Run, RunError
 from tsmlib.study.tasks import load_task
 from tsmlib.study.zoo import OURS, PAPERS
 
-README, FIGURES = ROOT / "README.md", ROOT / "figures"
+README = ROOT / "README.md"
 RESULTS_PAGE, CLAIMS_PAGE = ROOT / "docs" / "results.md", ROOT / "docs" / "claims.md"
 FULL_PAGE = ROOT / "docs" / "claims_in_full.md"  # claim by claim
 SHIPPED = "shipped"  # tag of a notebook's cells that need no rows and no models but those that ship

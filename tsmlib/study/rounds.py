@@ -222,11 +222,11 @@ class Learner(NamedTuple):
 
 
 def learner(
-    word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None, *, muon: float | None = None
+    word: str, sizes: Sizes, seed: int, env: str = PENDULUM, folder: Path | None = None, *, muon: float
 ) -> Learner:
     """One of a world's learners as a loop begins; a training that was stopped goes on from ``folder``.
 
-    muon: rate of Muon, 0 for Adam alone; by default the world's.
+    muon: rate of Muon; 0: Adam for all.
     """
     here = require(env, word)
     train, held_out = divided(here.first(sizes.first, seed))
@@ -237,8 +237,7 @@ def learner(
     if prior is not None:
         how = sizes.training(10, 10, updates=sizes.prior)
         fit(prior, prior.loss, train, held_out, how, seed=seed, checkpoint=kept["prior"])
-    rate = here.muon.get(word, 0.0) if muon is None else muon
-    how = sizes.training(model.past_len, 20, updates=sizes.before, muon=rate)
+    how = sizes.training(model.past_len, 20, updates=sizes.before, muon=muon)
     data = train if here.augmented is None else here.augmented(train)
     fit(model, model.loss, data, held_out, how, seed=seed, checkpoint=kept["model"])
     return Learner(model, prior, train, held_out)
@@ -259,15 +258,16 @@ def loop(
     here, seed = world(env), run.seed
     sizes = sizes or here.sizes[run.scale]
     own = None if folder is None else folder / (env if env == PENDULUM else EnvSpec.parse(env).name) / word
-    model, prior, train, held_out = learner(word, sizes, seed, env, own)
+    muon = here.muon.get(word, 0.0)
+    model, prior, train, held_out = learner(word, sizes, seed, env, own, muon=muon)
     sizes = sizes.judged_for(model)
     measured, began = measure(sizes, seed, env), len(train) + len(held_out)
-    options = sizes.options(model.past_len, muon=here.muon.get(word, 0.0), rms=here.rms)
+    options = sizes.options(model.past_len, muon=muon, rms=here.rms)
 
     def new(k: int) -> Trajectories | None:
         return here.random(sizes.episodes, round_seed(seed, k)) if data == RANDOM else None
 
-    made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed, "muon": here.muon.get(word, 0.0)}
+    made_from: dict[str, Json] = {"sizes": asdict(sizes), "seed": seed, "muon": muon}
     slug, curves = data.replace(" ", "-"), dict[str, list[float]]()
     zero = _once(own and own / "round-0.json", made_from, lambda: dict(measured(model, prior)))
     if prior and sizes.searches:

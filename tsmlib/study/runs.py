@@ -26,6 +26,7 @@ INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
 ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
 NOTEBOOKS = ROOT / "notebooks"
 RESULTS = ROOT / "data" / "results"  # the published tables
+FIGURES = ROOT / "figures"  # drawn of them; an installation has none
 TESTED = range(401, 1032)  # seeds whose episodes in 09_your_own, up to 600, begin by resets that are for its tests
 
 T = TypeVar("T")

@@ -19,7 +19,7 @@ from tsmlib.study.claims.claim import (
 )  # fmt: skip
 from tsmlib.study.claims.evaluate import Effect, Verdict, state_of
 from tsmlib.study.results.table import markdown
-from tsmlib.study.runs import ROOT
+from tsmlib.study.runs import FIGURES
 
 DECIDED = (REPLICATED, DEPENDENT, FAILED)
 ANSWERS = {REPLICATED: "yes", FAILED: "no", INCONCLUSIVE: "open", UNTESTABLE: "not testable"}  # to our own questions
@@ -118,7 +118,7 @@ def _links(claim: Claim, root: str) -> str:
     notebook, section, figure = claim.shown
     at = f"#{section.replace(' ', '-')}" if section else ""
     found = [f"[{notebook}]({root}notebooks/{notebook}.ipynb{at})"]
-    if figure and (ROOT / "figures" / f"{figure}.png").exists():
+    if figure and (FIGURES / f"{figure}.png").exists():
         found.append(f"[{figure}]({root}figures/{figure}.png)")
     return ", ".join(found)
 
