@@ -21,6 +21,8 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 LOADED = re.compile(r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=[\"'](?:https?:)?//[^>]*>")
 WRITTEN = [page for page in sorted(DOCS.rglob("*.md")) if "_build" not in page.parts]
 OPTIONAL = {"mbrl_lib": "mbrl.models", "own_data": "minari"}  # page -> what its program needs that may be missing
+COMMAND = re.compile(r"\bpython ((?:-m tsmlib|benchmarks/)[^`\n]*)")
+COMMANDING = [README, ROOT / "CONTRIBUTING.md", *WRITTEN, *sorted((ROOT / "benchmarks").glob("*/README.md"))]
 PAGES = [
     page for page in WRITTEN if BLOCK.search(page.read_text()) and page.stem != "own_data"
 ]  # which has its own test
@@ -90,6 +92,20 @@ def test_a_page_names_commands_and_files_that_exist(page: Path) -> None:
         assert re.search(rf"^(\w+ )*{target}( \w+)*:", makefile, re.MULTILINE), target
     for name in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (page.parent / name).exists(), name
+
+
+@pytest.mark.parametrize("page", COMMANDING, ids=str)
+def test_a_command_of_a_page_is_a_script_that_has_its_options(page: Path) -> None:
+    lines = page.read_text().replace("\\\n", " ").splitlines()
+    for command in [found for line in lines for found in COMMAND.findall(line)]:
+        script, *words = re.split(" -- | #", command)[0].split()
+        path = ROOT / ("tsmlib/__main__.py" if script == "-m" else script.rstrip('"'))
+        assert path.is_file(), command
+        options = path.read_text() + (ROOT / "benchmarks/_rounds.py").read_text()
+        for word in words:
+            assert not word.startswith("--") or f'"{word}"' in options, command
+        if script == "-m" and words[1:]:
+            assert f'"{words[1]}"' in options, command
 
 
 @pytest.mark.parametrize("asked", ["own environment", "own robot", "fine-tune", "cluster"])

@@ -225,6 +225,40 @@ def test_on_a_gpu_a_model_that_several_seeds_need_is_one_step_of_all_of_them() -
         assert not any(name.startswith("seeds") for name in others)
 
 
+def test_a_machine_without_a_gpu_submits_steps_that_need_one_and_data_need_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ParameterError, match="device is cuda"):
+        workflow.prepare(NOTEBOOKS, [0], scale="smoke", device="cuda", given={})
+    prepared = workflow.prepare(NOTEBOOKS, [0], scale="smoke", device="cuda", given={}, executor="slurm")
+    for step in workflow.steps(prepared, {}).values():
+        assert f"--device {'cpu' if step.kind == 'data' else 'cuda'}" in step.command
+
+
+def test_the_page_on_clusters_says_what_a_step_asks_for() -> None:
+    page = (runs.ROOT / "docs/howto/cluster.md").read_text()
+    notebooks = runs.notebooks()
+    prepared = workflow.prepare([notebooks["explore"], notebooks["train"]], [0], scale="paper", device="", given={})
+    steps = workflow.steps(prepared, {})
+    usual, exploring = (steps[f"seed0/{name}"] for name in ("02_train", "10_explore"))
+    assert f"| {usual.mem_mb:,} |" in page
+    assert f"a notebook {usual.minutes}, `10_explore`, whose loops are CPU hours, {exploring.minutes}" in page
+    model, more = (workflow._step(prepared[0].run, "model", "m", [], "", [], 600, n) for n in (1, 3))  # of ten minutes
+    assert (model.minutes, more.minutes) == (50, 130)  # four times, and for each seed
+    assert more.mem_mb - model.mem_mb == 2 * 500
+    assert "500 for each seed after the first" in page
+
+
+def test_what_the_page_on_clusters_asks_of_slurm_for_a_gpu_is_allowed_by_its_plugin() -> None:
+    utils = pytest.importorskip("snakemake_executor_plugin_slurm.utils")
+    page = (runs.ROOT / "docs/howto/cluster.md").read_text()
+    (asked,) = re.findall(r"`-- --default-resources (gpu=(\d))`", page)
+    job = SimpleNamespace(resources=SimpleNamespace(get={"gpu": int(asked[1])}.get))
+    assert "--gpus" in utils.set_gres_string(job)
+    assert "slurm_extra" not in page
+
+
 @pytest.mark.usefixtures("gpu")
 def test_a_policy_is_one_step_of_all_seeds_too_after_the_models_that_it_learns_in() -> None:
     steps = table("paper", (0, 2), device="cuda")

@@ -165,7 +165,9 @@ def _run(arguments: argparse.Namespace, more: Sequence[str]) -> int:
     if arguments.seeds is not None or any(options):
         from tsmlib.study import workflow
 
-        prepared = workflow.prepare(chosen, _seeds(arguments), scale=scale, device=device, given=given)
+        prepared = workflow.prepare(
+            chosen, _seeds(arguments), scale=scale, device=device, given=given, executor=arguments.executor
+        )
         return workflow.run_all(
             prepared, given, executor=arguments.executor, jobs=arguments.jobs, dry_run=arguments.dry_run,
             any_code=arguments.any_code, more=more,

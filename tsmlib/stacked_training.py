@@ -65,7 +65,8 @@ def fit_stacked(
 
     loss: name of a method of theirs. train: (S, N, L + T, .), see ``stacked``, L being ``options.past_len``. seeds: of
     each copy's windows and noise. compiled: losses and gradients by ``torch.compile``. Seconds of the records are by
-    the clock, of all copies together. On a CPU it is slower than ``fit`` of one after the other.
+    the clock, of all copies together. On a CPU ten take 0.74 to 1.5 times as long
+    as by ``fit`` in turn (docs/speed.md).
 
     ValueError where there are not as many models, seeds and data, for frozen weights, for features without statistics
     or copies in whose data other dimensions change, for windows with another past than the models', and for a loss that

@@ -9,10 +9,10 @@ name the seeds that are missing. Files are those that ``python -m tsmlib run tra
 runs/paper/seed<k>/models, and say in their headers that they were trained as copies, and on what. --compiled is worth
 its minute or more where a training takes longer than that.
 
-    python benchmarks/settings/seeds.py --scale paper --seeds 0 1 2 3 4 5 6 7 8 9 --envs tsm/Reacher-v0 --table
+    python benchmarks/settings/seeds.py --scale paper --seeds 0 1 2 3 4 5 6 7 8 9 --table
 
-writes ``seeds.csv`` beside this script: validation loss and seconds of the models that these seeds have, as their
-headers say.
+writes into ``seeds.csv`` beside this script: validation loss and seconds of the models that these seeds have, as their
+headers say, in place of lines of the same environment, model, seed and processor.
 
     python benchmarks/settings/seeds.py --scale paper --seeds 3 4 --envs tsm/ReacherPush-v1 --models tsm rtsm lstm \
         --policies 880 --together 2
@@ -43,7 +43,7 @@ from tsmlib.storage import artifacts
 from tsmlib.study import models, parallel, policies, runs, zoo
 from tsmlib.study.data import dataset
 
-HERE = Path(__file__).parent
+SEEDS = Path(__file__).with_name("seeds.csv")
 ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
 MODELS = ("rtsm", "tsm", "lstm", "multistep", "onestep", "prior")
 SPLITS = ("train", "validation")
@@ -97,6 +97,14 @@ def table(of: list[runs.Run], envs: Sequence[str], words: Sequence[str]) -> pd.D
     return pd.DataFrame(lines)
 
 
+def merged(there: pd.DataFrame, found: pd.DataFrame) -> pd.DataFrame:
+    """Lines that are there, in their order, with those found in place of such about the same; new ones at the end."""
+    about = ["env", "model", "seed", "processor"]
+    lines = pd.concat([there, found]).set_index(about)
+    last = lines[~lines.index.duplicated(keep="last")]
+    return last.loc[lines.index.unique()].reset_index()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", required=True)
@@ -106,14 +114,14 @@ def main() -> None:
     parser.add_argument("--policies", type=int, default=0, metavar="N", help="learn policies in them, N iterations")
     parser.add_argument("--together", type=int, default=5, help="models side by side (default 5)")
     parser.add_argument("--compiled", action="store_true", help="losses and gradients by torch.compile")
-    parser.add_argument("--table", action="store_true", help="write seeds.csv, and train nothing")
+    parser.add_argument("--table", action="store_true", help="write into seeds.csv, and train nothing")
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--device", default="", help="default TSM_DEVICE, else cpu")
     given = parser.parse_args()
     own = [runs.resolve("02_train", scale=given.scale, seed=seed, device=given.device) for seed in given.seeds]
     if given.table:
         found = table(own, given.envs, given.models)
-        found.to_csv(HERE / "seeds.csv", index=False, lineterminator="\n")
+        merged(pd.read_csv(SEEDS, dtype=str), found.astype(str)).to_csv(SEEDS, index=False, lineterminator="\n")
         print(found.to_string(index=False))
         return
     began, spawn = time.perf_counter(), multiprocessing.get_context("spawn")

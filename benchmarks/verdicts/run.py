@@ -4,7 +4,7 @@
     python benchmarks/verdicts/run.py checks           one of its parts alone, checks or worlds
     python benchmarks/verdicts/run.py --table          the table of docs/claims.md, from worlds.csv
 
-worlds.csv: claims of 1, 3 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
+worlds.csv: claims of 1 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
 every seed. A check's value is effect + seed + target + rest, each normal, of the deviations in PLANS and SCORES.
 effect: in units of the margin; at 1 the claim is false, and true by any larger number. Wrong verdicts are REPLICATED at
 an effect of 1, and NOT REPLICATED at an effect of 1 as well, where the truth is just not on the wrong side.

@@ -247,7 +247,7 @@ def _header(
 def train_as_one(runs: Sequence[Run], env: str, model: str, *, compiled: bool = False) -> list[Trained]:
     """Train a model with the seeds of several runs as one (``fit_stacked``), and store each where its run finds it.
 
-    For a GPU; on a CPU it is slower than one after the other. compiled: of ``fit_stacked``. Nothing is kept of a
+    For a GPU; on a CPU it gains little or nothing (docs/speed.md). compiled: of ``fit_stacked``. Nothing is kept of a
     training that is stopped. ValueError for runs of one seed or of several scales, for a model that is trained on the
     data of another environment, and where ``fit_stacked`` raises one.
     """

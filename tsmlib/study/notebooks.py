@@ -34,15 +34,17 @@ class Execution:
 
 
 def prepare(
-    notebook: Notebook, *, scale: str = "", seed: Value = 0, device: str = "", given: Mapping[str, str] | None = None
-) -> Execution:
+    notebook: Notebook, *, scale: str = "", seed: Value = 0, device: str = "", given: Mapping[str, str] | None = None,
+    elsewhere: bool = False,
+) -> Execution:  # fmt: skip
     """Check all that a notebook is executed with, before any file exists. given: parameter -> text, as typed.
+    elsewhere: other machines will execute it, so that this one need not have the device.
 
     Raises ParameterError for bad parameters.
     """
     asked = {"scale": scale, "seed": seed, **parameters.typed(notebook.path, given or {})}
     values = {name: asked[name] for name in parameters.declared(notebook.path) if name in asked}
-    run = resolve(notebook.stem, device=device, **values)  # type: ignore[arg-type]  # which it checks
+    run = resolve(notebook.stem, device=device, elsewhere=elsewhere, **values)  # type: ignore[arg-type]  # which it checks
     return Execution(notebook, run, values | ({"scale": run.scale} if "scale" in values else {}))
 
 

@@ -143,13 +143,15 @@ def home() -> Path:
 
 
 def resolve(
-    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", **others: Value
-) -> Run:
+    notebook: str, *, scale: str = "", seed: int = 0, run_dir: str = "", device: str = "", elsewhere: bool = False,
+    **others: Value,
+) -> Run:  # fmt: skip
     """The run that a notebook belongs to. Touches no file.
 
     scale: smoke, laptop or paper; '' means TSM_SCALE, and without it laptop. seed: 0 .. 2**31 - 1.
     run_dir: the folder that holds all runs, relative to ``home``; '' means TSM_RUN_DIR, and without it runs.
-    device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu.
+    device: cpu, cuda or cuda:N; '' means TSM_DEVICE, and without it cpu. elsewhere: other machines execute the run, so
+    that this one need not have the device.
     others: the notebook's other parameters. All are checked here and nowhere else, whichever way they came.
     Raises ParameterError naming the value and what is allowed.
     """
@@ -164,7 +166,9 @@ def resolve(
             f"expected one below {TESTED.start} or above {TESTED.stop - 1}."
         )
     scale = _setting("scale", scale, "TSM_SCALE", "laptop")
-    device = _present(_setting("device", device, "TSM_DEVICE", "cpu"))
+    device = _setting("device", device, "TSM_DEVICE", "cpu")
+    if not elsewhere:
+        _require_present(device)
     base = home() / _setting("run_dir", run_dir, "TSM_RUN_DIR", "runs")
     own = find(notebook) if others else None
     defaults = parameters.declared(own.path) if own else {}
@@ -210,10 +214,10 @@ def _setting(name: str, value: str, variable: str, default: str) -> str:
     return value or default
 
 
-def _present(device: str) -> str:
-    """``device``, if this machine has it."""
+def _require_present(device: str) -> None:
+    """Raises ParameterError unless this machine has ``device``."""
     if device == "cpu":
-        return device
+        return
     import torch  # heavy, and not needed otherwise
 
     found, asked = torch.cuda.device_count() if torch.cuda.is_available() else 0, torch.device(device).index or 0
@@ -222,4 +226,3 @@ def _present(device: str) -> str:
             f"device is {device}, but torch {torch.__version__} finds {found} such devices here. Leave --device (or "
             "TSM_DEVICE) out, or install a torch that is built for this machine's: https://pytorch.org/get-started"
         )
-    return device

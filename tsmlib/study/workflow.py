@@ -42,6 +42,7 @@ from tsmlib.study.runs import NOTEBOOKS, Notebook, Run, RunError
 
 SNAKEFILE = Path(__file__).with_name("Snakefile")
 POOL = "pool"  # in place of an executor: no Snakemake
+HERE = ("", "local", POOL)  # executors of this machine
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 COPY = 500  # MB more for each further seed of a training of several: its data
@@ -85,8 +86,9 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
     groups = seed_groups(executions)
     options = [word for name, text in given.items() if name != "run_dir" for word in ("-p", f"{name}={text}")]
 
-    def at(run: Run, *seeds: str) -> list[str]:
-        return ["--scale", run.scale, *seeds, "--device", run.device, *options]
+    def at(run: Run, *seeds: str, kind: str = "") -> list[str]:
+        device = "cpu" if kind == "data" else run.device  # simulators need no other
+        return ["--scale", run.scale, *seeds, "--device", device, *options]
 
     def name_of(execution: Execution, job: Job) -> str:
         """Of the step that makes a job."""
@@ -100,7 +102,7 @@ def steps(executions: Sequence[Execution], given: Mapping[str, str]) -> dict[str
             run, seeds = execution.run, [str(each.run.seed) for each in group]
             before = [add(each, other) for each in group for other in job.needs(each.run)]
             which = ["--seed", seeds[0]] if len(seeds) == 1 else ["--seeds", ",".join(seeds)]
-            command = [_word(execution.notebook), "--job", job.name, *at(run, *which)]
+            command = [_word(execution.notebook), "--job", job.name, *at(run, *which, kind=job.kind)]
             step = _step(run, job.kind, name, before, _settings(run, job), command, job.seconds(run), len(group))
             written = [f"seed{seed}/{job.name}.safetensors" for seed in seeds]
             found[name] = replace(step, files=written, ships=job.ships(run))
@@ -176,9 +178,11 @@ def _step(
 
 
 def prepare(
-    chosen: Sequence[Notebook], seeds: Sequence[int], *, scale: str, device: str, given: Mapping[str, str]
-) -> list[Execution]:
+    chosen: Sequence[Notebook], seeds: Sequence[int], *, scale: str, device: str, given: Mapping[str, str],
+    executor: str = "",
+) -> list[Execution]:  # fmt: skip
     """Every notebook with every seed, checked before any file exists; the claims, which read all others, at the end.
+    executor: as in ``run_all``; where it is a cluster's, this machine need not have the device.
 
     Raises ParameterError, for seeds of held-out episodes and targets too.
     """
@@ -187,7 +191,11 @@ def prepare(
     claims = [notebook for notebook in last if notebook.stem == CLAIMS]
     order = [(notebook, seed) for seed in seeds for notebook in last if notebook not in claims]
     order += [(notebook, seed) for seed in seeds for notebook in claims]
-    return [notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given) for one, seed in order]
+    elsewhere = executor not in HERE
+    return [
+        notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given, elsewhere=elsewhere)
+        for one, seed in order
+    ]
 
 
 def run_all(

@@ -14,7 +14,7 @@ checks, so that many checks do not make a failure likely by chance.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -49,7 +49,7 @@ class Effect:
     """What rows say of a check: estimate, interval where there is one, n in words, and a state.
 
     p: one-sided p value against lying on the claimed side of the margin, where there is an interval.
-    by_seed: the number of each training seed, the mean over its trials where it has some.
+    by_seed: the number of each training seed, where it has trials the mean of their pseudo-values.
     """
 
     check: Check
@@ -330,8 +330,13 @@ def measure(check: Check, rows: Tables) -> Effect:
         exact = float(check.number.of({}))
         return Effect(check, "holds" if check.accepts(exact, exact) else "fails", exact, exact, exact, "exact")
     values, n = of_seeds(check, asked)
-    found = compared(check, random_effects(values, crossed=not any(term.curve for term in asked)), n)
+    found = compared(check, random_effects(values, crossed=not nested(asked)), n)
     return replace(found, by_seed=tuple(values.mean(1).tolist()))
+
+
+def nested(terms: Iterable[Term]) -> bool:
+    """Whether trials are a seed's own, copies of a policy, and not targets that all seeds have."""
+    return any(term.curve for term in terms)
 
 
 def of_seeds(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[np.ndarray, str]:
@@ -360,7 +365,7 @@ def of_seeds(check: Check, asked: Mapping[Term, pd.DataFrame]) -> tuple[np.ndarr
         # pseudo-values (seeds, trials): of a mean, the trials' own
         left_out = np.array([[number(i, without=j) for j in range(trials)] for i in range(len(seeds))])
         values = trials * values - (trials - 1) * left_out
-        n = f"{trials} trials of {n}"
+        n = f"{n} of {trials} copies each" if nested(asked) else f"{trials} trials of {n}"
     return values, n
 
 

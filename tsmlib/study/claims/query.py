@@ -64,7 +64,7 @@ NOISE, DELAY = CLEAN._replace(noise=0.25), CLEAN._replace(delay=5)
 PENDULUM, WEAK_MOTORS = Place("Pendulum-v1"), Place("tsm/Reacher-gain0.7-v0")
 TASKS, ARMS = (REACHER, PUSH), (REACHER, OBSTACLE, PUSH)
 
-# Other readings of the paper: name -> fields of Query. A1 to A33 are numbers of docs/deviations.md.
+# Other readings of the paper: name -> fields of Query. A1 to A34 are numbers of docs/deviations.md.
 VARIANCE = {"A1d one variance per step and dimension": {"likelihood": "ll_horizon"}}
 LIKELIHOODS = {"A1b one shared variance": {"likelihood": "ll_shared"}, **VARIANCE}
 PROTOCOLS = {**LIKELIHOODS, "A6 segments from the true past": {"execution": "segments"}}
@@ -299,7 +299,7 @@ class Query:
         return largest(ppo, trpo)
 
     def samples_ratio(self, place: Place) -> Number:
-        """Samples to 90 % of the common plateau: TSM with prior over the better policy gradient."""
+        """Samples to 90 % of the common plateau: TSM with prior over the better policy gradient of each seed."""
         tsm, ppo, trpo = (self._ask("05_control", self.samples, word, place, search_space=space, execution="policy",
                                     iteration="") for word, space in (LAP, ("ppo", ""), ("trpo", "")))  # fmt: skip
         return tsm / smallest(ppo, trpo)
