@@ -5,9 +5,11 @@
     python benchmarks/verdicts/run.py --table          the table of docs/claims.md, from worlds.csv
 
 worlds.csv: claims of 1 or 8 checks, in worlds of some training seeds and, of plans, 100 targets that are the same in
-every seed. A check's value is effect + seed + target + rest, each normal, of the deviations in PLANS and SCORES.
-effect: in units of the margin; at 1 the claim is false, and true by any larger number. Wrong verdicts are REPLICATED at
-an effect of 1, and NOT REPLICATED at an effect of 1 as well, where the truth is just not on the wrong side.
+every seed; of policies, three copies within each seed. A check's value is effect + seed + target + rest, each normal,
+of the deviations in KINDS. ``shared`` is the share of the seeds' variance that all checks, or all readings, have in
+common. effect: in units of the margin; at 1 the claim is false, and true by any larger number. Wrong verdicts are
+REPLICATED at an effect of 1, and NOT REPLICATED at an effect of 1 as well, where the truth is just not on the wrong
+side. A claim with three readings has the same effect under each; READING-DEPENDENT is wrong, too.
 
 checks.csv: every check of the ledger whose published rows have two seeds or more, and a margin: the deviation of its
 values over seeds, and the share of simulated studies of ten seeds in which it holds, if its truth is as ``truth`` says.
@@ -17,6 +19,7 @@ Seeds, and targets where they are the same in every seed, differ there as they d
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -27,8 +30,8 @@ import pandas as pd
 from tsmlib.statistics import random_effects
 from tsmlib.storage import files
 from tsmlib.study.claims import evaluate, ledger
-from tsmlib.study.claims.claim import FAILED, REPLICATED, Claim
-from tsmlib.study.claims.query import REACHER, TSM, Check, Checks, Model, Query, Term
+from tsmlib.study.claims.claim import DEPENDENT, FAILED, REPLICATED, Claim
+from tsmlib.study.claims.query import REACHER, TSM, Check, Checks, Model, Number, Place, Query, Term
 from tsmlib.study.claims.shown import FIGURE5
 from tsmlib.study.zoo import PAPERS
 
@@ -51,51 +54,75 @@ class Deviations(NamedTuple):
     targets: int
 
 
+class Kind(NamedTuple):
+    """Worlds of a kind. ask: a claim's number of a model. shared: of the seeds' variance. readings: other ones."""
+
+    how: Deviations
+    ask: Callable[[Query, Model, Place], Number]
+    shared: float = 0.0
+    readings: Mapping[str, Mapping[str, str]] = {}
+
+
 SCORES = Deviations(0.5, 0.0, 0.0, 1)
-PLANS = Deviations(0.5, 2.5, 2.5, 100)
+OTHERS = {"second": {"likelihood": "ll_shared"}, "third": {"likelihood": "ll_horizon"}}  # readings
+KINDS = {
+    "scores": Kind(SCORES, Query.ll), "plans": Kind(Deviations(0.5, 2.5, 2.5, 100), Query.executed),
+    "policies, 3 copies": Kind(Deviations(0.5, 0.0, 0.5, 3), Query.final),
+    "scores, checks that share half": Kind(SCORES, Query.ll, 0.5),
+    "scores, three readings that share half": Kind(SCORES, Query.ll, 0.5, OTHERS),
+}  # fmt: skip
+CASES = {kind: ((1, 3, 5, 6, 10), (1, 8)) if kind in ("scores", "plans") else ((3, 5, 10), (1, 8)) for kind in KINDS}
 
 
-def drawn(effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator) -> np.ndarray:
-    """Values (effects, seeds, targets) of studies."""
+def drawn(
+    effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator, shared: float = 0.0
+) -> np.ndarray:
+    """Values (effects, seeds, targets) of studies. shared: of the seeds' variance, in all effects alike."""
     shape = (len(effects), seeds, how.targets)
-    values = effects[:, None, None] + how.seed * rng.standard_normal((*shape[:2], 1))
+    noise = rng.standard_normal((*shape[:2], 1))
+    if shared:
+        noise = (1 - shared) ** 0.5 * noise + shared**0.5 * rng.standard_normal((1, seeds, 1))
+    values = effects[:, None, None] + how.seed * noise
     return values + how.target * rng.standard_normal((shape[0], 1, shape[2])) + how.rest * rng.standard_normal(shape)
 
 
 class World(evaluate.Tables):
-    """Rows of a world: a value (seeds, targets) of each rival, and 0 for the paper's model."""
+    """Rows of a world: under each reading a value (seeds, targets) of each rival, and 0 for the paper's model."""
 
-    def __init__(self, effects: np.ndarray, seeds: int, how: Deviations, rng: np.random.Generator) -> None:
-        values = drawn(effects, seeds, how, rng)
-        self.values = {f"rival{i}": -each for i, each in enumerate(values)} | {PAPERS: np.zeros(values.shape[1:])}
+    def __init__(self, effects: np.ndarray, seeds: int, kind: Kind, rng: np.random.Generator) -> None:
+        metrics = [term.metric for term in kind.ask(Query(), TSM, REACHER).terms]
+        metrics += [reading["likelihood"] for reading in kind.readings.values()]
+        values = drawn(np.tile(effects, len(metrics)), seeds, kind.how, rng, kind.shared)
+        asked = product(metrics, range(len(effects)))
+        self.values = {(metric, f"rival{i}"): -each for (metric, i), each in zip(asked, values, strict=True)}
+        self.zero = np.zeros(values.shape[1:])
 
     def ask(self, term: Term) -> pd.DataFrame:
-        return pd.DataFrame(self.values[term.model])
+        return pd.DataFrame(self.values.get((term.metric, term.model), self.zero))
 
 
-def superiority(n_checks: int, *, trials: bool) -> Claim:
+def superiority(n_checks: int, kind: Kind) -> Claim:
     """The paper's model is ahead of each of so many rivals by more than the margin."""
 
     def rule(q: Query) -> Checks:
-        ask = q.executed if trials else q.ll
         for i in range(n_checks):
-            found = ask(TSM, REACHER) - ask(Model(f"rival{i}"), REACHER) > MARGIN
+            found = kind.ask(q, TSM, REACHER) - kind.ask(q, Model(f"rival{i}"), REACHER) > MARGIN
             assert isinstance(found, Check)
             yield found
 
-    return Claim("X1", "simulated", FIGURE5, "it")(rule)
+    return Claim("X1", "simulated", FIGURE5, "it", readings=kind.readings)(rule)
 
 
 def worlds(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     """A line for each kind of rows, number of seeds, of checks, and effect."""
     lines = []
-    for (kind, how), seeds, n_checks, effect in product(
-        {"scores": SCORES, "plans": PLANS}.items(), (1, 3, 5, 6, 10), (1, 8), (1.0, 2.0)
-    ):
-        asked, effects = superiority(n_checks, trials=how.targets > 1), np.full(n_checks, effect)
-        words = [evaluate.judge(asked, World(effects, seeds, how, rng)).word for _ in range(studies)]
-        shares = {word.lower(): words.count(word) / studies for word in (REPLICATED, FAILED)}
-        lines.append({"rows": kind, "seeds": seeds, "checks": n_checks, "effect": effect, **shares, "studies": studies})
+    for name, kind in KINDS.items():
+        for seeds, n_checks, effect in product(*CASES[name], (1.0, 2.0)):
+            asked, effects = superiority(n_checks, kind), np.full(n_checks, effect)
+            words = [evaluate.judge(asked, World(effects, seeds, kind, rng)).word for _ in range(studies)]
+            shares = {word.lower(): words.count(word) / studies for word in (REPLICATED, DEPENDENT, FAILED)}
+            about = {"rows": name, "seeds": seeds, "checks": n_checks, "effect": effect}
+            lines.append({**about, **shares, "studies": studies})
     return pd.DataFrame(lines)
 
 
@@ -161,12 +188,12 @@ def page_table(found: pd.DataFrame) -> str:
     decided = found[(found["seeds"] > 1) | (found["rows"] == "plans")]
     lines = [
         "| rows | training seeds | checks | wrongly replicated, effect 1 | wrongly not replicated, effect 1 | "
-        "replicated, effect 2 |",
-        "|---|---|---|---|---|---|",
+        "reading-dependent, effect 1 | replicated, effect 2 |",
+        "|---|---|---|---|---|---|---|",
     ]
     for (rows, seeds, n_checks), pair in decided.groupby(["rows", "seeds", "checks"], sort=False):
         false, true = (pair[pair["effect"] == effect].iloc[0] for effect in (1, 2))
-        shares = [false[REPLICATED.lower()], false[FAILED.lower()], true[REPLICATED.lower()]]
+        shares = [*(false[word.lower()] for word in (REPLICATED, FAILED, DEPENDENT)), true[REPLICATED.lower()]]
         lines.append(f"| {rows} | {seeds} | {n_checks} | {' | '.join(map(percent, shares))} |")
     return "\n".join(lines)
 

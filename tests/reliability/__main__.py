@@ -57,6 +57,7 @@ CHECKS: dict[str, list[tuple[Callable[[int], Outcome], int, int]]] = {  # check,
     ],
     "pipelines": [
         (pipelines.notebooks_in_any_order, LONG_ONLY, 2),
+        (pipelines.notebooks_in_workflows, LONG_ONLY, 0),
         (pipelines.cells_out_of_order, LONG_ONLY, 20),
         (pipelines.killed_runs, LONG_ONLY, 24),  # tests/test_runner.py has each once
         (pipelines.elsewhere, 2, 3),

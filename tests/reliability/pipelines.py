@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import random
@@ -141,6 +142,28 @@ def notebooks_in_any_order(trials: int) -> Outcome:
                 for name in sorted(first):
                     found.count(tables.get(name) == first[name], f"{name} differs in order {[p.stem for p in order]}")
     found.note = f"{len(runs.notebooks())} notebooks, {len(first)} tables"
+    return found
+
+
+def notebooks_in_workflows(trials: int = 0) -> Outcome:
+    """R12: all notebooks of two seeds by the pool and by Snakemake: the same tables, but for what a clock measured."""
+    found, made = Outcome(), list[dict[str, list[Any]]]()
+    if importlib.util.find_spec("snakemake") is None:
+        return Outcome(note="no Snakemake: not done")
+    for executor in ("pool", "local"):
+        with folder() as place:
+            command = ["-m", "tsmlib", "run", "all", "--scale", "smoke", "--seeds", "0,2", "--executor", executor]
+            done = subprocess.run(
+                [sys.executable, *command],
+                env={**os.environ, "TSM_RUN_DIR": str(place), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+                cwd=place, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            found.count(done.returncode == 0, done.stderr[-500:])
+            made.append({str(path.relative_to(place)): numbers(path) for path in place.rglob("metrics/*.csv")})
+    pool, workflow = made
+    for name in sorted(pool.keys() | workflow.keys()):
+        found.count(pool.get(name) == workflow.get(name), f"{name} differs")
+    found.note = f"{len(runs.notebooks())} notebooks, 2 seeds, {len(pool)} tables"
     return found
 
 
