@@ -141,7 +141,7 @@ def checks(studies: int, rng: np.random.Generator) -> pd.DataFrame:
             continue
         other = [each.margin for each in one.checks[""] if each.number is check.number and each is not check]
         value, why = truth(check, other)
-        how = deviations(values, crossed=not any(term.curve for term in asked))
+        how = deviations(values, crossed=not evaluate.nested(asked))
         found = (random_effects(study) for study in drawn(np.full(studies, value), SEEDS, how, rng))
         holds = [evaluate.compared(check, each, "").state == "holds" for each in found]
         lines.append({

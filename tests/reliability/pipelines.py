@@ -161,6 +161,7 @@ def notebooks_in_workflows(trials: int = 0) -> Outcome:
             found.count(done.returncode == 0, done.stderr[-500:])
             made.append({str(path.relative_to(place)): numbers(path) for path in place.rglob("metrics/*.csv")})
     pool, workflow = made
+    found.count(pool, "no tables")
     for name in sorted(pool.keys() | workflow.keys()):
         found.count(pool.get(name) == workflow.get(name), f"{name} differs")
     found.note = f"{len(runs.notebooks())} notebooks, 2 seeds, {len(pool)} tables"
