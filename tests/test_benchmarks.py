@@ -9,15 +9,17 @@ from pathlib import Path
 import _rounds
 import _table
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from scripts import run_script
+from scripts import load_script, run_script
 from torch.utils.flop_counter import FlopCounterMode
 
 from tsmlib.__main__ import _benchmarks, main
 from tsmlib.models.layers import CausalDecoder, Encoder
 from tsmlib.storage import tables
 from tsmlib.study import runs
+from tsmlib.study.runs import ROOT
 
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],
@@ -183,3 +185,21 @@ def test_the_page_of_speed_has_a_place_for_its_table() -> None:
     text = (runs.ROOT / "docs" / "speed.md").read_text()
     assert text.count(_table.MARKS[0]) == text.count(_table.MARKS[1]) == 1
     assert tables.COLUMNS[-1] == "scale"  # what benchmarks add comes after
+
+
+def test_lines_of_seeds_replace_those_of_the_same_processor_alone() -> None:
+    seeds = load_script(ROOT / "benchmarks" / "settings" / "seeds.py", "settings_seeds")
+    stored = pd.DataFrame(
+        {"env": "arm", "model": ["a", "b"], "seed": "1", "processor": "gpu", "validation": ["1", "2"]}
+    )
+    new = pd.DataFrame({"env": "arm", "model": "a", "seed": "1", "processor": ["cpu", "gpu"], "validation": list("34")})
+    assert seeds.merged(stored, new)[["model", "processor", "validation"]].to_numpy().tolist() == [
+        ["a", "gpu", "4"], ["b", "gpu", "2"], ["a", "cpu", "3"],
+    ]  # fmt: skip
+
+
+def test_trainings_of_one_seed_that_are_compared_have_no_interval() -> None:
+    twice = load_script(ROOT / "benchmarks" / "settings" / "twice.py", "settings_twice")
+    one = pd.DataFrame({"model": "m", "metric": "nrmse", "seed": [6], "gpu": [0.5], "cpu": [0.25]})
+    assert twice.compared(one)["CPU minus GPU"].tolist() == ["-0.250"]
+    assert " ± " in twice.compared(pd.concat([one, one.assign(seed=7, cpu=0.3)]))["CPU minus GPU"].item()

@@ -439,6 +439,26 @@ def test_the_page_says_how_often_simulated_verdicts_were_wrong() -> None:
     assert printed in publish.CLAIMS_PAGE.read_text(), "put the output of benchmarks/verdicts/run.py --table there"
 
 
+def test_the_page_says_of_simulated_verdicts_what_the_worlds_do() -> None:
+    module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
+    found = pd.read_csv(ROOT / "benchmarks" / "verdicts" / "worlds.csv")
+    assert set(found["rows"]) == set(module.KINDS)
+    false = found[(found["effect"] == 1) & (found["seeds"] >= 3)]
+    assert (false[["replicated", "not replicated"]] < 0.05).all(axis=None)
+    one = false[(false["checks"] == 1) & false["rows"].str.contains("readings")]
+    page = publish.CLAIMS_PAGE.read_text()
+    assert f"in {one['reading-dependent'].min():.0%} to {one['reading-dependent'].max():.0%}".replace("%", "") in page
+    told = found[(found["rows"] == "policies, 3 copies") & (found["seeds"] == 5) & (found["effect"] == 2)]
+    assert " and ".join(f"{100 * share:.0f} %" for share in told["replicated"]) in page
+
+
+def test_what_simulated_checks_share_leaves_each_as_it_was() -> None:
+    module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
+    values = module.drawn(np.zeros(2), 20_000, module.SCORES, np.random.default_rng(0), 0.5)[..., 0]
+    assert np.allclose(values.std(1), module.SCORES.seed, rtol=0.02)
+    assert np.corrcoef(values)[0, 1] == pytest.approx(0.5, abs=0.02)
+
+
 def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
     module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
     columns = ["claim", "check", "seeds", "margin", "truth", "why"]

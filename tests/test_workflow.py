@@ -229,8 +229,9 @@ def test_a_machine_without_a_gpu_submits_steps_that_need_one_and_data_need_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ParameterError, match="device is cuda"):
-        workflow.prepare(NOTEBOOKS, [0], scale="smoke", device="cuda", given={})
+    for here in ("", "local", "pool"):
+        with pytest.raises(ParameterError, match="device is cuda"):
+            workflow.prepare(NOTEBOOKS, [0], scale="smoke", device="cuda", given={}, executor=here)
     prepared = workflow.prepare(NOTEBOOKS, [0], scale="smoke", device="cuda", given={}, executor="slurm")
     for step in workflow.steps(prepared, {}).values():
         assert f"--device {'cpu' if step.kind == 'data' else 'cuda'}" in step.command

@@ -97,10 +97,11 @@ def table(of: list[runs.Run], envs: Sequence[str], words: Sequence[str]) -> pd.D
     return pd.DataFrame(lines)
 
 
-def merged(there: pd.DataFrame, found: pd.DataFrame) -> pd.DataFrame:
-    """Lines that are there, in their order, with those found in place of such about the same; new ones at the end."""
+def merged(stored: pd.DataFrame, new: pd.DataFrame) -> pd.DataFrame:
+    """Stored lines in their order, replaced where a new one has the same environment, model, seed and processor; then
+    the other new ones."""
     about = ["env", "model", "seed", "processor"]
-    lines = pd.concat([there, found]).set_index(about)
+    lines = pd.concat([stored, new]).set_index(about)
     last = lines[~lines.index.duplicated(keep="last")]
     return last.loc[lines.index.unique()].reset_index()
 

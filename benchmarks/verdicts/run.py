@@ -55,23 +55,29 @@ class Deviations(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Worlds of a kind. ask: a claim's number of a model. shared: of the seeds' variance. readings: other ones."""
+    """Worlds of a kind.
+
+    ask: a claim's number of a model. shared: of the seeds' variance, in all checks and readings. readings: other ones.
+    seeds: how many, in turn.
+    """
 
     how: Deviations
     ask: Callable[[Query, Model, Place], Number]
     shared: float = 0.0
     readings: Mapping[str, Mapping[str, str]] = {}
+    seeds: tuple[int, ...] = (3, 5, 10)
 
 
 SCORES = Deviations(0.5, 0.0, 0.0, 1)
+FEW_TO_TEN, CHECKS, EFFECTS = (1, 3, 5, 6, 10), (1, 8), (1.0, 2.0)
 OTHERS = {"second": {"likelihood": "ll_shared"}, "third": {"likelihood": "ll_horizon"}}  # readings
 KINDS = {
-    "scores": Kind(SCORES, Query.ll), "plans": Kind(Deviations(0.5, 2.5, 2.5, 100), Query.executed),
+    "scores": Kind(SCORES, Query.ll, seeds=FEW_TO_TEN),
+    "plans": Kind(Deviations(0.5, 2.5, 2.5, 100), Query.executed, seeds=FEW_TO_TEN),
     "policies, 3 copies": Kind(Deviations(0.5, 0.0, 0.5, 3), Query.final),
     "scores, checks that share half": Kind(SCORES, Query.ll, 0.5),
     "scores, three readings that share half": Kind(SCORES, Query.ll, 0.5, OTHERS),
 }  # fmt: skip
-CASES = {kind: ((1, 3, 5, 6, 10), (1, 8)) if kind in ("scores", "plans") else ((3, 5, 10), (1, 8)) for kind in KINDS}
 
 
 def drawn(
@@ -95,10 +101,10 @@ class World(evaluate.Tables):
         values = drawn(np.tile(effects, len(metrics)), seeds, kind.how, rng, kind.shared)
         asked = product(metrics, range(len(effects)))
         self.values = {(metric, f"rival{i}"): -each for (metric, i), each in zip(asked, values, strict=True)}
-        self.zero = np.zeros(values.shape[1:])
+        self.values |= {(metric, PAPERS): np.zeros(values.shape[1:]) for metric in metrics}
 
     def ask(self, term: Term) -> pd.DataFrame:
-        return pd.DataFrame(self.values.get((term.metric, term.model), self.zero))
+        return pd.DataFrame(self.values[term.metric, term.model])
 
 
 def superiority(n_checks: int, kind: Kind) -> Claim:
@@ -117,7 +123,7 @@ def worlds(studies: int, rng: np.random.Generator) -> pd.DataFrame:
     """A line for each kind of rows, number of seeds, of checks, and effect."""
     lines = []
     for name, kind in KINDS.items():
-        for seeds, n_checks, effect in product(*CASES[name], (1.0, 2.0)):
+        for seeds, n_checks, effect in product(kind.seeds, CHECKS, EFFECTS):
             asked, effects = superiority(n_checks, kind), np.full(n_checks, effect)
             words = [evaluate.judge(asked, World(effects, seeds, kind, rng)).word for _ in range(studies)]
             shares = {word.lower(): words.count(word) / studies for word in (REPLICATED, DEPENDENT, FAILED)}

@@ -42,7 +42,7 @@ from tsmlib.study.runs import NOTEBOOKS, Notebook, Run, RunError
 
 SNAKEFILE = Path(__file__).with_name("Snakefile")
 POOL = "pool"  # in place of an executor: no Snakemake
-HERE = ("", "local", POOL)  # executors of this machine
+LOCAL_EXECUTORS = ("", "local", POOL)  # those of this machine
 INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 COPY = 500  # MB more for each further seed of a training of several: its data
@@ -191,7 +191,7 @@ def prepare(
     claims = [notebook for notebook in last if notebook.stem == CLAIMS]
     order = [(notebook, seed) for seed in seeds for notebook in last if notebook not in claims]
     order += [(notebook, seed) for seed in seeds for notebook in claims]
-    elsewhere = executor not in HERE
+    elsewhere = executor not in LOCAL_EXECUTORS
     return [
         notebooks.prepare(one, scale=scale, seed=seed, device=device, given=given, elsewhere=elsewhere)
         for one, seed in order
