@@ -198,6 +198,27 @@ def test_lines_of_seeds_replace_those_of_the_same_processor_alone() -> None:
     ]  # fmt: skip
 
 
+def test_a_table_of_two_trainings_pairs_scores_of_the_older_and_of_those_that_ship(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    twice = load_script(ROOT / "benchmarks" / "settings" / "twice.py", "settings_twice")
+    line = {"env": twice.PUSH, "model": "rtsm", "seed": 6, "execution": "open loop", "subset": "", "metric": "nrmse"}
+    for name, value in (("older", 0.5), ("03_predict", 0.25)):
+        tables.save(tmp_path / f"{name}.csv", [line | {"value": value}])
+    monkeypatch.setattr(twice, "FILE", tmp_path / "twice.csv")
+    monkeypatch.setattr(twice, "RESULTS", tmp_path)
+
+    def written(older: str) -> str:
+        monkeypatch.setattr("sys.argv", ["twice.py", "write", str(tmp_path / older), "--seeds", "6"])
+        twice.main()
+        return (tmp_path / "twice.csv").read_text()
+
+    assert written("older.csv") == "model,metric,seed,gpu,cpu\nrtsm,nrmse,6,0.5,0.25\n"
+    with pytest.raises(SystemExit):
+        written("03_predict.csv")
+    assert "seeds [6] have no other scores there than those that ship" in capsys.readouterr().err
+
+
 def test_trainings_of_one_seed_that_are_compared_have_no_interval() -> None:
     twice = load_script(ROOT / "benchmarks" / "settings" / "twice.py", "settings_twice")
     one = pd.DataFrame({"model": "m", "metric": "nrmse", "seed": [6], "gpu": [0.5], "cpu": [0.25]})
