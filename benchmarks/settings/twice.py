@@ -1,7 +1,7 @@
 """Models that were trained twice with the same training seeds: as copies on a GPU, and alone on a CPU.
 
     git show 8a20766:data/results/03_predict.csv.gz > build/gpu.csv.gz
-    python benchmarks/settings/twice.py write build/gpu.csv.gz --seeds 6
+    python benchmarks/settings/twice.py write build/gpu.csv.gz --seeds 6 7 8
     python benchmarks/settings/twice.py
 
 write puts scores of pushing of these seeds into twice.csv, from an older table of scores (GPU) and the one that ships
@@ -51,7 +51,7 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("part", nargs="?", default="print", choices=("write", "print"))
     options.add_argument("older", nargs="?", type=Path, help="the table of write")
-    options.add_argument("--seeds", nargs="+", type=int, default=[6])
+    options.add_argument("--seeds", nargs="+", type=int, default=[6, 7, 8])
     given = options.parse_args()
     if (given.part == "write") != bool(given.older):
         options.error("write, and nothing else, takes an older table of scores")
