@@ -96,7 +96,7 @@ def test_a_page_names_commands_and_files_that_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", COMMANDING, ids=str)
 def test_a_command_of_a_page_is_a_script_that_has_its_options(page: Path) -> None:
-    text = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), page.read_text())  # wrapped in a line
+    text = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), page.read_text())  # unwrapped
     lines = text.replace("\\\n", " ").splitlines()
     for command in [found for line in lines for found in COMMAND.findall(line)]:
         script, *words = re.split(" -- | #", command)[0].split()
