@@ -20,6 +20,8 @@ from tsmlib.models.layers import CausalDecoder, Encoder
 from tsmlib.storage import tables
 from tsmlib.study import runs
 
+REACH, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
+
 TINY = {
     "collect": ["--episodes", "6", "--loop-episodes", "2"],
     "robots": ["--episodes", "3", "--loop-episodes", "2"],
@@ -205,9 +207,10 @@ def test_a_table_of_two_trainings_pairs_scores_of_the_older_and_of_those_that_sh
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     twice = load_script(runs.ROOT / "benchmarks" / "settings" / "twice.py", "settings_twice")
-    line = {"env": twice.PUSH, "model": "rtsm", "seed": 6, "execution": "open loop", "subset": "", "metric": "nrmse"}
-    for name, value in (("older", 0.5), ("03_predict", 0.25)):
-        tables.save(tmp_path / f"{name}.csv", [line | {"value": value}])
+    push = {"env": PUSH, "model": "rtsm", "seed": 6, "execution": "open loop", "subset": "", "metric": "nrmse"}
+    lines = [(push, 0.25), (push | {"env": REACH, "seed": 5}, 0.75), (push | {"env": REACH, "noise": 0.25}, 1.0)]
+    for name, more in (("older", 0.25), ("03_predict", 0.0)):
+        tables.save(tmp_path / f"{name}.csv", [line | {"value": value + more} for line, value in lines])
     monkeypatch.setattr(twice, "FILE", tmp_path / "twice.csv")
     monkeypatch.setattr(twice, "RESULTS", tmp_path)
 
@@ -216,14 +219,16 @@ def test_a_table_of_two_trainings_pairs_scores_of_the_older_and_of_those_that_sh
         twice.main()
         return (tmp_path / "twice.csv").read_text()
 
-    assert written("older.csv") == "model,metric,seed,gpu,cpu\nrtsm,nrmse,6,0.5,0.25\n"
+    assert written("older.csv").splitlines() == [
+        "env,model,metric,seed,gpu,cpu", f"{REACH},rtsm,nrmse,5,1,0.75", f"{PUSH},rtsm,nrmse,6,0.5,0.25",
+    ]  # fmt: skip
     with pytest.raises(SystemExit):
         written("03_predict.csv")
-    assert "no other scores of pushing there than those that ship" in capsys.readouterr().err
+    assert "no other scores of these arms there than those that ship" in capsys.readouterr().err
 
 
 def test_trainings_of_one_seed_that_are_compared_have_no_interval() -> None:
     twice = load_script(runs.ROOT / "benchmarks" / "settings" / "twice.py", "settings_twice")
-    one = pd.DataFrame({"model": "m", "metric": "nrmse", "seed": [6], "gpu": [0.5], "cpu": [0.25]})
+    one = pd.DataFrame({"env": PUSH, "model": "m", "metric": "nrmse", "seed": [6], "gpu": [0.5], "cpu": [0.25]})
     assert twice.compared(one)["CPU minus GPU"].tolist() == ["-0.250"]
     assert " ± " in twice.compared(pd.concat([one, one.assign(seed=7, cpu=0.3)]))["CPU minus GPU"].item()
