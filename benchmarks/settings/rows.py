@@ -19,6 +19,7 @@ codes, how many of 500 iterations until its plans are nearly done, for 25 target
 gradients: their errors (02_train). collect, latent and robustness execute 01_collect, 04_latent and 06_robustness in
 the run's folder for --envs and --models, as far as these ask for them, and publish what their tables then say:
 06_robustness of tsm/Reacher-v0 in its imperfect worlds and of the place of its map that tsm/ReacherObstacle-v0 is.
+imperfect: what 06_robustness says of predictions with noise and with delay, without its policies and its map.
 
 rounds: of exploration on --envs, by default the pendulum, by each of --data: own plans, as many random episodes, or no
 new ones (the same training alone); of pushing also contacts in each round's episodes, and how soon a search through
@@ -42,14 +43,33 @@ from collections.abc import Callable, Iterable
 from functools import partial, reduce
 from itertools import product
 from pathlib import Path
+from typing import TypedDict, cast
 
+import numpy as np
 import pandas as pd
 
 from tsmlib import figures, study
-from tsmlib.envs.spec import ENV_IDS
+from tsmlib.envs import imperfect
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE
+from tsmlib.evaluation import filtering, futures, prediction
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
+from tsmlib.models.recurrent import RecurrentTSM
+from tsmlib.models.tsm import TSM
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, drawings, media, needed, notebooks, parameters, rounds, runs, worlds, zoo
+from tsmlib.study import (
+    adaptation,
+    drawings,
+    media,
+    needed,
+    notebooks,
+    parameters,
+    predictions,
+    results,
+    rounds,
+    runs,
+    worlds,
+    zoo,
+)
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
@@ -63,15 +83,23 @@ KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution",
 LOOP = ("env", "model", "configuration", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
-    "latent": "04_latent", "convergence": "05_control", "robustness": "06_robustness", "torques": "07_action_prior",
-    "rounds": "10_explore", "adaptation": "10_explore",
+    "latent": "04_latent", "convergence": "05_control", "robustness": "06_robustness", "imperfect": "06_robustness",
+    "torques": "07_action_prior", "rounds": "10_explore", "adaptation": "10_explore",
 }  # fmt: skip
+REACH = ENV_IDS[0]
 WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
 WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
 MAPPED = ("rtsm", exploration.PLANNED, 0, "paper")  # the loops whose episodes are drawn
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
+
+
+class Common(TypedDict):
+    """What all rows of a run have."""
+
+    seed: int
+    scale: str
 
 
 def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
@@ -178,6 +206,43 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
         rows += action_prior.task_rows(study.task_torques(run, task), trials[task.env], run)
         rows += study.signal_rows(run, task.take(50), [word for word in models if word != SIMULATOR], samples=32)
     return rows
+
+
+def imperfect_rows(run: runs.Run, models: list[str]) -> list[Row]:
+    """Rows of 06_robustness.csv on the reaching arm with noise and with delay, but for those of policies."""
+    noisy, late = imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY)
+    pairs, coded = list(product((noisy, late), models)), [word for word in models if word in zoo.words(cls=zoo.CODED)]
+    study.precompute(run, [Scores(env, word, segments) for env, word in pairs for segments in (False, True)])
+    n, samples = run.pick(smoke=8, laptop=100, paper=1000), run.pick(smoke=4, laptop=16, paper=32)
+    held_out = {env: study.dataset(run, env, "validation") for env in (noisy, late, REACH)}
+    test = {env: study.dataset(run, env, "test").take(slice(n)) for env in (noisy, late, REACH)}
+    rows, common, truth = study.score_rows(run, pairs), Common(seed=run.seed, scale=run.scale), test[REACH]
+    about = {"planner": "none", "execution": "open loop", "subset": "past actions zero", "n": n}
+    for word in coded:
+        blind = predictions.WithoutPastActions(study.load_or_train(run, late, word).model)
+        found = prediction.score(
+            blind, blind.features, test[late], held_out[late], horizon=90, samples=samples, seed=run.seed, progress=word
+        )
+        here = results.table.place(late) | about | {**common} | {"model": word}
+        rows += [here | {"metric": metric, "value": value} for metric, value in results.prediction.means(found).items()]
+    for env, word in product((noisy, late), coded):
+        segments = cast(TSM | RecurrentTSM, study.load_or_train(run, env, word).model)
+        drawn = futures.sample_futures(segments, test[env], samples=samples, horizon=10, seed=run.seed)
+        own = results.latent.rows(segments, drawn, model=word, **common)
+        rows += [row for row in own if not row.get("subset") and "dimension" not in row]
+    for word in models:
+        net = study.load_or_train(run, noisy, word).model
+        off = filtering.model_errors(net, test[noisy], truth, samples=samples, progress=word)
+        rows += results.robustness.error_rows(noisy, word, off, **common)
+    raw = filtering.errors(test[noisy].states[:, 1:], truth.states[:, 1:])
+    raw = np.repeat(raw[:, :, None], 10, 2).reshape(-1, 10, raw.shape[-1])
+    rows += results.robustness.error_rows(noisy, "none", raw, **common)
+    told = held_out[noisy], held_out[REACH]
+    kalman = filtering.KalmanFilter.fitted(study.dataset(run, REACH, "train"), NOISE).tuned(*told)
+    now, ahead = filtering.filter_errors(kalman, test[noisy], truth)
+    rows += results.robustness.error_rows(noisy, "filter", ahead, now, **common)
+    now = filtering.exponential_errors(filtering.tuned_exponential(*told), test[noisy], truth)
+    return rows + results.robustness.error_rows(noisy, "exponential", None, now, **common)
 
 
 def adapted(
@@ -332,6 +397,8 @@ def main() -> None:
         publish("03_ablation" if given.part == "ablations" else notebook, study.score_rows(run, pairs))
     elif given.part == "convergence":
         publish(f"{notebook}_rows", convergence(run, given.envs, given.models))
+    elif given.part == "imperfect":
+        publish(notebook, imperfect_rows(run, given.models))
     elif given.part == "torques":
         publish(notebook, torques(run, given.envs, given.models, given.planners))
     elif given.part == "rounds":
