@@ -33,6 +33,7 @@ from tsmlib.study.claims.claim import (
 )  # fmt: skip
 from tsmlib.study.claims.evaluate import Tables
 from tsmlib.study.claims.query import (
+    ADAM,
     LAP,
     LIKELIHOODS,
     LSTM,
@@ -626,17 +627,66 @@ def test_a_claim_in_full_shows_every_seed_of_every_check_and_each_reading() -> N
     fair = [score("tsm", k, -1.0 - 0.1 * k, metric="ll_shared") for k in range(3)]
     verdict = evaluate.judge(rule, frames(of_03_predict=rows + fair))
     text = report.in_full(verdict, verdict)
-    strips = [line for line in text.splitlines() if "|" in line and "; asked" in line]
-    assert len(strips) == 2
-    for strip in strips:
-        drawn, _, words = strip.partition("  open  ")
-        assert drawn.count("o") == 3  # the middle one hides the mean
-        assert drawn.index("|") == report.HALF
-        assert "5 [-" in words
-    assert strips[0].index("o") > report.HALF  # all seeds lie beyond 0
-    read = [[cell.strip() for cell in line.split("|")[1:3]] for line in text.splitlines() if line.startswith("| ")]
+    assert "![Checks of X1](figures/claims/X1.svg)" in text
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
+    assert [line[0] for line in cells[1:3]] == ["1", "2"]
+    assert [line[2] for line in cells[1:3]] == ["> 0", "< 8"]
+    assert all(line[3].startswith("5 [-") and line[4] == "open" for line in cells[1:3])
+    drawn = report.drawn_checks(verdict)
+    assert [(check.margin, check.rising, check.seeds.tolist()) for check in drawn] == [
+        (0, True, [1.0, 5.0, 9.0]), (8, False, [1.0, 5.0, 9.0]),
+    ]  # fmt: skip
+    read = [line[:2] for line in cells[3:]]
     assert read[1:] == [["as the paper words it", "inconclusive"], ["A1b one shared variance", "not replicated"]]
     assert "What would change it: about 10 training seeds that differ as these do" in text
+
+
+def test_the_figure_of_a_claim_has_a_row_for_every_check_and_a_mark_for_every_seed() -> None:
+    seeds, none = np.array([1.0, 5.0, 9.0]), np.full(3, np.nan)
+    rows = [
+        figures.DrawnCheck("holds", "5 [1, 9]", 0, True, np.array([5.0, 1.0, 9.0]), seeds),
+        figures.DrawnCheck("fails", "5 [1, 9]", 0, False, np.array([5.0, 1.0, 9.0]), seeds),
+        figures.DrawnCheck("missing", "no rows", 0, True, none, none[:0]),
+    ]
+    ax = figures.claim_checks(rows).axes[0]
+    places = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "o"]
+    assert places == [[1 / 9, 5 / 9, 1], [-1 / 9, -5 / 9, -1], []]  # what is claimed lies to the right
+    words = [text.get_text() for text in ax.texts]
+    assert {"1  holds", "2  fails", "3  missing", "no rows"} <= set(words)
+    assert (words.count("-9"), words.count("9")) == (2, 2)  # the ends of both scales
+    with pytest.raises(ValueError, match="no checks"):
+        figures.claim_checks([])
+
+
+def test_an_svg_file_has_the_same_bytes_on_any_day(tmp_path: Path) -> None:
+    row = figures.DrawnCheck("holds", "5", 0, True, np.array([5.0, 1.0, 9.0]), np.array([5.0]))
+    files = [figures.save_svg(figures.claim_checks([row]), tmp_path / name) for name in ("a.svg", "b.svg")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert b"Date" not in files[0].read_bytes()
+
+
+def test_an_interval_that_is_no_95_percent_says_so() -> None:
+    rule = claim(lambda q: iter([*between(0, q.ll(TSM, REACHER), 9), q.ll(TSM, REACHER) > 0]))
+    rows = [score("tsm", k, 1.0 + k) for k in range(3)]
+    texts = [effect.estimate for effect in evaluate.judge(rule, frames(of_03_predict=rows)).effects[""]]
+    assert ["(90 %)" in text for text in texts] == [True, True, False]
+
+
+def test_the_claims_that_the_papers_planner_judges_otherwise_are_named() -> None:
+    rule = claim(lambda q: iter([q.executed(TSM, REACHER) - q.executed(LSTM, REACHER) > 0]), readings=ADAM)
+    about = dict(metric="return_true", env="tsm/Reacher-v0", search_space="direct", horizon=50, execution="open loop",
+                 scale="paper")  # fmt: skip
+    rows = [
+        dict(about, planner=planner, model=model, seed=seed, target=target, value=value + 0.01 * seed + 0.001 * target)
+        for planner, lead in (("cem", 1.0), ("adam", -1.0)) for model, value in (("tsm", lead), ("lstm", 0.0))
+        for seed in range(3) for target in range(3)
+    ]  # fmt: skip
+    rows = [row | {"value": row["value"] * (1 + 0.1 * row["seed"])} for row in rows]
+    verdict = evaluate.judge(rule, frames(of_05_control_rows=rows))
+    assert verdict.claim.primary == "by CEM (A20)"
+    assert report.by_papers_planner([verdict]).endswith("in place of CEM: X1 not replicated.")
+    same = evaluate.judge(superiority(LSTM), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1]))
+    assert (same.claim.primary, report.by_papers_planner([same])) == ("as the paper words it", "")
 
 
 def test_seeds_to_decide_are_those_that_put_the_interval_beside_the_margin() -> None:
@@ -653,8 +703,8 @@ def test_seeds_to_decide_are_those_that_put_the_interval_beside_the_margin() -> 
 @pytest.mark.parametrize(
     ("tsm", "said"),
     [
-        ([3.0, 3.1, 3.2], "to the other side of its margin, 3.1 from where it lies on the right one"),
-        ([-3.0, -3.1, -3.2], "to the other side of its margin, 3.1 from where it lies on the wrong one"),
+        ([3.0, 3.1, 3.2], "a mean of the deciding check below 0, in place of 3.1"),
+        ([-3.0, -3.1, -3.2], "a mean of the deciding check above 0, in place of -3.1"),
         ([3.0], "another training seed"),
         ([], "rows, which are missing"),
     ],

@@ -2,6 +2,8 @@ from .action_prior import cost_of_prior as cost_of_prior
 from .action_prior import figure10 as figure10
 from .action_prior import prior_walks as prior_walks
 from .action_prior import spectra as spectra
+from .claims import DrawnCheck as DrawnCheck
+from .claims import claim_checks as claim_checks
 from .claims import claim_margins as claim_margins
 from .data import figure4 as figure4
 from .data import loss_curves as loss_curves
@@ -48,6 +50,7 @@ from .rollouts import gallery as gallery
 from .rollouts import rollout_panels as rollout_panels
 from .sliders import slider_panel as slider_panel
 from .style import save as save
+from .style import save_svg as save_svg
 from .style import stamp as stamp
 from .video import animation as animation
 from .video import embed as embed

@@ -1,16 +1,17 @@
-"""Figure of the claim ledger: every effect against its margin."""
+"""Figures of the claim ledger: every claim against its margin, and every check of a claim with its training seeds."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from tsmlib.figures.style import WIDTH, entry, legend, styled
+from tsmlib.figures.style import NOTE, WIDTH, entry, legend, rows_only, styled
 
 VERDICTS = {  # verdict -> colour
     "REPLICATED": "#009E73", "READING-DEPENDENT": "#E69F00", "INCONCLUSIVE": "#7A7A7A", "NOT REPLICATED": "#D55E00",
@@ -65,4 +66,61 @@ def claim_margins(claims: Sequence[tuple[str, str, str, str, np.ndarray, np.ndar
         marks.append(entry("no interval: one training seed", color=grey, marker="o", ms=3.4, mfc="white", ls=""))
     marks.append(entry("one training seed of the effect that decides", color=grey, marker="|", ms=6, mew=0.6, ls=""))
     legend(figure, marks)
+    return figure
+
+
+STATES = {"holds": "#009E73", "fails": "#D55E00", "open": "#7A7A7A"}  # of a check -> colour; of others grey
+
+
+class DrawnCheck(NamedTuple):
+    """A check as it is drawn.
+
+    estimate: with the ends of its interval (3,), NaN where there are none. seeds: each training seed's number (seeds,).
+    rising: whether the claimed side is that of larger numbers.
+    """
+
+    state: str
+    text: str
+    margin: float
+    rising: bool
+    estimate: np.ndarray
+    seeds: np.ndarray
+
+
+@styled
+def claim_checks(checks: Sequence[DrawnCheck]) -> Figure:
+    """Every check of a claim, a row each, numbered from 1: estimate, interval and training seeds against the margin.
+
+    The claimed side is to the right and tinted. Each row has a scale of its own, linear, with its ends in numbers.
+    ValueError without checks.
+    """
+    if not checks:
+        raise ValueError("no checks: nothing to draw")
+    figure, ax = plt.subplots(figsize=(WIDTH, 0.2 * len(checks) + 0.55))
+    ax.axvspan(0, 1.08, color="#EEF6F2", lw=0, zorder=0)
+    ax.axvline(0, color="#555555", lw=0.8, zorder=1)
+    for y, check in enumerate(checks):
+        colour, side = STATES.get(check.state, "#B0B0B0"), 1 if check.rising else -1
+        beyond, seeds = (side * (numbers - check.margin) for numbers in (check.estimate, check.seeds))
+        furthest = float(np.fmax.reduce(np.abs(np.concatenate([beyond, seeds])), initial=0.0)) or 1.0
+        ax.plot(seeds / furthest, [y] * len(seeds), "o", ms=4, mfc="none", mec=colour, mew=0.6, alpha=0.8, zorder=3)
+        value, low, high = beyond / furthest
+        ax.plot([low, high], [y, y], color=colour, lw=1.6, zorder=2)
+        ax.plot([value, value], [y - 0.32, y + 0.32], color=colour, lw=1.6, zorder=4)
+        words: dict[str, object] = {"va": "center", "fontsize": 5.5, "annotation_clip": False}
+        ax.annotate(f"{y + 1}  {check.state}", (0, y), (-42, 0), ("axes fraction", "data"), "offset points",
+                    ha="right", color=colour, **words)  # fmt: skip
+        for at, share, places in ((-1, 0, "right"), (1, 1, "left")):
+            ends = f"{check.margin + side * at * furthest:.3g}" if np.isfinite(beyond[0]) else ""
+            ax.annotate(ends, (share, y), (4 * at, 0), ("axes fraction", "data"), "offset points", ha=places,
+                        color=NOTE, **words)  # fmt: skip
+        ax.annotate(check.text, (1, y), (38, 0), ("axes fraction", "data"), "offset points", color="#444444", **words)
+    ax.set(xlim=(-1.08, 1.08), ylim=(len(checks) - 0.4, -0.6), xticks=[-1, 0, 1], yticks=[])
+    ax.set_xticklabels(["against the claim", "margin", "for it"])
+    rows_only(ax)
+    grey = "#444444"
+    legend(figure, [
+        entry("mean", color=grey, marker="|", ms=6, mew=1.6, ls=""), entry("interval", color=grey, lw=1.6),
+        entry("one training seed", color=grey, marker="o", ms=4, mfc="none", mew=0.6, ls=""),
+    ])  # fmt: skip
     return figure

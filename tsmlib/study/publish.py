@@ -131,9 +131,14 @@ def publish_claims() -> None:
 
 
 def draw_claims(papers: list[evaluate.Verdict]) -> list[Path]:
-    """The figure of all claims. Returns its files."""
+    """The figure of all claims, and one of the checks of each. Returns their files."""
     figure = figures.claim_margins(claims_report.margins(papers))
-    return [*figures.save(figures.stamp(figure, "Rows: published; the paper's model"), FIGURES / "claims")]
+    found = [*figures.save(figures.stamp(figure, "Rows: published; the paper's model"), FIGURES / "claims")]
+    for verdict in papers:
+        if checks := claims_report.drawn_checks(verdict):
+            path = FIGURES / "claims" / f"{verdict.claim.id}.svg"
+            found.append(figures.save_svg(figures.claim_checks(checks), path))
+    return found
 
 
 def compress() -> None:
@@ -170,7 +175,7 @@ def publish_figures() -> list[Path]:
             for path in drawn_by_cells(notebook, Path(folder)):
                 drawn.add(FIGURES / path.name)
                 files.write_bytes(FIGURES / path.name, path.read_bytes())
-    return sorted(path for path in set(FIGURES.iterdir()) - drawn if path.suffix != ".pdf")
+    return sorted(path for path in set(FIGURES.glob("*.*")) - drawn if path.suffix != ".pdf")
 
 
 def drawn_by_cells(notebook: Notebook, folder: Path) -> list[Path]:

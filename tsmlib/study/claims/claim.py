@@ -71,6 +71,12 @@ class Claim:
         queries = {name: replace(Query(self.subject), **change) for name, change in {"": {}, **self.readings}.items()}
         return {name: [*self.rule(query), *others] for name, query in queries.items()}
 
+    @property
+    def primary(self) -> str:
+        """What the reading is called that decides first: plans are CEM's there, and not Adam's, as in the paper."""
+        terms = [term for check in self.checks[""] for term in check.number.terms]
+        return "by CEM (A20)" if any(term.wanted.get("planner") == "cem" for term in terms) else "as the paper words it"
+
     @cached_property
     def sha256(self) -> str:
         """Of all that decides the verdict: the source of the rule, and every check as it is asked."""

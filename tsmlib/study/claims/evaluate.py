@@ -106,7 +106,8 @@ class Effect:
         """Estimate and interval in words."""
         if self.value is None:
             return "no rows"
-        return f"{self.value:.3g}" + ("" if self.low is None else f" [{self.low:.3g}, {self.high:.3g}]")
+        level = " (90 %)" * (self.check.level == 0.90)
+        return f"{self.value:.3g}" + ("" if self.low is None else f" [{self.low:.3g}, {self.high:.3g}]{level}")
 
     @property
     def text(self) -> str:
@@ -275,9 +276,9 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     if claim.definition:
         word, why = DEFINITIONAL, claim.definition
     elif first == "holds" and turned:
-        word, why = DEPENDENT, f"It holds as the paper words it. It turns with: {'; '.join(turned)}."
+        word, why = DEPENDENT, f"It holds {claim.primary}. It turns with: {'; '.join(turned)}."
     elif first in ("fails", "open") and holds:
-        word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. As the paper words it, {why}"
+        word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. {claim.primary.capitalize()}, {why}"
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
 
 

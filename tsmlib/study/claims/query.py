@@ -68,7 +68,8 @@ TASKS, ARMS = (REACHER, PUSH), (REACHER, OBSTACLE, PUSH)
 VARIANCE = {"A1d one variance per step and dimension": {"likelihood": "ll_horizon"}}
 LIKELIHOODS = {"A1b one shared variance": {"likelihood": "ll_shared"}, **VARIANCE}
 PROTOCOLS = {**LIKELIHOODS, "A6 segments from the true past": {"execution": "segments"}}
-ADAM = {"A20 Adam from zero": {"planner": "adam"}, "A20 Adam from sampled starts": {"planner": "adam+starts"}}
+PAPERS_PLANNER = "A20 Adam from zero"  # the paper has Adam, and does not say where it begins
+ADAM = {PAPERS_PLANNER: {"planner": "adam"}, "A20 Adam from sampled starts": {"planner": "adam+starts"}}
 CLOCKS = {
     "with the samples of the data set": {"samples": "env_samples_to_90"},
     "by the clock": {"samples": "seconds_to_90"},

@@ -1,5 +1,7 @@
 """Verdicts as tables and as arrays: deciding effects, causes, and changes under other readings of the paper."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 
@@ -7,6 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
+from tsmlib import figures
 from tsmlib.study.claims.claim import (
     DEFINITIONAL,
     DEPENDENT,
@@ -18,6 +21,7 @@ from tsmlib.study.claims.claim import (
     Claim,
 )  # fmt: skip
 from tsmlib.study.claims.evaluate import Effect, Verdict, state_of
+from tsmlib.study.claims.query import PAPERS_PLANNER
 from tsmlib.study.results.table import markdown
 from tsmlib.study.runs import FIGURES
 
@@ -45,8 +49,10 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
         claim, key, checks = verdict.claim, verdict.key, len(verdict.checks)
         found = "no rows yet" if key.value is None else key.estimate
         lines.append({
-            "": claim.id, "the claim, in our words": f"{claim.statement} ({claim.place})",
+            "": f"[{claim.id}]({root}docs/claims_in_full.md#{claim.id.lower()})",
+            "the claim, in our words": f"{claim.statement} ({claim.place})",
             "verdict": "; ".join(filter(None, [f"**{verdict.word}**", failing(verdict)])),
+            "by Adam": _under(verdict.effects[PAPERS_PLANNER]) if PAPERS_PLANNER in verdict.effects else "",
             "with our model": other.word.lower(), "measured": claim.statistic,
             "deciding check": "; ".join(filter(None, [
                 f"{found}, asked {key.check.asked}", f"one of {checks}" * (checks > 1), unmeasured(verdict),
@@ -54,6 +60,19 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
             "n": key.n, "shown in": _links(claim, root),
         })  # fmt: skip
     return markdown(pd.DataFrame(lines))
+
+
+def by_papers_planner(verdicts: Sequence[Verdict]) -> str:
+    """The claims of which the paper's planner gives another verdict than ours, in a sentence; '' without any."""
+    planned = [verdict for verdict in verdicts if PAPERS_PLANNER in verdict.effects]
+    words = {verdict.claim.id: _under(verdict.effects[PAPERS_PLANNER]) for verdict in planned}
+    others = {verdict.claim.id: words[verdict.claim.id] for verdict in planned
+              if words[verdict.claim.id] not in ("no rows", verdict.word.lower())}  # fmt: skip
+    told = "; ".join(
+        f"{', '.join(claim for claim in others if others[claim] == word)} {word}"
+        for word in dict.fromkeys(others.values())
+    )
+    return f"By Adam, the paper's planner, in place of CEM: {told}." if told else ""
 
 
 def unmeasured(verdict: Verdict) -> str:
@@ -143,17 +162,22 @@ def readings(verdicts: Sequence[Verdict]) -> str:
 
 
 def in_full(verdict: Verdict, ours: Verdict, *, root: str = "") -> str:
-    """One claim as a section in Markdown: the paper's words and ours, verdict, every check with all its seeds, the
-    verdict under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
-    claim, effects = verdict.claim, verdict.effects[""]
+    """One claim as a section in Markdown: the paper's words and ours, verdict, every check with a picture of all its
+    seeds, the verdict under each reading, and what would change it. ours: the same with ``zoo.OURS`` for TSM."""
+    claim = verdict.claim
     checks = len(verdict.checks)
     several = f"All of {checks} checks have to hold" if checks > 1 else "One check has to hold"
     known = verdict.why if verdict.word in (DEFINITIONAL, UNTESTABLE) else claim.why.get(verdict.word, "")
     known = f" {known}" if known else ""
     several = "; ".join(filter(None, [several, unmeasured(verdict)]))
-    pictures = "\n".join([f"{'against':<{HALF}}|{'for it':>{HALF}}", *map(_strip, effects)])
+    picture = f"![Checks of {claim.id}]({root}figures/claims/{claim.id}.svg)\n\n" * bool(drawn_checks(verdict))
+    found = [
+        {"": i, "check": f"`{effect.check.number.text}`", "asked": f"{effect.check.op} {effect.check.margin:g}",
+         "found": effect.text, "state": effect.state}
+        for i, effect in enumerate(verdict.effects[""], 1)
+    ]  # fmt: skip
     read = [
-        {"reading": reading or "as the paper words it", "verdict": _under(found), "deciding check": _deciding(found)}
+        {"reading": reading or claim.primary, "verdict": _under(found), "deciding check": _deciding(found)}
         for reading, found in verdict.effects.items()
     ]
     return f"""## {claim.id}
@@ -166,9 +190,7 @@ In our words: {claim.statement}
 
 Measured: {claim.statistic}. {several}. Shown in {_links(claim, root)}.
 
-```text
-{pictures}
-```
+{picture}{markdown(pd.DataFrame(found))}
 
 {markdown(pd.DataFrame(read))}
 
@@ -177,27 +199,23 @@ What would change it: {change(verdict)}"""
 
 def quotation(claim: Claim) -> str:
     """The paper's words as a block quote in Markdown, or the figure that a claim is read off."""
-    return f"> “{claim.quote}” ({claim.place})" if claim.quote else f"Read off {claim.place}."
+    told = f"> “{claim.quote}” ({claim.place})" if claim.quote else f"Read off {claim.place}."
+    return told + "\n\nThe paper says this of one picture or video." * claim.picture
 
 
-HALF = 18  # characters on either side of the margin
-
-
-def _strip(effect: Effect) -> str:
-    """A check as one line: seeds o, estimate x and interval - against the margin |, then in words."""
-    beyond = np.concatenate([effect.beyond, effect.seeds_beyond])
-    places: list[str] = [" "] * (2 * HALF + 1)
-    if not np.isnan(beyond[0]):
-        at = HALF + np.rint(HALF * np.nan_to_num(beyond / max(np.nanmax(np.abs(beyond)), 1e-300))).astype(int)
-        value, low, high, *seeds = at.tolist()
-        if effect.low is not None:
-            places[min(low, high) : max(low, high) + 1] = "-" * (abs(high - low) + 1)
-    places[HALF] = "|"
-    if not np.isnan(beyond[0]):
-        for mark, where in (("x", [value]), ("o", seeds)):
-            for place in where:
-                places[place] = mark
-    return f"{''.join(places)}  {effect.state:7}  {effect.text}; asked {effect.check.text}"
+def drawn_checks(verdict: Verdict) -> list[figures.DrawnCheck]:
+    """What ``figures.claim_checks`` draws of a claim; empty where no check has rows."""
+    effects = verdict.effects[""]
+    if all(effect.value is None for effect in effects):
+        return []
+    return [
+        figures.DrawnCheck(
+            effect.state, f"{effect.estimate}, asked {effect.check.op} {effect.check.margin:g}", effect.check.margin,
+            effect.check.op[0] != "<", np.array([effect.value, effect.low, effect.high], float),
+            np.array(effect.by_seed, float),
+        )
+        for effect in effects
+    ]  # fmt: skip
 
 
 def _under(effects: Sequence[Effect]) -> str:
@@ -224,12 +242,12 @@ def change(verdict: Verdict) -> str:
     if key.low is None:
         return "another training seed, since one has no interval."
     away, low, high = key.beyond
+    several = f" All of {checks} checks have to hold." * (checks > 1)
     if verdict.word in (REPLICATED, FAILED):
-        side, half = "right" if verdict.word == REPLICATED else "wrong", abs(high - low) / 2
-        times = f": {abs(away) / half:.1f} times half its interval" if half > 0 else ""
+        towards = "above" if (key.check.op[0] == "<") == (verdict.word == REPLICATED) else "below"
         return (
-            f"rows that bring the mean of the deciding check to the other side of its margin, {abs(away):.3g} from "
-            f"where it lies on the {side} one{times}."
+            f"a mean of the deciding check {towards} {key.check.margin:g}, in place of {key.value:.3g}; more training "
+            f"seeds that differ as these do would hardly bring it there.{several * (verdict.word == FAILED)}"
         )
     side = "right" if away > 0 else "wrong"
     if low * high > 0:
@@ -243,7 +261,7 @@ def change(verdict: Verdict) -> str:
     many = f"about {wanted} training seeds" if wanted else "more than 100 training seeds"
     return (
         f"{many} that differ as these do, which put the interval of the deciding check on the {side} side of its "
-        "margin, where its mean lies."
+        f"margin, where its mean lies.{several}"
     )
 
 

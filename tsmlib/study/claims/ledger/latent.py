@@ -21,9 +21,7 @@ def c45(q: Query) -> Checks:
        quote="When the dynamics are simple and deterministic ... the model does express certainty by ignoring the "
              "latent code.",
        statistic="plain arm: KL per segment in nats, active units, spread of samples over that of the data",
-       why={FAILED: "The codes carry next to nothing and no unit is active. But the decoder does not ignore noise put "
-                    "into them altogether.",
-            REPLICATED: "Codes are ignored with the obstacle too (KL, active units), where the paper would have "
+       why={REPLICATED: "Codes are ignored with the obstacle too (KL, active units), where the paper would have "
                         "them used."})
 def c46(q: Query) -> Checks:
     """Where dynamics are simple and certain, codes are ignored."""
@@ -45,8 +43,8 @@ def c47(q: Query) -> Checks:
        quote="when the dynamics are deterministic but complex, the model also uses the latent codes to express "
              "uncertainty. This can occur ... immediately following a collision",
        statistic="KL on pushing minus the plain arm; spread after contact over that before, at the same steps",
-       why={REPLICATED: "After a touch, on pushing: over all its segments the KL is below what C46 calls ignored, and "
-                        "with the obstacle codes are ignored."})
+       why={REPLICATED: "It holds at pushing, for segments after a touch. Over all segments of pushing the KL is below "
+                        "what C46 calls ignored, and with the obstacle codes are ignored."})
 def c48(q: Query) -> Checks:
     """Where dynamics are certain but complex, codes are used, above all after collisions."""
     yield q.latent("kl", PUSH) - q.latent("kl", REACHER) > 0
@@ -78,7 +76,7 @@ def c50(q: Query) -> Checks:
        quote="when we use an action prior, solutions from trajectory optimization look similar.",
        statistic="area under the curve of a classifier that tells them from held-out training torques",
        why={FAILED: "The classifier also tells apart random draws of the prior and training torques rebuilt "
-                    "through it: it recognises this prior's decoder, planned or not."})
+                    "through it: it recognises this prior's decoder, so that no plan through this prior would pass."})
 def c51(q: Query) -> Checks:
     """Planned through the prior, torques look like training data."""
     for task in TASKS:
@@ -99,9 +97,7 @@ def c52(q: Query) -> Checks:
 @Claim("C53", "section 5.3.5", FIGURE6, headline=True, readings=ADAM,
        quote="the discrepancy between the model and the true dynamics is minimized, resulting in higher rewards "
              "achieved in the actual environment.",
-       statistic="size of the gap and executed return: with the prior minus without, both tasks",
-       why={FAILED: "The oracle returns nearly the same in both search spaces: what the prior loses is lost in "
-                    "the search, not for want of reach."})
+       statistic="size of the gap and executed return: with the prior minus without, both tasks")
 def c53(q: Query) -> Checks:
     """The prior makes gaps smaller and so returns higher."""
     for task in TASKS:
