@@ -471,17 +471,22 @@ def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
 
 def test_the_page_says_what_ten_seeds_would_find_as_the_table_does() -> None:
     stored = pd.read_csv(pages.POWER)
-    said = re.search(r"Of (\d+) checks with .*?would find (\d+) in 95 % of", publish.CLAIMS_PAGE.read_text())
+    page, once = publish.CLAIMS_PAGE.read_text(), stored.drop_duplicates("check")
+    said = re.search(r"for the (\d+) checks with .*? Of these (\d+) are found in 95 % of", page)
     assert said
-    assert [int(number) for number in said.groups()] == [len(stored), sum(stored["power"] >= 0.95)]
-    few = pd.DataFrame({"claim": ["C1", "C2", "C2"], "seeds": 3, "power": [1.0, 0.5, 0.1], "why": "beyond"})
-    assert "Of 3 checks with 3 training seeds" in (told := pages.power_of_ten_seeds(few))
-    assert told.endswith("would find 1 in 95 % of studies or more, were the truth as far beyond the margin as that is "
-                         "from zero. The others would be found in fewer: C2 (10 %, 50 %).")  # fmt: skip
+    assert [int(number) for number in said.groups()] == [len(once), sum(once["power"] >= 0.95)]
+    twice = pd.concat([stored[:1], stored[:1].assign(claim="C99")])
+    assert "for the 1 checks" in pages.power_of_ten_seeds(twice)
+    few = pd.DataFrame({"claim": ["C1", "C2", "C2"], "check": [*"abc"], "seeds": 3, "power": [1.0, 0.5, 0.1]})
+    few["why"] = "beyond"
+    assert "for the 3 checks with 3 training seeds" in (told := pages.power_of_ten_seeds(few))
+    assert told.endswith(
+        "Of these 1 are found in 95 % of studies or more. The others are found in fewer: C2 (10 %, 50 %)."
+    )
     assert "The others" not in pages.power_of_ten_seeds(few[:1])
     told = pages.power_of_ten_seeds(few.assign(why=["nearest", "midway", "midway"]))
-    assert "of 1 that cannot be, as near as can be" in told
-    assert "of 2 that are halves of tests of equivalence, midway" in told
+    assert "for 1 that cannot be, as near as can be" in told
+    assert "for 2 halves of tests of equivalence, midway" in told
 
 
 def test_the_truth_of_a_simulated_check_is_one_that_there_can_be() -> None:

@@ -84,7 +84,8 @@ REASONS: dict[str, Callable[[Mapping[str, evaluate.Verdict]], bool]] = {  # clai
     "C28": lambda v: states_of(effects_of(v, "C28"), "range") == {"fails"},
     "C29": lambda v: (
         "holds" not in {e.state for e in effects_of(v, "C29") if "Reacher)" in e.check.text and "2 *" in e.check.text}
-        and {"holds"} == {e.state for e in effects_of(v, "C29") if "Push)" in e.check.text and "2 *" not in e.check.text}
+        and {"holds"}
+        == {e.state for e in effects_of(v, "C29") if "Push)" in e.check.text and "2 *" not in e.check.text}
         and [e.state for e in effects_of(v, "C29") if "Push)" in e.check.text and "2 *" in e.check.text][1:]
         == ["open", "open"]
     ),

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from tsmlib.figures.style import NOTE, WIDTH, entry, legend, rows_only, styled
+from tsmlib.figures.style import NOTE, WIDTH, Props, entry, legend, rows_only, styled
 
 VERDICTS = {  # verdict -> colour
     "REPLICATED": "#009E73", "READING-DEPENDENT": "#E69F00", "INCONCLUSIVE": "#7A7A7A", "NOT REPLICATED": "#D55E00",
@@ -107,7 +107,7 @@ def claim_checks(checks: Sequence[DrawnCheck]) -> Figure:
         value, low, high = beyond / furthest
         ax.plot([low, high], [y, y], color=colour, lw=1.6, zorder=2)
         ax.plot([value, value], [y - 0.32, y + 0.32], color=colour, lw=1.6, zorder=4)
-        words: dict[str, object] = {"va": "center", "fontsize": 5.5, "annotation_clip": False}
+        words: Props = {"va": "center", "fontsize": 5.5, "annotation_clip": False}
         ax.annotate(f"{y + 1}  {check.state}", (0, y), (-42, 0), ("axes fraction", "data"), "offset points",
                     ha="right", color=colour, **words)  # fmt: skip
         for at, share, places in ((-1, 0, "right"), (1, 1, "left")):

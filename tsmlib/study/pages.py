@@ -13,7 +13,7 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study import adaptation, needed, plans, runs, worlds, zoo
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims import report as claims_report
-from tsmlib.study.claims.claim import DEFINITIONAL, INCONCLUSIVE, VERDICTS
+from tsmlib.study.claims.claim import DEFINITIONAL, VERDICTS
 from tsmlib.study.comparison import published
 from tsmlib.study.results import adaptation as adaptation_results
 from tsmlib.study.results import aims as aims_results
@@ -137,7 +137,7 @@ def readme_scores(env: str) -> str:
             return ""
         ratios = [f"{each[model].mean() / min(each[word].mean() for word in BASELINES):.2f}" for each in found]
         said.append(f"`{model}` {' and '.join(ratios)}")
-    return f"Energy score over the best baseline's, 10 and 80 steps ahead: {', '.join(said)}."
+    return f"Energy score over that of the best of the paper's baselines, 10 and 80 steps ahead: {', '.join(said)}."
 
 
 def _seeds(rows: pd.DataFrame) -> str:
@@ -156,13 +156,13 @@ def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) 
     )  # fmt: skip
     named = [verdict for verdict in papers if verdict.claim.id in README_CLAIMS]
     said = "; ".join(
-        f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" + _leaning(verdict)
-        for verdict in named
+        f"{verdict.claim.id} ({_clause(verdict.claim.statement)}) is **{verdict.word.lower()}**" for verdict in named
     )
     theirs, instead = (f"{claims_report.counts(each)}. {claims_report.seeds_told(each)}" for each in (papers, ours))
+    planned = claims_report.by_papers_planner(papers)
     return f"""**What replicated.** With the paper's model, {theirs}
 With `{OURS}` in its place, {instead}
-Of the {len(carrying)} that carry the paper, with its model: {given}. So {said}."""
+Of the {len(carrying)} main claims, with the paper's model: {given}. So {said}. {planned}"""
 
 
 def _clause(statement: str) -> str:
@@ -170,22 +170,11 @@ def _clause(statement: str) -> str:
     return statement[0].lower() + statement[1:].rstrip(".")
 
 
-def _leaning(verdict: evaluate.Verdict) -> str:
-    """Of an inconclusive verdict: how many of its checks have their whole interval on the wrong side of the margin, and
-    the readings by which it fails."""
-    if verdict.word != INCONCLUSIVE:
-        return ""
-    against = sum(effect.against for effect in verdict.checks)
-    told = f"the intervals of {against} of its {len(verdict.checks)} checks lie against it" * (against > 0)
-    said = "; ".join(filter(None, [told, claims_report.failing(verdict)]))
-    return f" ({said})" * bool(said)
-
-
 # Pages of docs/ ------------------------------------------------------------------------------------------------------
 
 
 def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
-    """Every claim with its verdict, those that carry the paper first."""
+    """Every claim with its verdict, the main claims first."""
     pairs = sorted(zip(papers, ours, strict=True), key=lambda pair: not pair[0].claim.headline)
     headlines = sum(verdict.claim.headline for verdict in papers)
     carry, others = (
@@ -213,7 +202,10 @@ With `{OURS}` in the place of the paper's model:
 
 {power_of_ten_seeds(pd.read_csv(POWER))} {without_margin()}
 
-## The {headlines} claims that carry the paper
+## The {headlines} main claims
+
+What the paper says of long horizons, with its figures 5 to 8 and 10, of codes and of the action prior; chosen together
+with the margins. {claims_report.by_papers_planner(papers)}
 
 {carry}
 
@@ -224,7 +216,8 @@ With `{OURS}` in the place of the paper's model:
 ## Questions of its outlook
 
 The paper ends on what it leaves to future work (section 6). These questions and their thresholds are ours, asked
-of `{OURS}`, and are not counted above.
+of `{OURS}`, and are not counted above. Their margins were set when rows of one training seed were there; what
+was made anew when rows were known is in [deviations](deviations.md#rows-of-earlier-models).
 
 {claims_report.answers(shipped_answers(), root="../")}"""
 
@@ -263,31 +256,34 @@ def time_of_a_seed(control: pd.DataFrame, robustness: pd.DataFrame) -> str:
 
 def power_of_ten_seeds(checks: pd.DataFrame) -> str:
     """How many of the checks in benchmarks/verdicts/checks.csv ten seeds would find, and which they would not."""
-    found, seeds = checks["power"] >= ENOUGH, sorted(checks["seeds"].unique())
+    once, seeds = checks.drop_duplicates("check"), sorted(checks["seeds"].unique())
+    found = once["power"] >= ENOUGH
     weak = [
         f"{claim} ({', '.join(f'{power:.0%}'.replace('%', ' %') for power in sorted(each['power']))})"
-        for claim, each in checks[~found].groupby("claim")
+        for claim, each in once[~found].groupby("claim")
     ]  # fmt: skip
-    nearest, midway = ((checks["why"] == why).sum() for why in ("nearest", "midway"))
-    where = f"; of {nearest} that cannot be, as near as can be (a share or AUC of 1, an AUC of 0.5)" * bool(nearest)
-    where += f"; of {midway} that are halves of tests of equivalence, midway between both margins" * bool(midway)
-    others = f". The others would be found in fewer: {', '.join(weak)}" * bool(weak)
+    nearest, midway = ((once["why"] == why).sum() for why in ("nearest", "midway"))
+    where = f"; for {nearest} that cannot be, as near as can be (a share or AUC of 1, an AUC of 0.5)" * bool(nearest)
+    where += f"; for {midway} halves of tests of equivalence, midway between both margins" * bool(midway)
+    others = f". The others are found in fewer: {', '.join(weak)}" * bool(weak)
     which = " to ".join(str(count) for count in sorted({seeds[0], seeds[-1]}))
     return (
-        f"Of {len(checks)} checks with {which} training seeds and a margin that is not zero "
-        f"(`benchmarks/verdicts/checks.csv`), ten seeds that differ as these do would find {found.sum()} in "
-        f"{ENOUGH:.0%} of studies or more, were the truth as far beyond the margin as that is from zero{where}{others}."
+        f"We simulated ten seeds that differ as those of the rows do, for the {len(once)} checks with {which} training "
+        "seeds and a margin that is not zero, checks of several claims counted once "
+        "(`benchmarks/verdicts/checks.csv`). The truth was as far beyond the margin as that is from zero"
+        f"{where}. Of these {found.sum()} are found in {ENOUGH:.0%} of studies or more{others}."
     ).replace("95%", "95 %")
 
 
 def without_margin() -> str:
     """A sentence: how many checks have a margin of zero, so that their power is not known."""
-    own = [check for claim in ledger.claims(PAPERS) if not claim.definition for check in claim.checks[""]]
-    own = [check for check in own if not check.premise]
-    zero = sum(not check.margin and check.op != "==" for check in own)
+    asked = [check for claim in ledger.claims(PAPERS) if not claim.definition for check in claim.checks[""]]
+    own = {check.text: check for check in asked if not check.premise}.values()
+    zero, equal = (sum(not check.margin and (check.op == "==") is same for check in own) for same in (False, True))
     return (
         f"The power of {zero} others, of {len(own)} checks in all, is not known: their margin is zero, since they ask "
-        "which of two is ahead, and names no difference that would have to be found."
+        "which of two is ahead, and name no difference that would have to be found. Nor is that of "
+        f"{equal} that asks for a difference of zero."
     )
 
 

@@ -122,14 +122,17 @@ def failing(verdict: Verdict) -> str:
 
 def answers(verdicts: Sequence[Verdict], *, root: str = "") -> str:
     """Questions of the paper's outlook with what our rows say, one line for each check, in Markdown."""
-    lines = [
-        {
-            "": verdict.claim.id, "question": f"{verdict.claim.statement} ({verdict.claim.place})",
-            "measured": f"`{effect.check.number.text}`", "answer": f"**{ANSWERS[verdict.word]}**",
-            "found": f"{effect.text}, asked {effect.check.asked}", "shown in": _links(verdict.claim, root),
-        }
-        for verdict in verdicts for effect in verdict.effects[""]
-    ]  # fmt: skip
+    lines = []
+    for verdict in verdicts:
+        answer = " ".join(filter(None, [f"**{ANSWERS[verdict.word]}**", verdict.claim.why.get(verdict.word, "")]))
+        lines += [
+            {
+                "": verdict.claim.id, "question": f"{verdict.claim.statement} ({verdict.claim.place})",
+                "measured": f"`{effect.check.number.text}`", "answer": answer,
+                "found": f"{effect.text}, asked {effect.check.asked}", "shown in": _links(verdict.claim, root),
+            }
+            for effect in verdict.effects[""]
+        ]  # fmt: skip
     return markdown(pd.DataFrame(lines))
 
 
