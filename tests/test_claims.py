@@ -194,7 +194,7 @@ def test_a_share_of_a_lead_that_is_not_there_is_no_margin(lstm: float, word: str
     assert verdict.word == word
     assert len(verdict.effects[""]) == (2 if word == REPLICATED else 3)  # a premise that holds is not a check
     assert ("A margin is a share of" in verdict.why) == (word == UNTESTABLE)
-    assert report.change(verdict).startswith("a lead" if word == UNTESTABLE else "rows that bring")
+    assert report.change(verdict).startswith("a lead" if word == UNTESTABLE else "a mean of the deciding check")
     assert ("not testable" in report.in_full(verdict, verdict)) == (word == UNTESTABLE)
 
 

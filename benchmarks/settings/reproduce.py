@@ -58,6 +58,7 @@ VARIANTS = ("tsm+plain", "tsm+full", "tsm+h1", "tsm+h20", "tsm+z4", "tsm+z16")
 OPEN, CLOSED = {"execution": ("open loop",)}, {"execution": ("closed loop",)}
 POLICY, EARLY = {"planner": ("policy",)}, {"subset": (policies.EARLY,)}
 CONTROL, CONVERGED = ("05_control", "05_control_rows"), {"metric": ("iterations_to_95",)}
+FILTERS = ("none", "filter", "exponential")  # in the place of a model that filters noise
 CEM, ADAM = {"planner": ("cem", "zero", "random")}, {"planner": ("adam",)}
 JUDGED = "08_claims"  # the table that ``publish --claims`` writes, whatever was made before
 CLAIMS = "python -m tsmlib publish --claims"
@@ -80,7 +81,7 @@ class Recipe:
     models: tuple[str, ...] = ()
     extra_models: tuple[str, ...] = ()
     options: str = ""
-    only: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    only: Mapping[str, Sequence[str | int]] = field(default_factory=dict)
     excluded: Mapping[str, Sequence[str]] = field(default_factory=dict)
     variant: str = ""
     script: tuple[str, ...] = ()
@@ -189,7 +190,10 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(CONTROL[:1], "policies", (PUSH,), FIVE, FREE, "--iterations 880", POLICY),
     Recipe(CONTROL[:1], "early", (REACH,), OUR, options="--iterations 220", only=EARLY),
     Recipe(CONTROL[1:], "convergence", (REACH, PUSH), OUR, only=CONVERGED),
-    Recipe(("06_robustness",), "robustness", (REACH, OBSTACLE), FIVE, ("none", "filter", "exponential"), whole=True),
+    Recipe(
+        ("06_robustness",), "robustness", (REACH, OBSTACLE), FIVE, FILTERS, only={"seed": range(5)}, whole=True
+    ),
+    Recipe(("06_robustness",), "imperfect", (REACH,), FIVE, FILTERS, only={"seed": range(5, 10)}, whole=True),
     Recipe(("07_action_prior",), "torques", (REACH, PUSH), OUR, ("prior", "none"), "--planners cem adam"),
     Recipe(("07_action_prior",), "torques", (REACH,), ("oracle",)),
     Recipe(("07_starts",), "", (REACH,), (PAPERS,), script=(
