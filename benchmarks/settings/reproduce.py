@@ -184,7 +184,11 @@ RECIPES = (  # in the order in which they are run: policies without a model befo
     Recipe(CONTROL, "control", (REACH, PUSH), (*FIVE, "ensemble+mse"), FLOORS, only={**CEM, **OPEN}),
     Recipe(CONTROL, "control", (REACH,), ("oracle",), only={"search_space": ("direct",)}),
     Recipe(CONTROL, "control", (PUSH,), FIVE, options=f"--closed {' '.join(FIVE)}", only=CLOSED),
-    Recipe(CONTROL, "control", (REACH, PUSH), FIVE, options="--planners adam", only=ADAM, excluded=CONVERGED),
+    Recipe(CONTROL, "control", (PUSH,), FIVE, options="--planners adam", only=ADAM, excluded=CONVERGED),
+    Recipe(CONTROL, "control", (REACH,), OUR, options="--planners adam", only=ADAM, excluded=CONVERGED),
+    Recipe(
+        CONTROL, "control", (REACH,), FIVE[2:], options="--planners adam --spaces direct", only=ADAM, excluded=CONVERGED
+    ),
     Recipe(CONTROL[:1], "policies", (REACH,), (PAPERS,), FREE, "--iterations 880", POLICY, EARLY),
     Recipe(CONTROL[:1], "policies", (REACH,), (*FIVE[1:], "ensemble+mse"), FREE, "--iterations 2200", POLICY, EARLY),
     Recipe(CONTROL[:1], "policies", (PUSH,), FIVE, FREE, "--iterations 880", POLICY),
