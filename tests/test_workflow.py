@@ -272,10 +272,11 @@ def test_a_policy_is_one_step_of_all_seeds_too_after_the_models_that_it_learns_i
 
 @pytest.mark.usefixtures("gpu")
 def test_seeds_that_need_a_policy_with_other_settings_are_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stored(run: runs.Run, env: str, method: Method) -> Budget | None:
-        return {2: Budget(3, 44), 4: Budget(3, 2200)}.get(run.seed)  # that of seed 4 is what is asked for
+    def policies(run: runs.Run) -> list[tuple[str, Method, Budget]]:
+        budget = {2: Budget(3, 44), 4: Budget(3, 2200)}.get(run.seed, needed.WHOLE)  # that of seed 4 is the same
+        return [(needed.REACH, zoo.method("rtsm", "latent", "policy"), budget)]
 
-    monkeypatch.setattr(needed, "stored_budget", stored)
+    monkeypatch.setattr(needed, "_policies", policies)
     steps = table("paper", (0, 2, 4), device="cuda")
     name = "models/Reacher/policy-rtsm-latent"
     assert {f"seeds0-4/{name}", f"seed2/{name}"} <= steps.keys()
