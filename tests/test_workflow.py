@@ -257,7 +257,7 @@ def test_the_page_on_clusters_says_what_a_step_asks_for() -> None:
 def test_what_the_page_on_clusters_asks_of_slurm_for_a_gpu_is_allowed_by_its_plugin() -> None:
     utils = pytest.importorskip("snakemake_executor_plugin_slurm.utils")
     page = (runs.ROOT / "docs/howto/cluster.md").read_text()
-    (asked,) = re.findall(r"`-- --default-resources (gpu=(\d))`", page)
+    (asked,) = re.findall(r"--default-resources slurm_partition=\S+ slurm_account=\S+ (gpu=(\d)) ", page)
     job = SimpleNamespace(resources=SimpleNamespace(get={"gpu": int(asked[1])}.get))
     assert "--gpus" in utils.set_gres_string(job)
     assert "slurm_extra" not in page
@@ -348,6 +348,27 @@ def test_options_that_would_be_ignored_are_refused(capsys: pytest.CaptureFixture
     assert dry("--executor", "pool", "--", "--cores", "3") == 2
     assert "'--cores 3' are options of Snakemake's" in capsys.readouterr().err
     assert not list(place.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", [["--set-resources", "model:runtime=9", "modle:mem_mb=1200"], ["--set-resources=modle:mem_mb=1200"],
+              ["--jobs", "2", "--set-threads", "modle=2"]],
+)  # fmt: skip
+def test_a_kind_of_step_that_there_is_not_is_refused_naming_those_there_are(
+    words: list[str], capsys: pytest.CaptureFixture[str], place: Path
+) -> None:
+    assert dry("--executor", "local", "--", *words) == 2
+    assert "names 'modle', expected a kind of step: data, model, scores, plan, policy, n" in capsys.readouterr().err
+    assert not list(place.iterdir())
+
+
+@needs_snakemake
+def test_the_command_of_the_page_on_clusters_for_a_gpu_is_taken_by_snakemake(place: Path) -> None:
+    page = (runs.ROOT / "docs/howto/cluster.md").read_text().replace("\\\n", " ")
+    (words,) = re.findall(r"^python -m tsmlib (run .* --device cuda --executor slurm) -- (.*)$", page, re.MULTILINE)
+    ours, theirs = (text.split() for text in words)
+    ours = [{"all": "train", "paper": "smoke"}.get(word, word) for word in ours]
+    assert main([*ours, "--dry-run", "--", *theirs]) == 0
 
 
 def test_a_notebook_beside_those_of_another_version_of_the_code_is_executed_and_that_is_said(place: Path) -> None:

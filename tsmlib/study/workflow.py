@@ -207,14 +207,16 @@ def run_all(
     executor: a plugin of Snakemake's, 'local' (this machine), or 'pool' (this machine without Snakemake); '' is local
     where Snakemake is installed, else pool. jobs: at a time; 0 is as many as ``cores`` says here, 100 elsewhere.
     dry_run: list the steps, and do nothing. any_code: go on with what another version of the code made. more: options
-    of Snakemake. Raises ParameterError for a negative number of jobs and for options of Snakemake's without it,
-    RunError where another process holds the workflow, the code changed or something is not installed.
+    of Snakemake. Raises ParameterError for a negative number of jobs, for options of Snakemake's without it and for a
+    kind of step that there is not, RunError where another process holds the workflow, the code changed or something is
+    not installed.
     """
     executor = executor or ("local" if importlib.util.find_spec("snakemake") else POOL)
     if jobs < 0:
         raise ParameterError(f"--jobs is {jobs}, expected 1 or more, or 0 for as many as there are cores.")
     if more and executor == POOL:
         raise ParameterError(f"{' '.join(more)!r:.80} are options of Snakemake's, which the pool does without.")
+    _require_kinds(more)
     _require_executor(executor)
     here = jobs or cores()
     table, folder = steps(executions, given), executions[0].run.dir.parent / "workflow"
@@ -437,6 +439,18 @@ def _require_executor(name: str) -> None:
     if name != "local" and not importlib.util.find_spec(f"snakemake_executor_plugin_{name.replace('-', '_')}"):
         package = "'tsmlib[cluster]'" if name == "slurm" else f"snakemake-executor-plugin-{name}"
         raise RunError(f"--executor {name} needs its plugin, missing here: {sys.executable} -m pip install {package}")
+
+
+def _require_kinds(more: Sequence[str]) -> None:
+    """ParameterError where options of Snakemake's are for a kind of step that there is not, which it would ignore."""
+    option = ""
+    for word in more:
+        value = word
+        if word.startswith("-"):
+            option, _, value = word.partition("=")
+        kind = re.split("[:=]", value)[0]
+        if option in ("--set-resources", "--set-threads") and value and kind not in MEMORY:
+            raise ParameterError(f"{option} names {kind!r:.80}, expected a kind of step: {', '.join(MEMORY)}.")
 
 
 def _list(table: Mapping[str, Step], undone: Mapping[str, str]) -> None:
