@@ -77,6 +77,22 @@ def test_every_seed_learns_every_policy_and_those_that_take_long_for_fewer_itera
     assert {world for world, _ in worlds.policies} == {"clean", "noise", "delay"}
 
 
+def test_a_policy_that_is_there_does_not_change_the_budget_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
+    asked = needed.control(run).policies
+    env, way, budget = asked[0]
+    task = study.load_task(env).take(2)
+    study.learn(run, task, way, study.Budget(iterations=1))
+    assert needed.control(run).policies == asked
+    assert study.learn(run, task, way, budget).header["budget"] == {"copies": 1, "iterations": 4}
+    assert (
+        "with Budget(copies=1, iterations=4), but one with Budget(copies=1, iterations=1), which is replaced"
+        in capsys.readouterr().out
+    )
+
+
 def test_a_step_takes_about_as_long_as_the_rows_say_and_is_given_that_four_times(tmp_path: Path) -> None:
     run, rows = resolve("05_control", scale="paper", seed=1, run_dir=str(tmp_path)), published("05_control")
     spent, stated = [], []

@@ -425,6 +425,39 @@ def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
         study.load_or_train(run, REACHER, "prior")
 
 
+@pytest.mark.parametrize(("scale", "seed"), [("smoke", 5), ("paper", 1)])
+def test_a_model_of_another_seed_or_scale_is_refused_naming_both(run: Run, scale: str, seed: int) -> None:
+    other = runs.resolve("05_control", scale=scale, seed=seed, run_dir=str(run.dir.parents[1]))
+    there = other.folder("models/Reacher") / "tsm.safetensors"
+    shutil.copy(run.models / "Reacher" / "tsm.safetensors", there)
+    said = (
+        f"{there} was trained with seed 1 at scale smoke, expected seed {seed} at scale {scale}. Move it .* delete it"
+    )
+    with pytest.raises(StoreError, match=said):
+        study.load_or_train(other, REACHER, "tsm")
+
+
+def test_shipped_models_are_those_of_scale_laptop_and_seed_0_whatever_scale_they_were_trained_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study.models, "fit", no_training)
+    run = runs.resolve("05_control", scale="laptop", run_dir=str(tmp_path))
+    assert study.load_or_train(run, REACHER, "tsm")[1]["scale"] == "paper"
+
+
+@pytest.mark.parametrize(("taken", "seed"), [("train", 5), ("test", 1)])
+def test_training_data_of_another_seed_or_split_are_refused_naming_both(run: Run, taken: str, seed: int) -> None:
+    other = new_run(run.dir.parents[1], seed=seed)
+    drawn = study.data.HELD_OUT_SEED.get(taken, run.seed)
+    study.dataset(run, REACHER, taken)
+    there = other.folder("data/Reacher") / "train.safetensors"
+    shutil.copy(run.data / "Reacher" / f"{taken}.safetensors", there)
+    with pytest.raises(
+        StoreError, match=f"holds split '{taken}' drawn with seed {drawn}, expected 'train' with seed {seed}"
+    ):
+        study.dataset(other, REACHER, "train")
+
+
 def test_data_of_another_environment_are_refused(run: Run) -> None:
     there = run.folder("data/PymunkReacher") / "train.safetensors"
     shutil.copy(run.data / "Reacher" / "train.safetensors", there)

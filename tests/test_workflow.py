@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -203,7 +204,9 @@ def test_a_notebook_that_takes_hours_is_given_them() -> None:
 
 def test_what_ships_is_there_and_no_step_that_is_to_be_done_again(place: Path) -> None:
     folder = place / "runs" / "laptop" / "workflow"
-    there = {name for name, step in table("laptop").items() if workflow._made(name, step, folder)}
+    prepared = workflow.prepare(NOTEBOOKS, (0, 2), scale="laptop", device="", given={})
+    steps = workflow.steps(prepared, {})
+    there = steps.keys() - workflow._undone(prepared, steps, folder)
     assert {f"seed0/models/{arm}/rtsm" for arm in ("Reacher", "ReacherPush")} <= there
     assert {f"seed{seed}/plans/ReacherPush-oracle-latent-cem" for seed in (0, 2)} <= there
     assert not {name for name in there if "seed2/models" in name or "data/" in name or name.endswith("05_control")}
@@ -254,7 +257,7 @@ def test_the_page_on_clusters_says_what_a_step_asks_for() -> None:
 def test_what_the_page_on_clusters_asks_of_slurm_for_a_gpu_is_allowed_by_its_plugin() -> None:
     utils = pytest.importorskip("snakemake_executor_plugin_slurm.utils")
     page = (runs.ROOT / "docs/howto/cluster.md").read_text()
-    (asked,) = re.findall(r"`-- --default-resources (gpu=(\d))`", page)
+    (asked,) = re.findall(r"--default-resources slurm_partition=\S+ slurm_account=\S+ (gpu=(\d)) ", page)
     job = SimpleNamespace(resources=SimpleNamespace(get={"gpu": int(asked[1])}.get))
     assert "--gpus" in utils.set_gres_string(job)
     assert "slurm_extra" not in page
@@ -272,10 +275,11 @@ def test_a_policy_is_one_step_of_all_seeds_too_after_the_models_that_it_learns_i
 
 @pytest.mark.usefixtures("gpu")
 def test_seeds_that_need_a_policy_with_other_settings_are_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stored(run: runs.Run, env: str, method: Method) -> Budget | None:
-        return {2: Budget(3, 44), 4: Budget(3, 2200)}.get(run.seed)  # that of seed 4 is what is asked for
+    def policies(run: runs.Run) -> list[tuple[str, Method, Budget]]:
+        budget = {2: Budget(3, 44), 4: Budget(3, 2200)}.get(run.seed, needed.WHOLE)  # that of seed 4 is the same
+        return [(needed.REACH, zoo.method("rtsm", "latent", "policy"), budget)]
 
-    monkeypatch.setattr(needed, "stored_budget", stored)
+    monkeypatch.setattr(needed, "_policies", policies)
     steps = table("paper", (0, 2, 4), device="cuda")
     name = "models/Reacher/policy-rtsm-latent"
     assert {f"seeds0-4/{name}", f"seed2/{name}"} <= steps.keys()
@@ -292,11 +296,11 @@ def test_a_seed_whose_model_ships_is_none_of_those_that_are_trained(place: Path)
     ]
     assert steps["seed0/scores/Reacher/lstm"].needs[0] == "seed0/models/Reacher/lstm"
     folder = place / "runs" / "laptop" / "workflow"
-    assert workflow._made("seed0/models/Reacher/lstm", steps["seed0/models/Reacher/lstm"], folder)
+    assert workflow._made(steps["seed0/models/Reacher/lstm"], folder)
     for seed in (1, 2):
-        assert not workflow._made("", steps["seeds1-2/models/Reacher/lstm"], folder)
+        assert not workflow._made(steps["seeds1-2/models/Reacher/lstm"], folder)
         files.write_bytes(folder.parent / f"seed{seed}/models/Reacher/lstm.safetensors", b"")
-    assert workflow._made("", steps["seeds1-2/models/Reacher/lstm"], folder)
+    assert workflow._made(steps["seeds1-2/models/Reacher/lstm"], folder)
 
 
 @pytest.mark.usefixtures("gpu")
@@ -344,6 +348,27 @@ def test_options_that_would_be_ignored_are_refused(capsys: pytest.CaptureFixture
     assert dry("--executor", "pool", "--", "--cores", "3") == 2
     assert "'--cores 3' are options of Snakemake's" in capsys.readouterr().err
     assert not list(place.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", [["--set-resources", "model:runtime=9", "modle:mem_mb=1200"], ["--set-resources=modle:mem_mb=1200"],
+              ["--jobs", "2", "--set-threads", "modle=2"]],
+)  # fmt: skip
+def test_a_kind_of_step_that_there_is_not_is_refused_naming_those_there_are(
+    words: list[str], capsys: pytest.CaptureFixture[str], place: Path
+) -> None:
+    assert dry("--executor", "local", "--", *words) == 2
+    assert "names 'modle', expected a kind of step: data, model, scores, plan, policy, n" in capsys.readouterr().err
+    assert not list(place.iterdir())
+
+
+@needs_snakemake
+def test_the_command_of_the_page_on_clusters_for_a_gpu_is_taken_by_snakemake(place: Path) -> None:
+    page = (runs.ROOT / "docs/howto/cluster.md").read_text().replace("\\\n", " ")
+    (words,) = re.findall(r"^python -m tsmlib (run .* --device cuda --executor slurm) -- (.*)$", page, re.MULTILINE)
+    ours, theirs = (text.split() for text in words)
+    ours = [{"all": "train", "paper": "smoke"}.get(word, word) for word in ours]
+    assert main([*ours, "--dry-run", "--", *theirs]) == 0
 
 
 def test_a_notebook_beside_those_of_another_version_of_the_code_is_executed_and_that_is_said(place: Path) -> None:
@@ -521,6 +546,55 @@ def test_without_snakemake_a_notebook_is_executed_again_where_what_it_needs_is_g
             gone.unlink()
 
 
+def replace_file(path: Path) -> None:
+    """The same weights from another training."""
+    tensors, header = artifacts.load(path, kind="model")
+    artifacts.save(path, tensors, kind="model", header=header | {"finished": "2001-01-01"})
+
+
+def test_a_notebook_is_executed_again_where_a_file_that_it_was_made_from_was_replaced_and_only_once(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    small(place, "02_train")
+    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    steps, folder = workflow.steps(prepared, {}), place / "runs" / "smoke" / "workflow"
+    for file in (file for step in steps.values() for file in step.files):
+        artifacts.save(folder.parent / file, {"x": torch.zeros(1)}, kind="model", header={})
+    assert workflow.run_all(prepared, {}, executor="pool") == 0
+    replace_file(folder.parent / "seed2/models/Reacher/prior.safetensors")
+    assert workflow._undone(prepared, steps, folder).keys() == {"seed2/02_train"}
+    assert workflow._again(prepared, steps, folder).keys() == {"seed2/models/Reacher/prior", "seed2/02_train"}
+    for said in ("executed: models/Reacher/prior.safetensors is not what it was made from\n", "complete\n"):
+        capsys.readouterr()
+        assert workflow.run_all(prepared, {}, executor="pool") == 0
+        assert f"seed2/02_train is {said}" in capsys.readouterr().out
+    assert (place / "tried").read_text().count("02_train 2") == 2
+
+
+def test_a_notebook_of_other_parameters_or_without_its_table_is_not_there(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    table = "from tsmlib.study.runs import resolve\n_ = (resolve('00_first', seed=seed).metrics / 'a').write_text('')"
+    small(place, "00_first", table)
+
+    def missing(*options: str) -> str:
+        capsys.readouterr()
+        assert main(["run", "all", "--scale", "smoke", "--seeds", "2", "--executor", "pool", *options]) == 0
+        return capsys.readouterr().out.splitlines()[-1]
+
+    monkeypatch.setenv("TSM_SCALE", "smoke")
+    run_dir = f"run_dir={place / 'runs'}"
+    missing("-p", run_dir)
+    assert missing("--dry-run") == "0 of 1 steps are not there yet"  # however the folder was named
+    assert missing("--dry-run", "-p", run_dir) == "0 of 1 steps are not there yet"
+    assert missing("--dry-run", "-p", "env=tsm/ReacherPush-v1") == "1 of 1 steps are not there yet"
+    (place / "runs/smoke/seed2/metrics/a").unlink()
+    assert missing("--dry-run") == "1 of 1 steps are not there yet"
+
+
 # Whole workflows -----------------------------------------------------------------------------------------------------
 
 
@@ -555,6 +629,18 @@ def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
     again = cluster.workflow(place / "local", "--executor", "local")
     assert again.wait(600) == 0
     assert "Nothing to be done" in (place / "local" / "log").read_text()
+    (folder.parent / "seed0" / "metrics" / "02_train.csv").unlink()
+    replace_file(folder.parent / "seed2" / "models" / "Reacher" / "prior.safetensors")
+    began = time.time()
+    again = cluster.workflow(place / "local", "--executor", "local")
+    assert again.wait(600) == 0
+    assert cluster.made(place / "local") == found["pool"]
+    told = (place / "local" / "log").read_text()
+    again_done = {"model/seed2/models/Reacher/prior", "notebook/seed0/02_train", "notebook/seed2/02_train"}
+    assert set(re.findall(r"(\S+) is done again", told)) == again_done
+    for seed, steps_again in ((0, 1), (2, 2)):
+        log = folder / "log" / f"seed{seed}"
+        assert len({path for path in log.rglob("*.log") if path.stat().st_mtime > began}) == steps_again
 
 
 def test_jobs_of_which_a_check_says_nothing_are_asked_of_again() -> None:

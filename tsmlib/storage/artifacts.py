@@ -93,11 +93,23 @@ def read_header(path: PathLike) -> dict[str, Json]:
 
 def code(path: PathLike) -> str:
     """The version of the code that wrote an artefact, as it says itself; '' where it says none. Nothing is checked."""
+    provenance = _stated(path).get("provenance")
+    return str(provenance.get("code", "")) if isinstance(provenance, dict) else ""
+
+
+def checksum(path: PathLike) -> str:
+    """The SHA-256 of an artefact, as it says itself; '' where it says none. Nothing is checked."""
+    return str(_stated(path).get("sha256", ""))
+
+
+def _stated(path: PathLike) -> dict[str, Any]:
+    """What the ``tsmlib`` entry of a file says, if it has one; the rest of the file is not read."""
     try:
-        with safetensors.safe_open(path, framework="pt") as file:  # the header alone is read
-            return str(json.loads(file.metadata()["tsmlib"])["provenance"]["code"])
+        with safetensors.safe_open(path, framework="pt") as file:
+            found = json.loads(file.metadata()["tsmlib"])
     except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError):
-        return ""
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

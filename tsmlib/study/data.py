@@ -49,14 +49,23 @@ def sizes(run: Run, env: str) -> dict[str, int]:
 
 
 def dataset(run: Run, env: str, split: str) -> Trajectories:
-    """One split of an environment's data, collected at the first call. Training data depend on the run's seed."""
-    n = sizes(run, env)[split]
+    """One split of an environment's data, collected at the first call. Training data depend on the run's seed.
+
+    Raises StoreError for a file of another environment, split or seed.
+    """
+    n, seed = sizes(run, env)[split], HELD_OUT_SEED.get(split, run.seed)
     path = run.folder(f"data/{EnvSpec.parse(env).name}") / f"{split}.safetensors"
     if path.exists():
-        with remade_by(f"python -m tsmlib run collect --scale {run.scale} --seed {run.seed}", path):
-            return artifacts.load_trajectories(path, expect=fingerprint(env))
+        command = f"python -m tsmlib run collect --scale {run.scale} --seed {run.seed}"
+        with remade_by(command, path):
+            found, header = artifacts.load_trajectories(path, expect=fingerprint(env)), artifacts.read_header(path)
+        if (stated := (header.get("split", split), header.get("seed", seed))) != (split, seed):
+            raise StoreError(
+                f"{path} holds split {stated[0]!r} drawn with seed {stated[1]}, expected {split!r} with seed {seed}. "
+                f"Move it to where it belongs, or delete it and make a new one: {command}"
+            )
+        return found
     require_other_seed(run.seed)
-    seed = HELD_OUT_SEED.get(split, run.seed)
     if n >= 1000:
         print(f"{env}: collecting {n:,} episodes for {split}, about {n / 100:.0f} s on one core")
     data = random_data(env, n, seed=seed)

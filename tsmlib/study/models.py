@@ -93,7 +93,8 @@ def load_or_train(run: Run, env: str, model: str) -> Trained:
     """A trained model of the zoo, by its word.
 
     From the run's folder; else, at scale laptop with seed 0, from the shipped models; else trained now. Raises
-    StoreError for a file of another environment, word, class or schedule.
+    StoreError for a file of another environment, word, class or schedule, and for one in the run's folder of another
+    seed or scale.
     """
     return _kept(run, env, model) or train(run, trained_on(env, model), model, _path(run, env, model))
 
@@ -133,6 +134,12 @@ def _kept(run: Run, env: str, model: str) -> Trained | None:
             if header.get("model") != model:
                 raise StoreError(f"{path} holds {header.get('model')!r}, expected {model!r}; restore or delete it")
             net = _load(path, env, model)
+            asked, made = (run.seed, run.scale), (header.get("seed", run.seed), trained_at.scale)
+            if path == _path(run, env, model) and made != asked:
+                raise StoreError(
+                    f"{path} was trained with seed {made[0]} at scale {made[1]}, expected seed {asked[0]} at scale "
+                    f"{asked[1]}. Move it to the run of its own seed and scale, or delete it to train one here"
+                )
             if (found := zoo.stated(header.get("schedule", planned))) != planned:
                 raise StoreError(
                     f"{path} was trained by another schedule: {found}, expected {planned}. Restore or delete it"

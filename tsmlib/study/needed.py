@@ -16,7 +16,7 @@ from tsmlib.figures.method import Method
 from tsmlib.study import zoo
 from tsmlib.study.data import SPLITS, parse_choice
 from tsmlib.study.jobs import Data, Job, Model, Policy, Scores, complete, plan_jobs
-from tsmlib.study.policies import Budget, stored_budget
+from tsmlib.study.policies import Budget
 from tsmlib.study.results.planning import BASELINES, ORACLE, PAPER, PUSH, REACH
 from tsmlib.study.runs import Run
 from tsmlib.study.zoo import OURS, PAPERS, method, methods
@@ -113,8 +113,7 @@ def _policies(run: Run) -> list[tuple[str, Method, Budget]]:
     envs = run.pick(smoke=(REACH, PUSH), laptop=(REACH,), paper=(REACH, PUSH))
     for env, way in product(envs, run.pick(smoke=inside[:1], laptop=[method(OURS, "latent", "policy")], paper=inside)):
         whole = ON_IMPERFECT if way.model == PAPERS or env == PUSH else WHOLE
-        budget = run.pick(smoke=Budget(), laptop=BEGUN, paper=whole)
-        found.append((env, way, stored_budget(run, env, way) or budget))
+        found.append((env, way, run.pick(smoke=Budget(), laptop=BEGUN, paper=whole)))
     return found
 
 

@@ -1,5 +1,7 @@
 """Execution of notebooks, and the status of what they made."""
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import importlib.util
@@ -9,10 +11,11 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tqdm.auto import tqdm
 
@@ -20,6 +23,9 @@ from tsmlib.storage.files import STATUS, Json, StoreError, alive, writer_lock
 from tsmlib.study import parameters
 from tsmlib.study.parameters import Value
 from tsmlib.study.runs import Notebook, Run, RunError, find, home, resolve
+
+if TYPE_CHECKING:
+    from tsmlib.study.jobs import Job
 
 TOOLS = ("papermill", "ipykernel", "pandas", "tabulate", "sklearn", "ipywidgets", "imageio_ffmpeg")  # extra "study"
 
@@ -95,9 +101,9 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
     Raises RunError if another process executes it there (or waits for that) or the notebook does not reach its end.
     """
     from tsmlib.storage import manifest  # heavy, and not needed to refuse a parameter
-    from tsmlib.storage.provenance import provenance
+    from tsmlib.study.needed import needs
 
-    run, hold = execution.run, contextlib.ExitStack()
+    run, hold, jobs = execution.run, contextlib.ExitStack(), needs(execution.run)
     try:
         hold.enter_context(writer_lock(run.dir, run.notebook, name=run.notebook, wait=wait))
     except StoreError as error:
@@ -107,15 +113,15 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
     with hold, terminable(), environment(TSM_DEVICE=run.device, TSM_WRITTEN=str(record)):
         began = time.monotonic()
         status: dict[str, Json] = {
-            "pid": os.getpid(), "host": socket.gethostname(), "started": _now(), "parameters": execution.values,
-            "scale": run.scale, "seed": run.seed, "device": run.device, "provenance": provenance(),
-            "notebook": code_sha256(execution.notebook.path),
+            "pid": os.getpid(), "host": socket.gethostname(), "started": _now(), "scale": run.scale, "seed": run.seed,
+            **_asked(execution),
         }  # fmt: skip
         _note(run, {**status, "state": "running"})
         ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
         try:
             executed = _papermill(execution, progress)
-            ended = {"state": "complete", "files": manifest.listing(run.dir, _made(run, record))}
+            files = manifest.listing(run.dir, _made(run, record))
+            ended = {"state": "complete", "files": files, "made_from": _files(run, jobs)}
         except RunError as error:
             ended = {"state": "failed", "error": str(error)}
             raise
@@ -126,25 +132,74 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
     return executed
 
 
-def completed(execution: Execution) -> str:
-    """When the execution began that made what the run holds of a notebook; '' where it holds nothing, or that was made
-    by other code, cells or values or on another device, or is not as it was left."""
-    from tsmlib.storage import manifest
-    from tsmlib.storage.provenance import provenance
-
+def outdated(execution: Execution) -> str:
+    """Why a notebook is to be executed; '' where what the run holds of it is as it was left, and was made by this code,
+    these cells and values, on this device and from the files of jobs that are there."""
     run = execution.run
-    entry = manifest.statuses(run.dir).get(run.notebook)
-    sha256 = code_sha256(execution.notebook.path)
-    asked: dict[str, Json] = {"parameters": dict(execution.values), "device": run.device, "notebook": sha256}
-    if not isinstance(entry, dict) or any(entry.get(name) != value for name, value in asked.items()):
-        return ""
-    if entry["provenance"]["code"] != provenance()["code"] or not (run.dir / execution.notebook.path.name).exists():
-        return ""
+    if not (entry := _complete(run)):
+        return "it did not come to its end yet"
+    asked, stated = _deciding(_asked(execution)), _deciding(entry)
+    if differs := [name for name, value in asked.items() if stated[name] != value]:
+        return f"its {' and '.join(differs)} changed"
+    if files := replaced(run):
+        return f"{files[0]} is not what it was made from"
+    if not (run.dir / execution.notebook.path.name).exists():
+        return f"{execution.notebook.path.name} is gone"
     try:
         require(run, run.notebook)
-    except RunError:
-        return ""
-    return str(entry["started"])
+    except RunError as error:
+        return str(error)
+    return ""
+
+
+def replaced(run: Run) -> list[str]:
+    """Files of jobs, relative to the run's folder, that are others than those that its complete notebook was made
+    from."""
+    from tsmlib.study.needed import needs
+
+    if not (entry := _complete(run)):
+        return []
+    stated, found = dict(entry.get("made_from", {})), _files(run, needs(run))
+    return [file for file in {**stated, **found} if stated.get(file) != found.get(file)]
+
+
+def span(run: Run) -> tuple[str, str]:
+    """When the execution of a complete notebook began and ended."""
+    entry = _complete(run)
+    return str(entry["started"]), str(entry["finished"])
+
+
+def _complete(run: Run) -> Mapping[str, Any]:
+    """The status of a run's notebook where it came to its end; else nothing."""
+    from tsmlib.storage import manifest
+
+    entry = manifest.statuses(run.dir).get(run.notebook)
+    return entry if isinstance(entry, dict) and entry.get("state") == "complete" else {}
+
+
+def _deciding(entry: Mapping[str, Any]) -> dict[str, Json]:
+    """What of a status decides what a notebook makes, which the folder of the runs does not."""
+    values = {name: value for name, value in entry.get("parameters", {}).items() if name != "run_dir"}
+    code = entry.get("provenance", {}).get("code")
+    return {"parameters": values, "device": entry.get("device"), "cells": entry.get("notebook"), "code": code}
+
+
+def _files(run: Run, jobs: Iterable[Job]) -> dict[str, Json]:
+    """File -> SHA-256, as it says itself, of what jobs have made in a run's folder."""
+    from tsmlib.storage import artifacts
+
+    paths = (run.dir / f"{job.name}.safetensors" for job in jobs)
+    return {path.relative_to(run.dir).as_posix(): artifacts.checksum(path) for path in paths if path.exists()}
+
+
+def _asked(execution: Execution) -> dict[str, Json]:
+    """What a status states of what its notebook is executed with."""
+    from tsmlib.storage.provenance import provenance
+
+    return {
+        "parameters": dict(execution.values), "device": execution.run.device, "provenance": provenance(),
+        "notebook": code_sha256(execution.notebook.path),
+    }  # fmt: skip
 
 
 def require(run: Run, notebook: str) -> Mapping[str, Json]:

@@ -154,9 +154,12 @@ class _Asked:
 
     def announcement(self, seeds: str = "") -> str:
         """What is going to be learned, and how long; seeds: of several as one."""
+        replaced = ""
+        if self.path.exists() and (there := _budget(self.path)) != self.budget:
+            replaced = f" with {self.budget}, but one with {there}, which is replaced"
         return (
             f"{self.task.env}: no {self.method.search_space} policy learned in {self.method.model} at scale "
-            f"{self.run.scale}{seeds}; learning it now, {self.budget.iterations} iterations of 0.1 to 1 s"
+            f"{self.run.scale}{seeds}{replaced}; learning it now, {self.budget.iterations} iterations of 0.1 to 1 s"
             f"{', several times that for all' if seeds else ''}. Stopped, it goes on from there the next time"
         )
 
@@ -288,7 +291,10 @@ def early_rows(run: Run, wanted: Sequence[tuple[Task, Method, Budget]]) -> list[
 
 
 def stored_budget(run: Run, env: str, method: Method) -> Budget | None:
-    """How the policy that the run's folder holds was learned, for ``learn`` to find it again; else None."""
+    """How the policy that the run's folder holds was learned, for ``learn`` to find it again; else None.
+
+    For tables of whatever was learned; a notebook asks for its own budget, by which ``learn`` learns anew.
+    """
     path = _path(run, env, method)
     return _budget(path) if path.exists() else None
 

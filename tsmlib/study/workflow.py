@@ -207,14 +207,16 @@ def run_all(
     executor: a plugin of Snakemake's, 'local' (this machine), or 'pool' (this machine without Snakemake); '' is local
     where Snakemake is installed, else pool. jobs: at a time; 0 is as many as ``cores`` says here, 100 elsewhere.
     dry_run: list the steps, and do nothing. any_code: go on with what another version of the code made. more: options
-    of Snakemake. Raises ParameterError for a negative number of jobs and for options of Snakemake's without it,
-    RunError where another process holds the workflow, the code changed or something is not installed.
+    of Snakemake. Raises ParameterError for a negative number of jobs, for options of Snakemake's without it and for a
+    kind of step that there is not, RunError where another process holds the workflow, the code changed or something is
+    not installed.
     """
     executor = executor or ("local" if importlib.util.find_spec("snakemake") else POOL)
     if jobs < 0:
         raise ParameterError(f"--jobs is {jobs}, expected 1 or more, or 0 for as many as there are cores.")
     if more and executor == POOL:
         raise ParameterError(f"{' '.join(more)!r:.80} are options of Snakemake's, which the pool does without.")
+    _require_kinds(more)
     _require_executor(executor)
     here = jobs or cores()
     table, folder = steps(executions, given), executions[0].run.dir.parent / "workflow"
@@ -222,14 +224,13 @@ def run_all(
     os.environ["TSM_RUN_DIR"] = str(folder.parents[1])
     if dry_run:
         _require_code(folder, runs, table, any_code=any_code)
-        _list(table, folder)
+        _list(table, _undone(executions, table, folder))
         if executor == POOL:
             return 0
         with tempfile.TemporaryDirectory() as place:
-            where = folder if folder.is_dir() else Path(place)
-            return _snakemake(
-                table, where, Path(place) / "steps.json", executor, jobs, ["--dry-run", "--quiet", "rules", *more]
-            )
+            where, listed = folder if folder.is_dir() else Path(place), Path(place) / "steps.json"
+            again = _again(executions, table, folder)
+            return _snakemake(table, again, where, listed, executor, jobs, ["--dry-run", "--quiet", "rules", *more])
     with _held(folder, [run.seed for run in runs]):
         codes = _require_code(folder, runs, table, any_code=any_code)
         manifest.write_json(folder / "code.json", {"codes": codes})
@@ -237,41 +238,77 @@ def run_all(
             os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels, as in the steps of Snakemake
             with environment(TSM_JOBS=str(here)):
                 return _run_here(executions, table)
-        return _snakemake(table, folder, folder / "steps.json", executor, jobs, more)
+        again = _again(executions, table, folder)
+        return _snakemake(table, again, folder, folder / "steps.json", executor, jobs, more)
 
 
 def _run_here(executions: Sequence[Execution], table: Mapping[str, Step]) -> int:
-    """Without Snakemake: the notebooks that are not complete, one after another. Returns an exit status.
+    """Without Snakemake: the notebooks that are not there (``_undone``), one after another. Returns an exit status.
 
-    One is executed again, too, where something that it needs is gone, or another whose tables it shows was executed
-    since it began. Where one fails, those that need it are left out.
+    Where one fails, those that need it are left out.
     """
     folder = executions[0].run.dir.parent / "workflow"
-    _precompute_groups([each for each in executions if not notebooks.completed(each)])
-    ended: dict[str, str] = {}  # when, of those that are complete
+    _precompute_groups([each for each in executions if notebooks.outdated(each)])
+    ended: dict[str, str] = {}
     failed: dict[str, str] = {}  # why
     for execution in executions:
-        run, name = execution.run, _name(execution.run)
-        before = [other for other in table[name].needs if table[other].kind == "notebook"]
-        if lacking := [other for other in before if other in failed]:
+        name = _name(execution.run)
+        if lacking := [other for other in table[name].needs if other in failed]:
             failed[name] = f"not executed, since it needs {lacking[0]}"
             continue
-        began = notebooks.completed(execution)
-        there = all(_made(other, table[other], folder) for other in _jobs(table, name))
-        if began and there and all(ended[other] <= began for other in before):
-            print(f"{name} is complete")
-        else:
+        if why := _outdated(execution, table, folder, ended):
+            print(f"{name} is executed: {why}")
             try:
                 print(notebooks.execute(execution))
             except (RunError, ValueError) as error:  # ValueError: StoreError
                 print(f"error: {error}", file=sys.stderr)
                 failed[name] = str(error).partition("\n")[0]
                 continue
-        ended[name] = str(manifest.statuses(run.dir)[run.notebook]["finished"])
+        else:
+            print(f"{name} is complete")
+        ended[name] = notebooks.span(execution.run)[1]
     if failed:
         said = [f"{len(failed)} of {len(executions)} notebooks are not complete; the same command goes on with them:"]
         print(*said, *(f"{name}: {why}" for name, why in failed.items()), sep="\n  ", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _undone(executions: Sequence[Execution], table: Mapping[str, Step], folder: Path) -> dict[str, str]:
+    """Steps that are to be done, and why."""
+    found = {name: "it is not there" for name, step in table.items() if not _made(step, folder)}
+    ended: dict[str, str] = {}
+    for execution in executions:
+        name = _name(execution.run)
+        if why := _outdated(execution, table, folder, ended):
+            found[name] = why
+        else:
+            ended[name] = notebooks.span(execution.run)[1]
+    return found
+
+
+def _again(executions: Sequence[Execution], table: Mapping[str, Step], folder: Path) -> dict[str, str]:
+    """Steps that Snakemake is to do whatever their markers say, and why: those that are to be done, and those whose
+    files were replaced since a notebook used them, so that what was made from these is made again, too."""
+    used = {f"seed{each.run.seed}/{file}" for each in executions for file in notebooks.replaced(each.run)}
+    changed = [name for name, step in table.items() if used.intersection(step.files)]
+    return dict.fromkeys(changed, "its file was replaced") | _undone(executions, table, folder)
+
+
+def _outdated(execution: Execution, table: Mapping[str, Step], folder: Path, ended: Mapping[str, str]) -> str:
+    """Why a notebook is to be executed; '' where it need not be.
+
+    It is, too, where something that it needs is gone, or another whose tables it shows was executed since it began.
+    ended: when each complete notebook before it ended.
+    """
+    name = _name(execution.run)
+    if why := notebooks.outdated(execution):
+        return why
+    if gone := sorted(other for other in _jobs(table, name) if not _made(table[other], folder)):
+        return f"{gone[0]} is not there"
+    began, _ = notebooks.span(execution.run)
+    before = (other for other in table[name].needs if table[other].kind == "notebook")
+    later = [other for other in before if not ended.get(other, "") or ended[other] > began]
+    return f"{later[0]} was executed since, or is to be" if later else ""
 
 
 def _jobs(table: Mapping[str, Step], name: str) -> set[str]:
@@ -404,33 +441,43 @@ def _require_executor(name: str) -> None:
         raise RunError(f"--executor {name} needs its plugin, missing here: {sys.executable} -m pip install {package}")
 
 
-def _list(table: Mapping[str, Step], folder: Path) -> None:
+def _require_kinds(more: Sequence[str]) -> None:
+    """ParameterError where options of Snakemake's are for a kind of step that there is not, which it would ignore."""
+    option = ""
+    for word in more:
+        value = word
+        if word.startswith("-"):
+            option, _, value = word.partition("=")
+        kind = re.split("[:=]", value)[0]
+        if option in ("--set-resources", "--set-threads") and value and kind not in MEMORY:
+            raise ParameterError(f"{option} names {kind!r:.80}, expected a kind of step: {', '.join(MEMORY)}.")
+
+
+def _list(table: Mapping[str, Step], undone: Mapping[str, str]) -> None:
     """Print the steps that are not there yet."""
-    missing = [name for name in table if not _made(name, table[name], folder)]
+    missing = [name for name in table if name in undone]
     for name in missing:
         print(f"{table[name].kind:8} {name}")
     print(f"{len(missing)} of {len(table)} steps are not there yet")
 
 
-def _made(name: str, step: Step, folder: Path) -> bool:
-    """Whether what a step makes is there, or ships; if it still holds, only the step can tell."""
-    if step.kind == "notebook":
-        seed, _, rest = name.partition("/")
-        entry = manifest.statuses(folder.parent / seed).get(rest, {})
-        return isinstance(entry, dict) and (entry.get("state"), entry.get("notebook")) == ("complete", step.settings)
+def _made(step: Step, folder: Path) -> bool:
+    """Whether what a job makes is there, or ships; if it still holds, only the step can tell. True of a notebook."""
     return step.ships or all((folder.parent / file).exists() for file in step.files)
 
 
 def _snakemake(
-    table: Mapping[str, Step], folder: Path, listed: Path, executor: str, jobs: int, more: Sequence[str]
-) -> int:
-    """Snakemake in this process, so that the lock of the folder lives as long as it does."""
+    table: Mapping[str, Step], again: Mapping[str, str], folder: Path, listed: Path, executor: str, jobs: int,
+    more: Sequence[str],
+) -> int:  # fmt: skip
+    """Snakemake in this process, so that the lock of the folder lives as long as it does. again: steps that are done
+    again where they have a marker, and why."""
     from snakemake.cli import main as snakemake
 
     files.write_bytes(listed, json.dumps({name: asdict(step) for name, step in table.items()}, indent=1).encode())
-    gone = [
-        step.done for name, step in table.items() if (folder / step.done).exists() and not _made(name, step, folder)
-    ]
+    gone = {step.done: again[name] for name, step in table.items() if name in again and (folder / step.done).exists()}
+    for done, why in gone.items():
+        print(f"{done.removeprefix('done/')} is done again: {why}")
     options = [
         "--snakefile", str(SNAKEFILE), "--directory", str(folder), "--config", f"steps={listed}",
         "--nolock", "--keep-going", "--retries", "2", "--rerun-incomplete", "--rerun-triggers", "mtime", "params",
