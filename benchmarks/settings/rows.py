@@ -33,7 +33,7 @@ model_free. whole publishes tables of scripts beside this one, starts.py and sam
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
 those of all seeds of the same environment and algorithm; all others stay. Rounds take the place of all rows of the
-same environment, model, data and seed, whatever their steps.
+same environment, model, data and seed, whatever their steps. Commands side by side write one after another.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import manifest, tables
+from tsmlib.storage.files import writer_lock
 from tsmlib.study import (
     adaptation,
     drawings,
@@ -147,12 +148,23 @@ def publish(
 ) -> None:  # fmt: skip
     """Merge rows into a table of data/results, and its new checksum into the manifest. loops: of whole loops of
     rounds, whose former rows go. told: what becomes of the whole table then."""
-    path, new, known = RESULTS / f"{name}.csv", tables.frame(rows), shipped(name)
-    table = merged(without_loops(known, new) if loops else known, new)
-    table = told(table) if told else table
-    tables.ship(path, table)
-    manifest.write_manifest(Path(RESULTS).parent)
-    print(f"{path.name}: {len(table)} rows")
+    new = tables.frame(rows)
+
+    def changed(known: pd.DataFrame) -> pd.DataFrame:
+        table = merged(without_loops(known, new) if loops else known, new)
+        return told(table) if told else table
+
+    ship(name, changed)
+
+
+def ship(name: str, changed: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
+    """Put what ``changed`` makes of a table of data/results in its place, and its new checksum into the manifest, while
+    no other command writes there."""
+    with writer_lock(RESULTS.parent, f"rows of {name}", wait=True):
+        table = changed(shipped(name))
+        tables.ship(RESULTS / f"{name}.csv", table)
+        manifest.write_manifest(RESULTS.parent)
+    print(f"{name}.csv: {len(table)} rows")
 
 
 def with_plateaus(table: pd.DataFrame, run: runs.Run, envs: list[str]) -> pd.DataFrame:
@@ -305,19 +317,22 @@ def published_peers(files: list[Path]) -> None:
     if len(predicted):
         publish("peers_pets", predicted)
     if len(policies):  # a learner's steps may have been others before
-        path, about = RESULTS / "model_free.csv", ["env", "model"]
-        kept = tables.load(path) if tables.stored(path) else policies[:0]
+        about = ["env", "model"]
         there = policies.set_index(about).index
-        tables.ship(path, tables.frame(pd.concat([kept[~kept.set_index(about).index.isin(there)], policies])))
-        manifest.write_manifest(Path(RESULTS).parent)
+        ship(
+            "model_free",
+            lambda known: tables.frame(pd.concat([known[~known.set_index(about).index.isin(there)], policies])),
+        )
 
 
 def published_whole(files: list[Path]) -> None:
     """Tables of WHOLE as they are."""
     for path in files:
         tables.load(path)  # StoreError where it is damaged
-        tables.ship_bytes(RESULTS / path.name, path.read_bytes())
-    manifest.write_manifest(Path(RESULTS).parent)
+    with writer_lock(RESULTS.parent, ", ".join(path.name for path in files), wait=True):
+        for path in files:
+            tables.ship_bytes(RESULTS / path.name, path.read_bytes())
+        manifest.write_manifest(RESULTS.parent)
 
 
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
