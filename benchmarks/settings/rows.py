@@ -76,11 +76,10 @@ from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.exploration import PENDULUM
-from tsmlib.study.results.table import Row, select
+from tsmlib.study.results.table import THING, Row, about, others, select
 from tsmlib.study.runs import RESULTS
 from tsmlib.trajectory import Trajectories
 
-KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 LOOP = ("env", "model", "configuration", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
@@ -115,25 +114,17 @@ def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.Da
 def without_loops(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
     """The published table without the loops of rounds that ``rows`` are of: a loop made again may lose other episodes,
     so that its rounds have other steps, and lack a return that was there."""
-    made = set(_loops(tables.frame(rows)))
+    made = set(about(tables.frame(rows), LOOP))
     of_rounds = (published["planner"] == "cem") | (published["subset"] == "data")
-    again = pd.Series([loop in made for loop in _loops(published)], index=published.index, dtype=bool)
+    again = pd.Series([loop in made for loop in about(published, LOOP)], index=published.index, dtype=bool)
     return published[~(of_rounds & again)]
-
-
-def _loops(rows: pd.DataFrame) -> list[tuple[str, ...]]:
-    """Of which loop a row is."""
-    rows = rows if "configuration" in rows else rows.assign(configuration="")
-    return list(rows[list(LOOP)].astype(str).itertuples(index=False, name=None))
 
 
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
-    rows = rows if "configuration" in rows else rows.assign(configuration="")
     curve, more = rows["planner"] == "policy", ("metric", "iteration", "steps_ahead")
-    what = {name: rows[name].astype(str).mask(curve, "") for name in more}
-    what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps", "subset")}
-    return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
+    masked = rows.assign(**{name: rows[name].astype(object).mask(curve, "") for name in more})
+    return about(masked, (*THING, *more, "env_steps", "subset"))
 
 
 def shipped(name: str) -> pd.DataFrame:
@@ -317,12 +308,8 @@ def published_peers(files: list[Path]) -> None:
     if len(predicted):
         publish("peers_pets", predicted)
     if len(policies):  # a learner's steps may have been others before
-        about = ["env", "model"]
-        there = policies.set_index(about).index
-        ship(
-            "model_free",
-            lambda known: tables.frame(pd.concat([known[~known.set_index(about).index.isin(there)], policies])),
-        )
+        about_these = ("env", "model")
+        ship("model_free", lambda known: tables.frame(pd.concat([others(known, policies, about_these), policies])))
 
 
 def published_whole(files: list[Path]) -> None:
