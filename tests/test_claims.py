@@ -460,6 +460,23 @@ def test_what_simulated_checks_share_leaves_each_as_it_was() -> None:
     assert np.corrcoef(values)[0, 1] == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("part", ["checks", "worlds"])
+def test_no_verdict_is_simulated_without_a_study(part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(ROOT / "benchmarks" / "verdicts" / "run.py", part, "--studies", "0", "--out", str(tmp_path))
+    assert "--studies 0: expected at least 1; the tables that ship are of 400" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_simulated_verdicts_are_written_once_all_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
+    monkeypatch.setattr(module, "PARTS", {"checks": lambda *_: pd.DataFrame({"a": [1]}), "worlds": lambda *_: 1 / 0})
+    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(tmp_path)])
+    with pytest.raises(ZeroDivisionError):
+        module.main()
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
     module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
     columns = ["claim", "check", "seeds", "margin", "truth", "why"]
