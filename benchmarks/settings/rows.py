@@ -56,7 +56,7 @@ from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import manifest, tables
-from tsmlib.storage.files import writer_lock
+from tsmlib.storage.files import StoreError, writer_lock
 from tsmlib.study import (
     adaptation,
     drawings,
@@ -71,6 +71,7 @@ from tsmlib.study import (
     worlds,
     zoo,
 )
+from tsmlib.study.data import require_other_seed
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
@@ -372,7 +373,10 @@ def main() -> None:
     if given.part == "whole" and (other := [path.name for path in given.files if path.stem not in WHOLE]):
         options.error(f"whole takes {' and '.join(f'{name}.csv' for name in WHOLE)}; got {', '.join(other)}")
     if given.part in FILES:
-        FILES[given.part](given.files)
+        try:
+            FILES[given.part](given.files)
+        except StoreError as error:
+            options.error(str(error))
         return
     if not given.models and given.part != "collect":
         options.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
@@ -386,10 +390,19 @@ def main() -> None:
         options.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
         options.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
+    if given.copies < 1 or given.iterations < 0:
+        options.error(
+            f"--copies {given.copies}, --iterations {given.iterations}: expected at least one copy, and 0 (the scale's "
+            "default) or more iterations"
+        )
     if (given.targets and given.part != "adaptation") or not 0 <= given.targets <= 100:
         options.error(f"--targets {given.targets}: expected 1 to 100, and of adaptation alone")
     notebook = NOTEBOOKS.get(given.part, "05_control")
-    run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    try:
+        require_other_seed(given.seed)
+        run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    except parameters.ParameterError as error:
+        options.error(str(error))
     if given.part == "convergence" and not needed.control(run).converging:
         options.error(f"nothing converges at scale {run.scale}; --scale of convergence is paper or smoke")
     if given.part in ("predict", "ablations"):
