@@ -203,6 +203,36 @@ def test_lines_of_seeds_replace_those_of_the_same_processor_alone() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("options", "said"), [
+    (["--seeds", "1000002", "3"], "seed 1000002 draws held-out episodes or targets"),
+    (["--seeds", "3", "3"], "--seeds names 3 more than once; name each seed once"),
+    (["--seeds", "3", "--envs", "foo"], "'foo' is none of tsm/Reacher-v0"),
+    (["--seeds", "3", "--scale", "foo"], "scale is 'foo', expected one of smoke, laptop, paper"),
+    (["--seeds", "3", "--together", "0"], "--together 0: expected at least 1"),
+    (["--seeds", "3", "--policies", "-1"], "--policies -1: expected at least 1 iteration"),
+    (["--seeds", "3", "--table"], "lines of scale paper alone, got laptop; type --table --scale paper"),
+    (["--seeds", "3", "--table", "--scale", "smoke"], "lines of scale paper alone, got smoke"),
+])  # fmt: skip
+def test_models_of_several_seeds_that_cannot_be_are_refused_before_any_work(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    with pytest.raises(SystemExit, match="2"):
+        run_script(runs.ROOT / "benchmarks" / "settings" / "seeds.py", *options)
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_older_table_of_scores_that_is_not_there_is_refused_with_where_it_comes_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(runs.ROOT / "benchmarks" / "settings" / "twice.py", "write", str(tmp_path / "none.csv"))
+    said = capsys.readouterr().err
+    assert "none.csv does not exist" in said
+    assert "--help says how an older table of scores is had from git" in said
+
+
 def test_a_table_of_two_trainings_pairs_scores_of_the_older_and_of_those_that_ship(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

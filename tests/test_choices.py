@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import as_published
@@ -24,7 +26,7 @@ from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.planning.execution import execute
 from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import zero_torques
-from tsmlib.storage import artifacts, tables
+from tsmlib.storage import artifacts, manifest, tables
 from tsmlib.study import runs
 from tsmlib.study.results import exploration, policies
 from tsmlib.study.results.exploration import PUSH
@@ -193,6 +195,24 @@ def test_rows_take_the_place_of_those_of_the_same_model_and_method() -> None:
     found = rows.merged(published, [{**row, "value": 2.0}, {**row, "value": 3.0, "metric": "gap"}])
     kept = {(line["model"], line["seed"], line["metric"]): line["value"] for line in tables.records(found)}
     assert kept == {("tsm", 0, "cost"): 2, ("tsm", 0, "gap"): 3, ("lstm", 0, "cost"): 1, ("tsm", 1, "cost"): 1}
+
+
+def test_commands_that_publish_side_by_side_lose_no_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "RESULTS", tmp_path / "results")
+    row, read = dict(env="e", model="tsm", metric="cost", value=1.0, n=2, scale="paper"), Event()
+
+    def slow(table: pd.DataFrame) -> pd.DataFrame:
+        read.set()
+        time.sleep(0.3)
+        return table
+
+    other = Thread(target=lambda: rows.publish("some", [dict(row, seed=1)], told=slow))
+    other.start()
+    assert read.wait(20)
+    rows.publish("some", [dict(row, seed=0)])
+    other.join()
+    assert sorted(tables.load(tmp_path / "results" / "some.csv")["seed"]) == [0, 1]
+    assert manifest.verify(tmp_path) == [tmp_path / "results" / "some.csv", tmp_path / "MANIFEST.json"]
 
 
 def test_rows_of_a_metric_leave_those_of_another_and_a_learning_curve_is_replaced_as_a_whole() -> None:

@@ -18,6 +18,7 @@ from scripts import load_script, run_script
 
 from tsmlib import figures
 from tsmlib.statistics import Estimate, holm, interval, random_effects
+from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
 from tsmlib.study import pages, publish
 from tsmlib.study.claims import evaluate, ledger, report
@@ -460,6 +461,23 @@ def test_what_simulated_checks_share_leaves_each_as_it_was() -> None:
     assert np.corrcoef(values)[0, 1] == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("part", ["checks", "worlds"])
+def test_no_verdict_is_simulated_without_a_study(part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run_script(ROOT / "benchmarks" / "verdicts" / "run.py", part, "--studies", "0", "--out", str(tmp_path))
+    assert "--studies 0: expected at least 1; the tables that ship are of 400" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_simulated_verdicts_are_written_once_all_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
+    monkeypatch.setattr(module, "PARTS", {"checks": lambda *_: pd.DataFrame({"a": [1]}), "worlds": lambda *_: 1 / 0})
+    monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(tmp_path)])
+    with pytest.raises(ZeroDivisionError):
+        module.main()
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_power_of_ten_seeds_is_of_todays_rows() -> None:
     module = load_script(ROOT / "benchmarks" / "verdicts" / "run.py", "verdicts_run")
     columns = ["claim", "check", "seeds", "margin", "truth", "why"]
@@ -531,6 +549,21 @@ def test_a_table_that_cells_wrote_by_hand_judges_no_claim(table: str, tmp_path: 
     tables_storage.save(run.metrics / f"{table}.csv", [dict(metric="return_true", value=0.0, seed=0, scale="paper")])
     with pytest.raises(RunError, match=f"{table[:3]}[a-z]* in .* is not run, expected complete"):
         evaluate.tables(LEDGER, run)
+
+
+def test_a_run_of_one_model_replaces_its_published_rows_and_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluate, "RESULTS", tmp_path / "results")
+    push = {"env": "tsm/ReacherPush-v1"}
+    stay = [score("tsm", 0, 1.0, **push), score("onestep", 0, 1.0), score("onestep", 1, 1.0), score("tsm", 1, 1.0)]
+    go = [score("tsm", 0, 1.0), score("tsm", 0, 1.0, metric="nrmse")]
+    tables_storage.save(tmp_path / "results" / "03_predict.csv", [*go, *stay])
+    run = resolve("03_predict", scale="paper", run_dir=str(tmp_path))
+    tables_storage.save(run.metrics / "03_predict.csv", [score("tsm", 0, 2.0)])
+    manifest.write_json(run.dir / files.STATUS, {"03_predict": {"state": "complete"}})
+    found = evaluate.tables([superiority(Model("onestep"))], run).rows["03_predict"]
+    pd.testing.assert_frame_equal(found, tables_storage.frame([*stay, score("tsm", 0, 2.0)]), check_dtype=False)
 
 
 @pytest.mark.parametrize("claim", [*LEDGER, *ledger.questions()], ids=lambda c: c.id)

@@ -52,6 +52,21 @@ def test_a_notebook_with_several_tables_ships_all_of_them_with_every_seed(tmp_pa
     assert "08_claims" not in publish.pooled(run)
 
 
+def test_publishing_a_run_of_fewer_seeds_loses_no_row_and_says_what_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(publish, "RESULTS", tmp_path / "data" / "results")
+    monkeypatch.setattr(publish, "publish_claims", lambda: None)
+    run, path = seed(tmp_path, 0), tmp_path / "data" / "results" / "03_predict.csv"
+    row: dict[str, Any] = dict(metric="kl", value=9, scale="paper", env="tsm/Reacher-v0")
+    stay = [dict(row, seed=1), dict(row, seed=2), dict(row, seed=0, env="tsm/ReacherPush-v1")]
+    tables_storage.save(path, [dict(row, seed=0), *stay])
+    publish.publish_table(run, "03_predict")
+    said = "03_predict: 1 (seed 0) rows of runs in place of 1 (seed 0) that shipped; 3 (seeds 0, 1, 2) stay\n"
+    assert capsys.readouterr().out == said
+    assert tables_storage.load(path).equals(tables_storage.frame([*stay, dict(row, seed=0, value=0)]))
+
+
 def test_publishing_compresses_a_large_table_once_and_changes_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

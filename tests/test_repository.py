@@ -102,7 +102,7 @@ def test_what_running_leaves_behind_is_ignored() -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("not a git checkout")
     made = [".venv/x", "runs/laptop/seed0/x", "tsmlib.egg-info/x", "tsmlib/__pycache__/x", ".ruff_cache/x"]
-    made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12"]
+    made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12", "data/.lock", "data/.writer"]
     done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == made
 

@@ -463,6 +463,11 @@ def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round(
     (["adaptation", "--models", "rtsm", "--episodes", "1"], "expected at least 2, since one is held out"),
     (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected 1 to 100"),
     (["rounds", "--models", "rtsm", "--targets", "5"], "--targets 5: expected 1 to 100, and of adaptation alone"),
+    (["rounds", "--models", "rtsm", "--seed", "1000001"], "seed 1000001 draws held-out episodes or targets"),
+    (["rounds", "--models", "rtsm", "--seed", "-1"], "seed is -1, expected a whole number from 0 to 2147483647"),
+    (["rounds", "--models", "rtsm", "--scale", "foo"], "scale is 'foo', expected one of smoke, laptop, paper"),
+    (["policies", "--envs", PUSH, "--models", "rtsm", "--copies", "0"], "--copies 0, --iterations 880: expected"),
+    (["peers", str(ROOT / "README.md")], "README.md is not a results table"),
     (["peers"], "peers and whole, and nothing else, take tables that are there; got none"),
     (["peers", "nowhere.csv"], "take tables that are there; got ['nowhere.csv']"),
 ])  # fmt: skip

@@ -33,7 +33,7 @@ model_free. whole publishes tables of scripts beside this one, starts.py and sam
 
 Rows take the place of those of the same environment, model, method, metric and seed in data/results, in model_free of
 those of all seeds of the same environment and algorithm; all others stay. Rounds take the place of all rows of the
-same environment, model, data and seed, whatever their steps.
+same environment, model, data and seed, whatever their steps. Commands side by side write one after another.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import manifest, tables
+from tsmlib.storage.files import StoreError, writer_lock
 from tsmlib.study import (
     adaptation,
     drawings,
@@ -70,16 +71,16 @@ from tsmlib.study import (
     worlds,
     zoo,
 )
+from tsmlib.study.data import require_other_seed
 from tsmlib.study.jobs import Job, Policy, Scores, plan_jobs
 from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.exploration import PENDULUM
-from tsmlib.study.results.table import Row, select
+from tsmlib.study.results.table import THING, Row, about, others, select
 from tsmlib.study.runs import RESULTS
 from tsmlib.trajectory import Trajectories
 
-KEY = ("env", "noise", "delay", "model", "planner", "search_space", "execution", "seed", "scale")
 LOOP = ("env", "model", "configuration", "seed", "scale")
 NOTEBOOKS = {
     "collect": "01_collect", "gradients": "02_train", "predict": "03_predict", "ablations": "03_predict",
@@ -114,25 +115,17 @@ def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.Da
 def without_loops(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
     """The published table without the loops of rounds that ``rows`` are of: a loop made again may lose other episodes,
     so that its rounds have other steps, and lack a return that was there."""
-    made = set(_loops(tables.frame(rows)))
+    made = set(about(tables.frame(rows), LOOP))
     of_rounds = (published["planner"] == "cem") | (published["subset"] == "data")
-    again = pd.Series([loop in made for loop in _loops(published)], index=published.index, dtype=bool)
+    again = pd.Series([loop in made for loop in about(published, LOOP)], index=published.index, dtype=bool)
     return published[~(of_rounds & again)]
-
-
-def _loops(rows: pd.DataFrame) -> list[tuple[str, ...]]:
-    """Of which loop a row is."""
-    rows = rows if "configuration" in rows else rows.assign(configuration="")
-    return list(rows[list(LOOP)].astype(str).itertuples(index=False, name=None))
 
 
 def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
-    rows = rows if "configuration" in rows else rows.assign(configuration="")
     curve, more = rows["planner"] == "policy", ("metric", "iteration", "steps_ahead")
-    what = {name: rows[name].astype(str).mask(curve, "") for name in more}
-    what |= {name: rows[name].astype(str) for name in ("configuration", "env_steps", "subset")}
-    return list(rows[list(KEY)].astype(str).assign(**what).itertuples(index=False, name=None))
+    masked = rows.assign(**{name: rows[name].astype(object).mask(curve, "") for name in more})
+    return about(masked, (*THING, *more, "env_steps", "subset"))
 
 
 def shipped(name: str) -> pd.DataFrame:
@@ -147,12 +140,23 @@ def publish(
 ) -> None:  # fmt: skip
     """Merge rows into a table of data/results, and its new checksum into the manifest. loops: of whole loops of
     rounds, whose former rows go. told: what becomes of the whole table then."""
-    path, new, known = RESULTS / f"{name}.csv", tables.frame(rows), shipped(name)
-    table = merged(without_loops(known, new) if loops else known, new)
-    table = told(table) if told else table
-    tables.ship(path, table)
-    manifest.write_manifest(Path(RESULTS).parent)
-    print(f"{path.name}: {len(table)} rows")
+    new = tables.frame(rows)
+
+    def changed(known: pd.DataFrame) -> pd.DataFrame:
+        table = merged(without_loops(known, new) if loops else known, new)
+        return told(table) if told else table
+
+    ship(name, changed)
+
+
+def ship(name: str, changed: Callable[[pd.DataFrame], pd.DataFrame]) -> None:
+    """Put what ``changed`` makes of a table of data/results in its place, and its new checksum into the manifest, while
+    no other command writes there."""
+    with writer_lock(RESULTS.parent, f"rows of {name}", wait=True):
+        table = changed(shipped(name))
+        tables.ship(RESULTS / f"{name}.csv", table)
+        manifest.write_manifest(RESULTS.parent)
+    print(f"{name}.csv: {len(table)} rows")
 
 
 def with_plateaus(table: pd.DataFrame, run: runs.Run, envs: list[str]) -> pd.DataFrame:
@@ -305,19 +309,18 @@ def published_peers(files: list[Path]) -> None:
     if len(predicted):
         publish("peers_pets", predicted)
     if len(policies):  # a learner's steps may have been others before
-        path, about = RESULTS / "model_free.csv", ["env", "model"]
-        kept = tables.load(path) if tables.stored(path) else policies[:0]
-        there = policies.set_index(about).index
-        tables.ship(path, tables.frame(pd.concat([kept[~kept.set_index(about).index.isin(there)], policies])))
-        manifest.write_manifest(Path(RESULTS).parent)
+        about_these = ("env", "model")
+        ship("model_free", lambda known: tables.frame(pd.concat([others(known, policies, about_these), policies])))
 
 
 def published_whole(files: list[Path]) -> None:
     """Tables of WHOLE as they are."""
     for path in files:
         tables.load(path)  # StoreError where it is damaged
-        tables.ship_bytes(RESULTS / path.name, path.read_bytes())
-    manifest.write_manifest(Path(RESULTS).parent)
+    with writer_lock(RESULTS.parent, ", ".join(path.name for path in files), wait=True):
+        for path in files:
+            tables.ship_bytes(RESULTS / path.name, path.read_bytes())
+        manifest.write_manifest(RESULTS.parent)
 
 
 def executed(notebook: runs.Notebook, run: runs.Run, envs: list[str], models: list[str]) -> pd.DataFrame:
@@ -370,7 +373,10 @@ def main() -> None:
     if given.part == "whole" and (other := [path.name for path in given.files if path.stem not in WHOLE]):
         options.error(f"whole takes {' and '.join(f'{name}.csv' for name in WHOLE)}; got {', '.join(other)}")
     if given.part in FILES:
-        FILES[given.part](given.files)
+        try:
+            FILES[given.part](given.files)
+        except StoreError as error:
+            options.error(str(error))
         return
     if not given.models and given.part != "collect":
         options.error(f"{given.part} needs --models, some of {', '.join(zoo.words())}")
@@ -384,10 +390,19 @@ def main() -> None:
         options.error(f"{given.part} takes no {PENDULUM}; --envs are some of {', '.join(ENV_IDS)}")
     if min(given.episodes) < 2:
         options.error(f"--episodes {min(given.episodes)}: expected at least 2, since one is held out")
+    if given.copies < 1 or given.iterations < 0:
+        options.error(
+            f"--copies {given.copies}, --iterations {given.iterations}: expected at least one copy, and 0 (the scale's "
+            "default) or more iterations"
+        )
     if (given.targets and given.part != "adaptation") or not 0 <= given.targets <= 100:
         options.error(f"--targets {given.targets}: expected 1 to 100, and of adaptation alone")
     notebook = NOTEBOOKS.get(given.part, "05_control")
-    run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    try:
+        require_other_seed(given.seed)
+        run = runs.resolve(notebook, scale=given.scale, seed=given.seed)
+    except parameters.ParameterError as error:
+        options.error(str(error))
     if given.part == "convergence" and not needed.control(run).converging:
         options.error(f"nothing converges at scale {run.scale}; --scale of convergence is paper or smoke")
     if given.part in ("predict", "ablations"):

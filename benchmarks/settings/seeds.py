@@ -41,7 +41,7 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.figures.method import Method
 from tsmlib.storage import artifacts
 from tsmlib.study import models, parallel, policies, runs, zoo
-from tsmlib.study.data import dataset
+from tsmlib.study.data import dataset, require_other_seed
 
 SEEDS = Path(__file__).with_name("seeds.csv")
 ENVS = ("tsm/ReacherPush-v1", "tsm/ReacherObstacle-v0", "tsm/Reacher-v0")
@@ -119,7 +119,21 @@ def main() -> None:
     parser.add_argument("--scale", default="", help="default TSM_SCALE, else laptop")
     parser.add_argument("--device", default="", help="default TSM_DEVICE, else cpu")
     given = parser.parse_args()
-    own = [runs.resolve("02_train", scale=given.scale, seed=seed, device=given.device) for seed in given.seeds]
+    if doubled := sorted({seed for seed in given.seeds if given.seeds.count(seed) > 1}):
+        parser.error(f"--seeds names {', '.join(map(str, doubled))} more than once; name each seed once")
+    if given.together < 1:
+        parser.error(f"--together {given.together}: expected at least 1 (default 5)")
+    if given.policies < 0:
+        parser.error(f"--policies {given.policies}: expected at least 1 iteration; leave it out to train models")
+    try:
+        require_other_seed(*given.seeds)
+        own = [runs.resolve("02_train", scale=given.scale, seed=seed, device=given.device) for seed in given.seeds]
+        for env in given.envs:
+            EnvSpec.parse(env)
+    except ValueError as error:  # ParameterError is one
+        parser.error(str(error))
+    if given.table and (scale := own[0].scale) != "paper":
+        parser.error(f"{SEEDS.name} has lines of scale paper alone, got {scale}; type --table --scale paper")
     if given.table:
         found = table(own, given.envs, given.models)
         merged(pd.read_csv(SEEDS, dtype=str), found.astype(str)).to_csv(SEEDS, index=False, lineterminator="\n")

@@ -19,6 +19,7 @@ import pandas as pd
 
 from tsmlib.statistics import interval
 from tsmlib.storage import tables
+from tsmlib.storage.files import StoreError
 from tsmlib.study.results import table
 from tsmlib.study.runs import RESULTS
 
@@ -58,7 +59,11 @@ def main() -> None:
     if (given.part == "write") != bool(given.older):
         options.error("write, and nothing else, takes an older table of scores")
     if given.older:
-        both = scores(given.older, "gpu").merge(scores(RESULTS / "03_predict.csv", "cpu"), on=ABOUT).query("gpu != cpu")
+        try:
+            older = scores(given.older, "gpu")
+        except StoreError as error:
+            options.error(f"{error} --help says how an older table of scores is had from git")
+        both = older.merge(scores(RESULTS / "03_predict.csv", "cpu"), on=ABOUT).query("gpu != cpu")
         if both.empty:
             options.error(f"{given.older}: no other scores of these arms there than those that ship")
         both.sort_values(ABOUT).to_csv(FILE, index=False, float_format="%.6g", lineterminator="\n")

@@ -221,8 +221,10 @@ def main() -> None:
         return
     if unknown := set(given.parts) - set(PARTS):
         parser.error(f"no part is called {', '.join(sorted(unknown))}; there are {' and '.join(PARTS)}")
-    for name in given.parts or PARTS:
-        lines = PARTS[name](given.studies, np.random.default_rng(0))
+    if given.studies < 1:
+        parser.error(f"--studies {given.studies}: expected at least 1; the tables that ship are of 400, the default")
+    found = {name: PARTS[name](given.studies, np.random.default_rng(0)) for name in given.parts or PARTS}
+    for name, lines in found.items():
         files.write_bytes(given.out / f"{name}.csv", lines.to_csv(index=False).encode())
         print(lines.to_string(index=False))
 

@@ -1,7 +1,7 @@
 """Publishing: a paper-scale run copied into data/ and figures/, and the results in README and docs/ written from it."""
 
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +14,7 @@ from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, ENV_IDS, MUJOCO_IDS, NOISE, EnvSpec
 from tsmlib.storage import files, manifest
 from tsmlib.storage import tables as tables_storage
+from tsmlib.storage.files import writer_lock
 from tsmlib.study import drawings, needed, notebooks, pages, runs, zoo
 from tsmlib.study.claims import evaluate
 from tsmlib.study.claims import report as claims_report
@@ -55,39 +56,53 @@ POOLED = (
 def publish(run: Run) -> None:
     """Copy a run's models, oracle plans, tables and figures into data/ and figures/; rewrite what is said of them.
 
-    Tables have the rows of the other seeds beside this run as well. Raises RunError, before anything is written,
-    unless the notebooks ran to their end and their results are as they left them.
+    Tables have the rows of the other seeds beside this run as well; published rows that no run has anew stay. Raises
+    RunError, before anything is written, unless the notebooks ran to their end and their results are as they left them.
     """
     for notebook in ("01_collect", "02_train", "05_control", *POOLED):
         require(run, notebook)
     tables = pooled(run)
-    for source, pattern, target in (
-        (run.models, "*/*.safetensors", run.shipped),
-        (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
-        (run.figures, "*.*", FIGURES),
-    ):
-        for path in sorted(source.glob(pattern)):
-            if _ships(path):
-                copy = target / path.relative_to(source)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                files.write_bytes(copy, path.read_bytes())
-    for path in sorted(run.metrics.glob("*.csv")):
-        if path.stem not in tables:
-            tables_storage.ship_bytes(RESULTS / path.name, path.read_bytes())
-    for name, rows in tables.items():
-        tables_storage.ship(RESULTS / f"{name}.csv", rows)
-    manifest.write_manifest(ROOT / "data")
+    with writer_lock(RESULTS.parent, "publish", wait=True):
+        for source, pattern, target in (
+            (run.models, "*/*.safetensors", run.shipped),
+            (run.folder("plans"), "*-oracle-*.safetensors", RESULTS),
+            (run.figures, "*.*", FIGURES),
+        ):
+            for path in sorted(source.glob(pattern)):
+                if _ships(path):
+                    copy = target / path.relative_to(source)
+                    copy.parent.mkdir(parents=True, exist_ok=True)
+                    files.write_bytes(copy, path.read_bytes())
+        _ship(tables)
     publish_claims()
 
 
 def publish_table(run: Run, notebook: str) -> None:
     """Copy the tables of one notebook of POOLED, with all their seeds, into data/; rewrite what is said of the
-    results."""
+    results. Published rows that no run has anew stay."""
     require(run, notebook)
-    for name, rows in pooled(run, [notebook]).items():
-        tables_storage.ship(RESULTS / f"{name}.csv", rows)
-    manifest.write_manifest(RESULTS.parent)
+    tables = pooled(run, [notebook])
+    with writer_lock(RESULTS.parent, f"publish {notebook}", wait=True):
+        _ship(tables)
     publish_claims()
+
+
+def _ship(tables: Mapping[str, pd.DataFrame]) -> None:
+    """Put rows of runs into the published tables, in place of those about the same; say what is new and what stays."""
+    for name, rows in tables.items():
+        path = RESULTS / f"{name}.csv"
+        before = tables_storage.load(path) if tables_storage.stored(path) else rows[:0]
+        stay = table.others(before, rows)
+        tables_storage.ship(path, tables_storage.frame(pd.concat([stay, rows])))
+        gone = before.drop(stay.index)
+        print(f"{name}: {_counted(rows)} rows of runs in place of {_counted(gone)} that shipped; {_counted(stay)} stay")
+    manifest.write_manifest(RESULTS.parent)
+
+
+def _counted(rows: pd.DataFrame) -> str:
+    """How many rows there are, and of which training seeds."""
+    seeds = sorted(set(rows["seed"].dropna()))
+    return f"{len(rows):,}" + f" (seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))})" * bool(seeds)
 
 
 def _ships(path: Path) -> bool:
@@ -117,17 +132,19 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
 def publish_claims() -> None:
     """Judge every claim from the tables that ship, and write README, docs/results.md, docs/claims.md and
     docs/claims_in_full.md. Idempotent."""
-    compress()
-    papers, ours = pages.shipped_verdicts(PAPERS), pages.shipped_verdicts(OURS)
-    tables_storage.ship(RESULTS / "08_claims.csv", evaluate.as_rows(papers + ours, scale="paper"), extra=evaluate.EXTRA)
-    manifest.write_manifest(ROOT / "data")
-    between(README, AIM_MARKS, pages.readme_aims())
-    between(README, MARKS, pages.readme_results())
-    between(RESULTS_PAGE, MARKS, pages.results_page())
-    between(README, CLAIM_MARKS, pages.readme_claims(papers, ours))
-    between(CLAIMS_PAGE, CLAIM_MARKS, pages.claims_page(papers, ours))
-    between(FULL_PAGE, CLAIM_MARKS, pages.full_page(papers, ours))
-    draw_claims(papers)
+    with writer_lock(RESULTS.parent, "claims and pages", wait=True):  # rows that they are of stay as they are
+        compress()
+        papers, ours = pages.shipped_verdicts(PAPERS), pages.shipped_verdicts(OURS)
+        rows = evaluate.as_rows(papers + ours, scale="paper")
+        tables_storage.ship(RESULTS / "08_claims.csv", rows, extra=evaluate.EXTRA)
+        manifest.write_manifest(ROOT / "data")
+        between(README, AIM_MARKS, pages.readme_aims())
+        between(README, MARKS, pages.readme_results())
+        between(RESULTS_PAGE, MARKS, pages.results_page())
+        between(README, CLAIM_MARKS, pages.readme_claims(papers, ours))
+        between(CLAIMS_PAGE, CLAIM_MARKS, pages.claims_page(papers, ours))
+        between(FULL_PAGE, CLAIM_MARKS, pages.full_page(papers, ours))
+        draw_claims(papers)
 
 
 def draw_claims(papers: list[evaluate.Verdict]) -> list[Path]:

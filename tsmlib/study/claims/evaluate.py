@@ -26,6 +26,7 @@ from tsmlib.storage import tables as tables_storage
 from tsmlib.study.claims.claim import DEFINITIONAL, DEPENDENT, FAILED, INCONCLUSIVE, REPLICATED, UNTESTABLE, Claim
 from tsmlib.study.claims.query import Check, Term
 from tsmlib.study.notebooks import require
+from tsmlib.study.results.table import others
 from tsmlib.study.runs import RESULTS, Run, find, notebooks
 
 UNTOLD = {"samples_to_90"}  # not told by a curve that was recorded too rarely (``results.policies.plateau_rows``)
@@ -223,7 +224,8 @@ class Tables:
 
 
 def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
-    """The rows that ship. run: of scale paper; the rows of each seed beside it that has its own take their place.
+    """The rows that ship. run: of scale paper; its rows, and those of each seed beside it, take the place of those of
+    the same seed, environment, model and method.
 
     RunError where a notebook that made such rows did not come to its end.
     """
@@ -234,14 +236,16 @@ def tables(claims: Sequence[Claim], run: Run | None = None) -> Tables:
     rows = {name: tables_storage.load(path) for name, path in paths.items() if path}
     stems = {notebook.stem[:3]: notebook.stem for notebook in notebooks().values()}  # 03_ablation is 03_predict's
     runs = run.seeds() if run and run.scale == "paper" else []
-    for one, name in itertools.product(runs, names):
-        if not (path := one.dir / "metrics" / f"{name}.csv").exists():
-            continue
-        if name[:3] in stems:
-            require(one, stems[name[:3]])
-        own = tables_storage.load(path)
-        shipped = rows.get(name, own[:0])
-        rows[name] = pd.concat([shipped[~shipped["seed"].isin(own["seed"])], own], ignore_index=True)
+    for name in names:
+        found = list[pd.DataFrame]()
+        for one in runs:
+            if (path := one.dir / "metrics" / f"{name}.csv").exists():
+                if name[:3] in stems:
+                    require(one, stems[name[:3]])
+                found.append(tables_storage.load(path))
+        if found:
+            own = pd.concat(found)
+            rows[name] = pd.concat([others(rows.get(name, own[:0]), own), own], ignore_index=True)
     return Tables(rows)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
 from typing import Any, Concatenate, NotRequired, ParamSpec, TypedDict, TypeVar
 
@@ -34,6 +34,9 @@ KEYS = (
     "start",
     "what",
 )  # what a line is about
+THING = (  # what the rows are about that replace each other
+    *("env", "noise", "delay", "model", "planner", "search_space", "execution", "configuration", "seed", "scale"),
+)
 Row = dict[str, object]
 K = TypeVar("K")
 V = TypeVar("V")
@@ -176,6 +179,25 @@ def arrays(wide: pd.DataFrame) -> dict[Any, np.ndarray]:
 def means(table: pd.DataFrame, by: str | list[str], columns: str | list[str] = "metric") -> pd.DataFrame:
     """Means, over seeds above all, with a line per ``by`` and a column per metric, in order of appearance."""
     return table.pivot_table(index=by, columns=columns, values="value", sort=False)
+
+
+# Rows in place of others ----------------------------------------------------------------------------------------------
+
+
+def about(rows: pd.DataFrame, columns: Sequence[str] = THING) -> list[tuple[str, ...]]:
+    """The values of some columns in each row, as texts: empty where a row, or the table, has none."""
+    texts = [
+        rows[name].astype(object).where(rows[name].notna(), "").astype(str) if name in rows else [""] * len(rows)
+        for name in columns
+    ]
+    return list(zip(*texts, strict=True))
+
+
+def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = THING) -> pd.DataFrame:
+    """The published rows that are about nothing that ``own`` has rows of: of other seeds, environments, models or
+    methods."""
+    there = set(about(own, columns))
+    return published[np.array([thing not in there for thing in about(published, columns)], dtype=bool)]
 
 
 # Published rows and the reader's own ----------------------------------------------------------------------------------
