@@ -43,29 +43,23 @@ from collections.abc import Callable, Iterable
 from functools import partial, reduce
 from itertools import product
 from pathlib import Path
-from typing import TypedDict, cast
 
-import numpy as np
 import pandas as pd
 
 from tsmlib import figures, study
-from tsmlib.envs import imperfect
+from tsmlib.envs import imperfect as imperfect_arm
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE
-from tsmlib.evaluation import filtering, futures, prediction
 from tsmlib.figures.method import PLANNERS, SEARCH_SPACES
-from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib.models.tsm import TSM
 from tsmlib.storage import manifest, tables
 from tsmlib.storage.files import StoreError, writer_lock
 from tsmlib.study import (
     adaptation,
     drawings,
+    imperfect,
     media,
     needed,
     notebooks,
     parameters,
-    predictions,
-    results,
     rounds,
     runs,
     worlds,
@@ -94,13 +88,6 @@ SIMULATOR = planning.ORACLE.model
 WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
 MAPPED = ("rtsm", exploration.PLANNED, 0, "paper")  # the loops whose episodes are drawn
 FLOORS = (planning.ORACLE, zoo.method("zero"), zoo.method("random"))
-
-
-class Common(TypedDict):
-    """What all rows of a run have."""
-
-    seed: int
-    scale: str
 
 
 def merged(published: pd.DataFrame, rows: pd.DataFrame | Iterable[Row]) -> pd.DataFrame:
@@ -214,39 +201,12 @@ def torques(run: runs.Run, envs: list[str], models: list[str], planners: list[st
 
 def imperfect_rows(run: runs.Run, models: list[str]) -> list[Row]:
     """Rows of 06_robustness.csv on the reaching arm with noise and with delay, but for those of policies."""
-    noisy, late = imperfect(REACH, noise=NOISE), imperfect(REACH, delay=DELAY)
+    noisy, late = imperfect_arm(REACH, noise=NOISE), imperfect_arm(REACH, delay=DELAY)
     pairs, coded = list(product((noisy, late), models)), [word for word in models if word in zoo.words(cls=zoo.CODED)]
     study.precompute(run, [Scores(env, word, segments) for env, word in pairs for segments in (False, True)])
-    n, samples = run.pick(smoke=8, laptop=100, paper=1000), run.pick(smoke=4, laptop=16, paper=32)
-    held_out = {env: study.dataset(run, env, "validation") for env in (noisy, late, REACH)}
-    test = {env: study.dataset(run, env, "test").take(slice(n)) for env in (noisy, late, REACH)}
-    rows, common, truth = study.score_rows(run, pairs), Common(seed=run.seed, scale=run.scale), test[REACH]
-    about = {"planner": "none", "execution": "open loop", "subset": "past actions zero", "n": n}
-    for word in coded:
-        blind = predictions.WithoutPastActions(study.load_or_train(run, late, word).model)
-        found = prediction.score(
-            blind, blind.features, test[late], held_out[late], horizon=90, samples=samples, seed=run.seed, progress=word
-        )
-        here = results.table.place(late) | about | {**common} | {"model": word}
-        rows += [here | {"metric": metric, "value": value} for metric, value in results.prediction.means(found).items()]
-    for env, word in product((noisy, late), coded):
-        segments = cast(TSM | RecurrentTSM, study.load_or_train(run, env, word).model)
-        drawn = futures.sample_futures(segments, test[env], samples=samples, horizon=10, seed=run.seed)
-        own = results.latent.rows(segments, drawn, model=word, **common)
-        rows += [row for row in own if not row.get("subset") and "dimension" not in row]
-    for word in models:
-        net = study.load_or_train(run, noisy, word).model
-        off = filtering.model_errors(net, test[noisy], truth, samples=samples, progress=word)
-        rows += results.robustness.error_rows(noisy, word, off, **common)
-    raw = filtering.errors(test[noisy].states[:, 1:], truth.states[:, 1:])
-    raw = np.repeat(raw[:, :, None], 10, 2).reshape(-1, 10, raw.shape[-1])
-    rows += results.robustness.error_rows(noisy, "none", raw, **common)
-    told = held_out[noisy], held_out[REACH]
-    kalman = filtering.KalmanFilter.fitted(study.dataset(run, REACH, "train"), NOISE).tuned(*told)
-    now, ahead = filtering.filter_errors(kalman, test[noisy], truth)
-    rows += results.robustness.error_rows(noisy, "filter", ahead, now, **common)
-    now = filtering.exponential_errors(filtering.tuned_exponential(*told), test[noisy], truth)
-    return rows + results.robustness.error_rows(noisy, "exponential", None, now, **common)
+    rows = [*study.score_rows(run, pairs), *imperfect.blind_rows(run, late, coded)]
+    rows += [row for env in (noisy, late) for row in imperfect.code_rows(run, env, coded)]
+    return rows + imperfect.clean_rows(run, noisy, REACH, models)
 
 
 def adapted(
