@@ -195,7 +195,7 @@ def test_a_share_of_a_lead_that_is_not_there_is_no_margin(lstm: float, word: str
     assert verdict.word == word
     assert len(verdict.effects[""]) == (2 if word == REPLICATED else 3)  # a premise that holds is not a check
     assert ("A margin is a share of" in verdict.why) == (word == UNTESTABLE)
-    assert report.change(verdict).startswith("a lead" if word == UNTESTABLE else "a mean of the deciding check")
+    assert report.change(verdict).startswith("a lead" if word == UNTESTABLE else "rows by which")
     assert ("not testable" in report.in_full(verdict, verdict)) == (word == UNTESTABLE)
 
 
@@ -671,8 +671,8 @@ def test_a_claim_in_full_shows_every_seed_of_every_check_and_each_reading() -> N
     assert [line[2] for line in cells[1:3]] == ["> 0", "< 8"]
     assert all(line[3].startswith("5 [-") and line[4] == "open" for line in cells[1:3])
     drawn = report.drawn_checks(verdict)
-    assert [(check.margin, check.rising, check.seeds.tolist()) for check in drawn] == [
-        (0, True, [1.0, 5.0, 9.0]), (8, False, [1.0, 5.0, 9.0]),
+    assert [(check.margin, check.side, check.seeds.tolist()) for check in drawn] == [
+        (0, 1, [1.0, 5.0, 9.0]), (8, -1, [1.0, 5.0, 9.0]),
     ]  # fmt: skip
     read = [line[:2] for line in cells[3:]]
     assert read[1:] == [["as the paper words it", "inconclusive"], ["A1b one shared variance", "not replicated"]]
@@ -682,9 +682,9 @@ def test_a_claim_in_full_shows_every_seed_of_every_check_and_each_reading() -> N
 def test_the_figure_of_a_claim_has_a_row_for_every_check_and_a_mark_for_every_seed() -> None:
     seeds, none = np.array([1.0, 5.0, 9.0]), np.full(3, np.nan)
     rows = [
-        figures.DrawnCheck("holds", "5 [1, 9]", 0, True, np.array([5.0, 1.0, 9.0]), seeds),
-        figures.DrawnCheck("fails", "5 [1, 9]", 0, False, np.array([5.0, 1.0, 9.0]), seeds),
-        figures.DrawnCheck("missing", "no rows", 0, True, none, none[:0]),
+        figures.DrawnCheck("holds", "5 [1, 9]", 0, 1, np.array([5.0, 1.0, 9.0]), seeds),
+        figures.DrawnCheck("fails", "5 [1, 9]", 0, -1, np.array([5.0, 1.0, 9.0]), seeds),
+        figures.DrawnCheck("missing", "no rows", 0, 1, none, none[:0]),
     ]
     ax = figures.claim_checks(rows).axes[0]
     places = [line.get_xdata().tolist() for line in ax.lines if line.get_marker() == "o"]
@@ -697,7 +697,7 @@ def test_the_figure_of_a_claim_has_a_row_for_every_check_and_a_mark_for_every_se
 
 
 def test_an_svg_file_has_the_same_bytes_on_any_day(tmp_path: Path) -> None:
-    row = figures.DrawnCheck("holds", "5", 0, True, np.array([5.0, 1.0, 9.0]), np.array([5.0]))
+    row = figures.DrawnCheck("holds", "5", 0, 1, np.array([5.0, 1.0, 9.0]), np.array([5.0]))
     files = [figures.save_svg(figures.claim_checks([row]), tmp_path / name) for name in ("a.svg", "b.svg")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert b"Date" not in files[0].read_bytes()
@@ -741,8 +741,8 @@ def test_seeds_to_decide_are_those_that_put_the_interval_beside_the_margin() -> 
 @pytest.mark.parametrize(
     ("tsm", "said"),
     [
-        ([3.0, 3.1, 3.2], "a mean of the deciding check below 0, in place of 3.1"),
-        ([-3.0, -3.1, -3.2], "a mean of the deciding check above 0, in place of -3.1"),
+        ([3.0, 3.1, 3.2], "the interval of a check reaches its margin; the one nearest to it is 3.1 ["),
+        ([-3.0, -3.1, -3.2], "rows by which the check that fails does not; it is -3.1 ["),
         ([3.0], "another training seed"),
         ([], "rows, which are missing"),
     ],

@@ -572,6 +572,25 @@ def test_a_notebook_is_executed_again_where_a_file_that_it_was_made_from_was_rep
     assert (place / "tried").read_text().count("02_train 2") == 2
 
 
+def test_a_file_that_is_replaced_while_a_notebook_runs_makes_it_out_of_date(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    small(place, "02_train")
+    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    prior = place / "runs" / "smoke" / "seed2/models/Reacher/prior.safetensors"
+    artifacts.save(prior, {"x": torch.zeros(1)}, kind="model", header={})
+    papermill = notebooks._papermill
+
+    def replacing(*asked: Any) -> Path:
+        replace_file(prior)
+        return papermill(*asked)
+
+    monkeypatch.setattr(notebooks, "_papermill", replacing)
+    assert workflow.run_all(prepared, {}, executor="pool") == 0
+    assert notebooks.replaced(prepared[0].run) == ["models/Reacher/prior.safetensors"]
+
+
 def test_a_notebook_of_other_parameters_or_without_its_table_is_not_there(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

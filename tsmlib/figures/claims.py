@@ -76,13 +76,13 @@ class DrawnCheck(NamedTuple):
     """A check as it is drawn.
 
     estimate: with the ends of its interval (3,), NaN where there are none. seeds: each training seed's number (seeds,).
-    rising: whether the claimed side is that of larger numbers.
+    side: 1 where larger numbers than the margin are claimed, -1 where smaller ones are, 0 where the margin itself is.
     """
 
     state: str
     text: str
     margin: float
-    rising: bool
+    side: int
     estimate: np.ndarray
     seeds: np.ndarray
 
@@ -91,16 +91,18 @@ class DrawnCheck(NamedTuple):
 def claim_checks(checks: Sequence[DrawnCheck]) -> Figure:
     """Every check of a claim, a row each, numbered from 1: estimate, interval and training seeds against the margin.
 
-    The claimed side is to the right and tinted. Each row has a scale of its own, linear, with its ends in numbers.
+    The claimed side is to the right and tinted; where the margin itself is claimed, nothing is. Each row has a linear
+    scale of its own, with its ends in numbers.
     ValueError without checks.
     """
     if not checks:
         raise ValueError("no checks: nothing to draw")
     figure, ax = plt.subplots(figsize=(WIDTH, 0.2 * len(checks) + 0.55))
-    ax.axvspan(0, 1.08, color="#EEF6F2", lw=0, zorder=0)
     ax.axvline(0, color="#555555", lw=0.8, zorder=1)
     for y, check in enumerate(checks):
-        colour, side = STATES.get(check.state, "#B0B0B0"), 1 if check.rising else -1
+        colour, side = STATES.get(check.state, "#B0B0B0"), check.side or 1
+        if check.side:
+            ax.fill_between([0, 1.08], y - 0.5, y + 0.5, color="#EEF6F2", lw=0, zorder=0)
         beyond, seeds = (side * (numbers - check.margin) for numbers in (check.estimate, check.seeds))
         furthest = float(np.fmax.reduce(np.abs(np.concatenate([beyond, seeds])), initial=0.0)) or 1.0
         ax.plot(seeds / furthest, [y] * len(seeds), "o", ms=4, mfc="none", mec=colour, mew=0.6, alpha=0.8, zorder=3)
@@ -115,7 +117,7 @@ def claim_checks(checks: Sequence[DrawnCheck]) -> Figure:
             ax.annotate(ends, (share, y), (4 * at, 0), ("axes fraction", "data"), "offset points", ha=places,
                         color=NOTE, **words)  # fmt: skip
         ax.annotate(check.text, (1, y), (38, 0), ("axes fraction", "data"), "offset points", color="#444444", **words)
-    ax.set(xlim=(-1.08, 1.08), ylim=(len(checks) - 0.4, -0.6), xticks=[-1, 0, 1], yticks=[])
+    ax.set(xlim=(-1.08, 1.08), ylim=(len(checks) - 0.5, -0.5), xticks=[-1, 0, 1], yticks=[])
     ax.set_xticklabels(["against the claim", "margin", "for it"])
     rows_only(ax)
     grey = "#444444"

@@ -117,11 +117,14 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
             **_asked(execution),
         }  # fmt: skip
         _note(run, {**status, "state": "running"})
+        before = _files(
+            run, jobs
+        )  # of a file that is replaced meanwhile the first counts: the notebook is outdated then
         ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
         try:
             executed = _papermill(execution, progress)
             files = manifest.listing(run.dir, _made(run, record))
-            ended = {"state": "complete", "files": files, "made_from": _files(run, jobs)}
+            ended = {"state": "complete", "files": files, "made_from": _files(run, jobs) | before}
         except RunError as error:
             ended = {"state": "failed", "error": str(error)}
             raise

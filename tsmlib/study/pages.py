@@ -186,6 +186,7 @@ def claims_page(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) ->
 
 - The paper's model: {claims_report.counts(papers)}. {claims_report.seeds_told(papers)}
 - `{OURS}` in its place: {claims_report.counts(ours)}. {claims_report.seeds_told(ours)}
+- {claims_report.by_papers_planner(papers)}
 - Not counted, since they hold by definition: {by_definition}.
 
 ## How many training seeds each figure and claim rests on
@@ -205,7 +206,7 @@ With `{OURS}` in the place of the paper's model:
 ## The {headlines} main claims
 
 What the paper says of long horizons, with its figures 5 to 8 and 10, of codes and of the action prior; chosen together
-with the margins. {claims_report.by_papers_planner(papers)}
+with the margins.
 
 {carry}
 

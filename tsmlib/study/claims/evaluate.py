@@ -282,7 +282,8 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     elif first == "holds" and turned:
         word, why = DEPENDENT, f"It holds {claim.primary}. It turns with: {'; '.join(turned)}."
     elif first in ("fails", "open") and holds:
-        word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. {claim.primary.capitalize()}, {why}"
+        first_reading = claim.primary[0].upper() + claim.primary[1:]
+        word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. {first_reading}, {why}"
     return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
 
 

@@ -72,7 +72,7 @@ def by_papers_planner(verdicts: Sequence[Verdict]) -> str:
         f"{', '.join(claim for claim in others if others[claim] == word)} {word}"
         for word in dict.fromkeys(others.values())
     )
-    return f"By Adam, the paper's planner, in place of CEM: {told}." if told else ""
+    return f"Of all claims, by Adam, the paper's planner, in place of CEM: {told}." if told else ""
 
 
 def unmeasured(verdict: Verdict) -> str:
@@ -214,7 +214,7 @@ def drawn_checks(verdict: Verdict) -> list[figures.DrawnCheck]:
     return [
         figures.DrawnCheck(
             effect.state, f"{effect.estimate}, asked {effect.check.op} {effect.check.margin:g}", effect.check.margin,
-            effect.check.op[0] != "<", np.array([effect.value, effect.low, effect.high], float),
+            {"<": -1, ">": 1}.get(effect.check.op[0], 0), np.array([effect.value, effect.low, effect.high], float),
             np.array(effect.by_seed, float),
         )
         for effect in effects
@@ -247,11 +247,12 @@ def change(verdict: Verdict) -> str:
     away, low, high = key.beyond
     several = f" All of {checks} checks have to hold." * (checks > 1)
     if verdict.word in (REPLICATED, FAILED):
-        towards = "above" if (key.check.op[0] == "<") == (verdict.word == REPLICATED) else "below"
-        return (
-            f"a mean of the deciding check {towards} {key.check.margin:g}, in place of {key.value:.3g}; more training "
-            f"seeds that differ as these do would hardly bring it there.{several * (verdict.word == FAILED)}"
-        )
+        found = f"{key.text}, asked {key.check.op} {key.check.margin:g}"
+        if verdict.word == REPLICATED:
+            return f"rows by which the interval of a check reaches its margin; the one nearest to it is {found}."
+        failing = sum(effect.state == "fails" for effect in verdict.checks)
+        fewer = f"none of the {failing} checks that fail does" if failing > 1 else "the check that fails does not"
+        return f"rows by which {fewer}; {'the deciding one' if failing > 1 else 'it'} is {found}.{several}"
     side = "right" if away > 0 else "wrong"
     if low * high > 0:
         return (
