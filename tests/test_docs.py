@@ -181,6 +181,8 @@ def test_gradients_over_codes_leave_smaller_gaps_and_return_less_as_the_page_on_
     rows = tables.load(ROOT / "data" / "results" / "05_control.csv")
     rows = rows[(rows["planner"] == "adam") & (rows["execution"] == "open loop") & rows["iteration"].isna()]
     found = rows.pivot_table(index=["env", "model"], columns=["metric", "search_space"], values="value")
+    found = found[["gap_absolute", "return_true"]].dropna()
+    assert len(found) >= 7  # the baselines' plans of reaching are direct alone
     assert (found["gap_absolute"]["latent"] < found["gap_absolute"]["direct"]).all()
     assert (found["return_true"]["latent"] < found["return_true"]["direct"]).all()
 

@@ -29,6 +29,7 @@ MOST_SEEDS = 1000
 INJECTED = "# Parameters\n"  # how the cell begins that papermill puts below the one tagged parameters
 Value: TypeAlias = bool | int | float | str
 _DEVICE = re.compile(r"(cpu|cuda(:(0|[1-9][0-9]?))?)?", re.ASCII)
+_CLAIM = re.compile(r"C(0[1-9]|[1-4][0-9]|5[0-4])", re.ASCII)
 _RESTORE = "Restore it: git checkout -- notebooks in a clone; where tsmlib is installed, install it again"
 
 
@@ -97,6 +98,7 @@ SCHEMA: dict[str, Rule] = {
     "target_x": Rule(float, f"metres from -{_REACH} to {_REACH}", lambda value: abs(value) <= _REACH),
     "target_y": Rule(float, f"metres from -{_REACH} to {_REACH}", lambda value: abs(value) <= _REACH),
     "n_targets": _whole(0, 100),
+    "claim": Rule(str, "one of C01 to C54", lambda value: bool(_CLAIM.fullmatch(value))),
 }  # fmt: skip
 PLAIN = {  # for a parameter without a rule, by the type of its default
     bool: Rule(bool, "true or false", lambda value: True),
