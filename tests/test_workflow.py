@@ -529,12 +529,17 @@ def test_without_snakemake_a_failure_ends_nothing_else_and_what_is_complete_is_n
     assert [word.rpartition(" ")[0] for word in run("2")] == ["00_first 2", "08_claims 2"]
 
 
+def only_training(place: Path, monkeypatch: pytest.MonkeyPatch) -> list[notebooks.Execution]:
+    """Of one seed, a small 02_train alone."""
+    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
+    small(place, "02_train")
+    return workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+
+
 def test_without_snakemake_a_notebook_is_executed_again_where_what_it_needs_is_gone(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
-    small(place, "02_train")
-    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    prepared = only_training(place, monkeypatch)
     made = [place / "runs" / "smoke" / file for step in workflow.steps(prepared, {}).values() for file in step.files]
     assert len(made) == 4
     for path in made:  # as if the notebook did
@@ -555,9 +560,7 @@ def replace_file(path: Path) -> None:
 def test_a_notebook_is_executed_again_where_a_file_that_it_was_made_from_was_replaced_and_only_once(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
-    small(place, "02_train")
-    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    prepared = only_training(place, monkeypatch)
     steps, folder = workflow.steps(prepared, {}), place / "runs" / "smoke" / "workflow"
     for file in (file for step in steps.values() for file in step.files):
         artifacts.save(folder.parent / file, {"x": torch.zeros(1)}, kind="model", header={})
@@ -575,9 +578,7 @@ def test_a_notebook_is_executed_again_where_a_file_that_it_was_made_from_was_rep
 def test_a_file_that_is_replaced_while_a_notebook_runs_makes_it_out_of_date(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "NOTEBOOKS", place / "notebooks")
-    small(place, "02_train")
-    prepared = workflow.prepare(list(runs.notebooks().values()), [2], scale="smoke", device="", given={})
+    prepared = only_training(place, monkeypatch)
     prior = place / "runs" / "smoke" / "seed2/models/Reacher/prior.safetensors"
     artifacts.save(prior, {"x": torch.zeros(1)}, kind="model", header={})
     papermill = notebooks._papermill

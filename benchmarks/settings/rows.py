@@ -71,7 +71,7 @@ from tsmlib.study.policies import Budget, stored_budget
 from tsmlib.study.results import action_prior, exploration, planning
 from tsmlib.study.results import policies as policies_results
 from tsmlib.study.results.exploration import PENDULUM
-from tsmlib.study.results.table import THING, Row, about, others, select
+from tsmlib.study.results.table import REPLACED_TOGETHER, Row, about, others, select
 from tsmlib.study.runs import RESULTS
 from tsmlib.trajectory import Trajectories
 
@@ -81,8 +81,8 @@ NOTEBOOKS = {
     "latent": "04_latent", "convergence": "05_control", "robustness": "06_robustness", "imperfect": "06_robustness",
     "torques": "07_action_prior", "rounds": "10_explore", "adaptation": "10_explore",
 }  # fmt: skip
-REACH = ENV_IDS[0]
-WEAK = ("tsm/Reacher-v0", "gain0.7")  # the arm that is adapted to by default
+REACH = planning.REACH
+WEAK = (REACH, "gain0.7")  # the arm that is adapted to by default
 WAYS = (*adaptation.WAYS, adaptation.REFERENCE)
 SIMULATOR = planning.ORACLE.model
 WHOLE = ("03_samples", "07_starts")  # tables that a script beside this one makes as a whole
@@ -112,7 +112,7 @@ def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
     """What a row is about, but for its target: a learning curve is replaced as a whole."""
     curve, more = rows["planner"] == "policy", ("metric", "iteration", "steps_ahead")
     masked = rows.assign(**{name: rows[name].astype(object).mask(curve, "") for name in more})
-    return about(masked, (*THING, *more, "env_steps", "subset"))
+    return about(masked, (*REPLACED_TOGETHER, *more, "env_steps", "subset"))
 
 
 def shipped(name: str) -> pd.DataFrame:

@@ -69,7 +69,9 @@ def claim_margins(claims: Sequence[tuple[str, str, str, str, np.ndarray, np.ndar
     return figure
 
 
-STATES = {"holds": "#009E73", "fails": "#D55E00", "open": "#7A7A7A"}  # of a check -> colour; of others grey
+STATES = {  # of a check -> colour; of others grey
+    "holds": VERDICTS["REPLICATED"], "fails": VERDICTS["NOT REPLICATED"], "open": VERDICTS["INCONCLUSIVE"],
+}  # fmt: skip
 
 
 class DrawnCheck(NamedTuple):
@@ -100,7 +102,7 @@ def claim_checks(checks: Sequence[DrawnCheck]) -> Figure:
     figure, ax = plt.subplots(figsize=(WIDTH, 0.2 * len(checks) + 0.55))
     ax.axvline(0, color="#555555", lw=0.8, zorder=1)
     for y, check in enumerate(checks):
-        colour, side = STATES.get(check.state, "#B0B0B0"), check.side or 1
+        colour, side = STATES.get(check.state, VERDICTS["NOT TESTABLE"]), check.side or 1
         if check.side:
             ax.fill_between([0, 1.08], y - 0.5, y + 0.5, color="#EEF6F2", lw=0, zorder=0)
         beyond, seeds = (side * (numbers - check.margin) for numbers in (check.estimate, check.seeds))

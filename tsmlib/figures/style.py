@@ -52,20 +52,21 @@ def save(figure: Figure, stem: str | Path) -> tuple[Path, Path]:
         pdf: {"CreationDate": None, "Creator": None, "Producer": None}, png: {"Software": None}
     }  # fmt: skip
     for path, metadata in none.items():
-        drawn = BytesIO()  # the disk may be full
-        with plt.style.context(STYLE):
-            figure.savefig(drawn, format=path.suffix[1:], metadata=metadata)
-        write_bytes(path, drawn.getvalue())
+        _write(figure, path, metadata)
     return pdf, png
 
 
 def save_svg(figure: Figure, path: Path) -> Path:
     """Write an SVG file in one step, its words as words; the same figure gives the same bytes, on any day."""
-    drawn = BytesIO()
-    with plt.style.context([STYLE, {"svg.fonttype": "none", "svg.hashsalt": "tsmlib"}]):
-        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
-    write_bytes(path, drawn.getvalue())
+    _write(figure, path, {"Date": None, "Creator": None})
     return path
+
+
+def _write(figure: Figure, path: Path, metadata: dict[str, None]) -> None:
+    drawn = BytesIO()  # the disk may be full
+    with plt.style.context(STYLE):
+        figure.savefig(drawn, format=path.suffix[1:], metadata=metadata)
+    write_bytes(path, drawn.getvalue())
 
 
 def tint(colour: str, share: float = 0.5) -> tuple[float, float, float]:

@@ -102,6 +102,12 @@ def checksum(path: PathLike) -> str:
     return str(_stated(path).get("sha256", ""))
 
 
+def unchecked_header(path: PathLike) -> dict[str, Json]:
+    """The header alone, of a file that was just loaded. Nothing is checked."""
+    header = _stated(path).get("header")
+    return header if isinstance(header, dict) else {}
+
+
 def _stated(path: PathLike) -> dict[str, Any]:
     """What the ``tsmlib`` entry of a file says, if it has one; the rest of the file is not read."""
     try:

@@ -13,21 +13,16 @@ from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.study.data import dataset
 from tsmlib.study.models import load_or_train
-from tsmlib.study.predictions import WithoutPastActions
+from tsmlib.study.predictions import WithoutPastActions, score_sizes
 from tsmlib.study.results import latent, robustness, table
 from tsmlib.study.results import prediction as prediction_results
 from tsmlib.study.results.table import Row
 from tsmlib.study.runs import Run
 
 
-def sizes(run: Run) -> tuple[int, int]:
-    """Test episodes, and samples of each prediction."""
-    return run.pick(smoke=8, laptop=100, paper=1000), run.pick(smoke=4, laptop=16, paper=32)
-
-
 def blind_rows(run: Run, env: str, words: Iterable[str]) -> list[Row]:
     """Scores, open loop, of segment models that are shown zeros in place of past actions."""
-    (n, samples), rows = sizes(run), list[Row]()
+    (n, samples), rows = score_sizes(run).values(), list[Row]()
     test, held_out = dataset(run, env, "test").take(slice(n)), dataset(run, env, "validation")
     for word in words:
         blind = WithoutPastActions(load_or_train(run, env, word).model)
@@ -45,7 +40,7 @@ def blind_rows(run: Run, env: str, words: Iterable[str]) -> list[Row]:
 
 def code_rows(run: Run, env: str, words: Iterable[str]) -> list[Row]:
     """What codes of segment models hold, in segments from the true past: spread, error, KL and active units."""
-    (n, samples), rows = sizes(run), list[Row]()
+    (n, samples), rows = score_sizes(run).values(), list[Row]()
     test = dataset(run, env, "test").take(slice(n))
     for word in words:
         net = cast(TSM | RecurrentTSM, load_or_train(run, env, word).model)
@@ -58,7 +53,7 @@ def code_rows(run: Run, env: str, words: Iterable[str]) -> list[Row]:
 def clean_rows(run: Run, noisy: str, clean: str, words: Iterable[str]) -> list[Row]:
     """Errors to the true state, of models, of the raw observation, and of two filters that are tuned on validation
     episodes. noisy, clean: the same arm with sensor noise and without."""
-    (n, samples), rows = sizes(run), list[Row]()
+    (n, samples), rows = score_sizes(run).values(), list[Row]()
     test, truth = (dataset(run, env, "test").take(slice(n)) for env in (noisy, clean))
     held_out = dataset(run, noisy, "validation"), dataset(run, clean, "validation")
 

@@ -52,7 +52,7 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
             "": f"[{claim.id}]({root}docs/claims_in_full.md#{claim.id.lower()})",
             "the claim, in our words": f"{claim.statement} ({claim.place})",
             "verdict": "; ".join(filter(None, [f"**{verdict.word}**", failing(verdict)])),
-            "by Adam": _under(verdict.effects[PAPERS_PLANNER]) if PAPERS_PLANNER in verdict.effects else "",
+            "by Adam": _by_papers_planner(verdict),
             "with our model": other.word.lower(), "measured": claim.statistic,
             "deciding check": "; ".join(filter(None, [
                 f"{found}, asked {key.check.asked}", f"one of {checks}" * (checks > 1), unmeasured(verdict),
@@ -64,15 +64,18 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
 
 def by_papers_planner(verdicts: Sequence[Verdict]) -> str:
     """The claims of which the paper's planner gives another verdict than ours, in a sentence; '' without any."""
-    planned = [verdict for verdict in verdicts if PAPERS_PLANNER in verdict.effects]
-    words = {verdict.claim.id: _under(verdict.effects[PAPERS_PLANNER]) for verdict in planned}
-    others = {verdict.claim.id: words[verdict.claim.id] for verdict in planned
-              if words[verdict.claim.id] not in ("no rows", verdict.word.lower())}  # fmt: skip
-    told = "; ".join(
-        f"{', '.join(claim for claim in others if others[claim] == word)} {word}"
-        for word in dict.fromkeys(others.values())
-    )
+    turned: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        word = _by_papers_planner(verdict)
+        if word not in ("", "no rows", verdict.word.lower()):
+            turned.setdefault(word, []).append(verdict.claim.id)
+    told = "; ".join(f"{', '.join(claims)} {word}" for word, claims in turned.items())
     return f"Of all claims, by Adam, the paper's planner, in place of CEM: {told}." if told else ""
+
+
+def _by_papers_planner(verdict: Verdict) -> str:
+    """The verdict where plans are by the paper's planner; '' of claims that are not about plans."""
+    return _under(verdict.effects[PAPERS_PLANNER]) if PAPERS_PLANNER in verdict.effects else ""
 
 
 def unmeasured(verdict: Verdict) -> str:

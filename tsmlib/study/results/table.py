@@ -34,7 +34,7 @@ KEYS = (
     "start",
     "what",
 )  # what a line is about
-THING = (  # what the rows are about that replace each other
+REPLACED_TOGETHER = (
     *("env", "noise", "delay", "model", "planner", "search_space", "execution", "configuration", "seed", "scale"),
 )
 Row = dict[str, object]
@@ -184,7 +184,7 @@ def means(table: pd.DataFrame, by: str | list[str], columns: str | list[str] = "
 # Rows in place of others ----------------------------------------------------------------------------------------------
 
 
-def about(rows: pd.DataFrame, columns: Sequence[str] = THING) -> list[tuple[str, ...]]:
+def about(rows: pd.DataFrame, columns: Sequence[str] = REPLACED_TOGETHER) -> list[tuple[str, ...]]:
     """The values of some columns in each row, as texts: empty where a row, or the table, has none."""
     texts = [
         rows[name].astype(object).where(rows[name].notna(), "").astype(str) if name in rows else [""] * len(rows)
@@ -193,7 +193,7 @@ def about(rows: pd.DataFrame, columns: Sequence[str] = THING) -> list[tuple[str,
     return list(zip(*texts, strict=True))
 
 
-def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = THING) -> pd.DataFrame:
+def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = REPLACED_TOGETHER) -> pd.DataFrame:
     """The published rows that are about nothing that ``own`` has rows of: of other seeds, environments, models or
     methods."""
     there = set(about(own, columns))
