@@ -722,7 +722,7 @@ def test_the_claims_that_the_papers_planner_judges_otherwise_are_named() -> None
     rows = [row | {"value": row["value"] * (1 + 0.1 * row["seed"])} for row in rows]
     verdict = evaluate.judge(rule, frames(of_05_control_rows=rows))
     assert verdict.claim.primary == "by CEM (A20)"
-    assert report.by_papers_planner([verdict]).endswith("in place of CEM: X1 not replicated.")
+    assert report.by_papers_planner([verdict]).endswith("in place of CEM (3 seeds): X1 not replicated.")
     same = evaluate.judge(superiority(LSTM), study(tsm=[3, 3.1, 3.2], lstm=[1, 1.2, 1.1]))
     assert (same.claim.primary, report.by_papers_planner([same])) == ("as the paper words it", "")
 

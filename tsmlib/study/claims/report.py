@@ -64,13 +64,17 @@ def table(verdicts: Sequence[Verdict], ours: Sequence[Verdict], *, root: str = "
 
 def by_papers_planner(verdicts: Sequence[Verdict]) -> str:
     """The claims of which the paper's planner gives another verdict than ours, in a sentence; '' without any."""
+    effects = [effect for verdict in verdicts for effect in verdict.effects.get(PAPERS_PLANNER, ())]
+    planned = (e for e in effects if any(term.wanted.get("planner") == "adam" for term in e.check.number.terms))
+    seeds = sorted({effect.seeds for effect in planned if effect.seeds})
     turned: dict[str, list[str]] = {}
     for verdict in verdicts:
         word = _by_papers_planner(verdict)
         if word not in ("", "no rows", verdict.word.lower()):
             turned.setdefault(word, []).append(verdict.claim.id)
     told = "; ".join(f"{', '.join(claims)} {word}" for word, claims in turned.items())
-    return f"Of all claims, by Adam, the paper's planner, in place of CEM: {told}." if told else ""
+    few = " to ".join(str(count) for count in dict.fromkeys((seeds[0], seeds[-1]))) if told else ""
+    return f"Of all claims, by Adam, the paper's planner, in place of CEM ({few} seeds): {told}." if told else ""
 
 
 def _by_papers_planner(verdict: Verdict) -> str:
