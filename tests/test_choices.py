@@ -140,6 +140,22 @@ def test_what_a_run_has_spent_is_told_by_headers_and_a_closed_loop_counts_its_ow
     ]
 
 
+@pytest.mark.parametrize(("options", "said"), [
+    (["--scale", "foo"], "scale is 'foo', expected one of smoke, laptop, paper"),
+    (["--envs", "foo"], "'foo' is none of tsm/Reacher-v0"),
+    (["--models", "prior"], "invalid choice: 'prior' (choose from 'tsm', 'rtsm'"),
+    (["--model-seed", "1000002"], "seed 1000002 draws held-out episodes or targets"),
+])  # fmt: skip
+def test_judges_are_refused_models_that_cannot_be_before_any_work(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
+    with pytest.raises(SystemExit, match="2"):
+        run_script(runs.ROOT / "benchmarks" / "settings" / "judge.py", *options)
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_a_candidate_is_judged_by_is_measured_open_and_closed_loop(tmp_path: Path) -> None:
     torch.manual_seed(0)
     task = dataclasses.replace(study.load_task("tsm/ReacherPush-v1", "validation").take(2), horizon=20)

@@ -592,6 +592,16 @@ def test_a_file_that_is_replaced_while_a_notebook_runs_makes_it_out_of_date(
     assert notebooks.replaced(prepared[0].run) == ["models/Reacher/prior.safetensors"]
 
 
+def test_a_notebook_states_the_shipped_model_that_it_is_made_from_where_its_run_has_none(place: Path) -> None:
+    run = runs.resolve("02_train", scale="laptop", seed=0, env="tsm/Reacher-v0", models="prior")
+    file = "models/Reacher/prior.safetensors"
+    assert notebooks._files(run, needed.needs(run))[file] == artifacts.checksum(
+        run.shipped / "Reacher" / "prior.safetensors"
+    )
+    artifacts.save(run.dir / file, {"x": torch.zeros(1)}, kind="model", header={})
+    assert notebooks._files(run, needed.needs(run))[file] == artifacts.checksum(run.dir / file)
+
+
 def test_a_notebook_of_other_parameters_or_without_its_table_is_not_there(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

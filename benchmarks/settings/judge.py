@@ -41,6 +41,7 @@ import torch
 from torch import Tensor
 
 from tsmlib import study
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.base import DynamicsModel, Model
 from tsmlib.planning.base import Judge, Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, execute, mpc
@@ -55,7 +56,8 @@ from tsmlib.planning.predictors import (
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.rewards import Reward
-from tsmlib.study import plans, runs
+from tsmlib.study import plans, runs, zoo
+from tsmlib.study.data import require_other_seed
 from tsmlib.study.models import load_prior
 from tsmlib.study.results import table
 from tsmlib.trajectory import Segment
@@ -66,6 +68,7 @@ JUDGES = (
     "mean of 16", "median of 16", "screened mean of 4", "screened mean of 8", "screened mean of 16",
 )  # fmt: skip
 REFERENCES = ("zero", "oracle")
+MODELS = (*zoo.words("dynamics", "ablation", "choice"), *REFERENCES)
 STUDY = f"screened mean of {JUDGING}"  # the study's judge of models with codes
 KEY = ("env", "model", "model_seed", "judge", "closed", "planner_seed", "targets", "candidates", "iterations", "again")
 COLUMNS = (
@@ -283,7 +286,8 @@ def write(path: Path, rows: list[Row]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", default=["rtsm"], help="words of the zoo, oracle, zero (default rtsm)")
+    parser.add_argument("--models", nargs="+", default=["rtsm"], choices=MODELS, metavar="MODEL",
+                        help=f"some of {' '.join(MODELS)} (default rtsm)")  # fmt: skip
     parser.add_argument("--envs", nargs="+", default=["tsm/ReacherPush-v1"], help="default tsm/ReacherPush-v1")
     parser.add_argument("--judges", nargs="+", choices=JUDGES, default=JUDGES, metavar="JUDGE", help="default all")
     parser.add_argument("--targets", type=int, default=25, help="of the 100 of validation (default 25)")
@@ -306,7 +310,13 @@ def main() -> None:
             parser.error(str(error))
         return
     torch.set_num_threads(1)
-    run = runs.resolve("05_control", scale=arguments.scale, seed=arguments.model_seed)
+    try:
+        require_other_seed(arguments.model_seed)
+        run = runs.resolve("05_control", scale=arguments.scale, seed=arguments.model_seed)
+        for env in arguments.envs:
+            EnvSpec.parse(env)
+    except ValueError as error:  # ParameterError is one
+        parser.error(str(error))
     for env in arguments.envs:
         task = study.load_task(env, "validation").take(arguments.targets)
         space = LatentActions(load_prior(run, env), task.horizon)

@@ -117,9 +117,7 @@ def execute(execution: Execution, *, progress: bool = True, wait: bool = False) 
             **_asked(execution),
         }  # fmt: skip
         _note(run, {**status, "state": "running"})
-        before = _files(
-            run, jobs
-        )  # of a file that is replaced meanwhile the first counts: the notebook is outdated then
+        before = _files(run, jobs)  # of a file that is replaced meanwhile the first counts: it is outdated then
         ended: dict[str, Json] = {"state": "interrupted", "error": "stopped before its end"}
         try:
             executed = _papermill(execution, progress)
@@ -188,11 +186,17 @@ def _deciding(entry: Mapping[str, Any]) -> dict[str, Json]:
 
 
 def _files(run: Run, jobs: Iterable[Job]) -> dict[str, Json]:
-    """File -> SHA-256, as it says itself, of what jobs have made in a run's folder."""
+    """File -> SHA-256, as it says itself, of what jobs have made in a run's folder, or else ships in place of that."""
     from tsmlib.storage import artifacts
 
-    paths = (run.dir / f"{job.name}.safetensors" for job in jobs)
-    return {path.relative_to(run.dir).as_posix(): artifacts.checksum(path) for path in paths if path.exists()}
+    found: dict[str, Json] = {}
+    for job in jobs:
+        path = run.dir / (file := f"{job.name}.safetensors")
+        if not path.exists() and job.ships(run):
+            path = run.shipped / path.parent.name / path.name
+        if path.exists():
+            found[file] = artifacts.checksum(path)
+    return found
 
 
 def _asked(execution: Execution) -> dict[str, Json]:
