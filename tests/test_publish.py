@@ -67,6 +67,26 @@ def test_publishing_a_run_of_fewer_seeds_loses_no_row_and_says_what_stays(
     assert tables_storage.load(path).equals(tables_storage.frame([*stay, dict(row, seed=0, value=0)]))
 
 
+def test_rows_of_fewer_targets_never_take_the_place_of_those_that_ship(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publish, "RESULTS", tmp_path / "data" / "results")
+    monkeypatch.setattr(publish, "publish_claims", lambda: None)
+    run, path = seed(tmp_path, 0), tmp_path / "data" / "results" / "03_predict.csv"
+    row: dict[str, Any] = dict(metric="kl", value=9, scale="paper", env="tsm/Reacher-v0", seed=0)
+    of_few, of_many = [dict(row, n=n) for n in (20, 100)]
+    tables_storage.save(run.metrics / "03_predict.csv", [of_few])
+    tables_storage.save(path, [of_many])
+    with pytest.raises(
+        RunError, match="of 20 targets or episodes, expected the 100 that ship, for env tsm/Reacher-v0, seed 0"
+    ):
+        publish.publish_table(run, "03_predict")
+    assert tables_storage.load(path).equals(tables_storage.frame([of_many]))
+    tables_storage.save(run.metrics / "03_predict.csv", [dict(of_few, env="tsm/ReacherPush-v1"), of_many])
+    publish.publish_table(run, "03_predict")
+    assert tables_storage.load(path)["n"].tolist() == [20, 100]
+
+
 def test_publishing_compresses_a_large_table_once_and_changes_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -90,13 +90,18 @@ def publish_table(run: Run, notebook: str) -> None:
 def _ship(tables: Mapping[str, pd.DataFrame]) -> None:
     """Put rows of runs into the published tables, in place of those about the same; say what is new and what stays."""
     for name, rows in tables.items():
-        path = RESULTS / f"{name}.csv"
-        before = tables_storage.load(path) if tables_storage.stored(path) else rows[:0]
+        path, before = RESULTS / f"{name}.csv", _shipped(name, rows)
         stay = table.others(before, rows)
         tables_storage.ship(path, tables_storage.frame(pd.concat([stay, rows])))
         gone = before.drop(stay.index)
         print(f"{name}: {_counted(rows)} rows of runs in place of {_counted(gone)} that shipped; {_counted(stay)} stay")
     manifest.write_manifest(RESULTS.parent)
+
+
+def _shipped(name: str, rows: pd.DataFrame) -> pd.DataFrame:
+    """The published table of a name; without rows, but with the columns of ``rows``, where there is none."""
+    path = RESULTS / f"{name}.csv"
+    return tables_storage.load(path) if tables_storage.stored(path) else rows[:0]
 
 
 def _counted(rows: pd.DataFrame) -> str:
@@ -115,8 +120,9 @@ def _ships(path: Path) -> bool:
 
 
 def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
-    """Table -> the rows of this run and of every seed beside it. RunError where one did not come to its end.
+    """Table -> the rows of this run and of every seed beside it.
 
+    RunError where one did not come to its end, or rows are of fewer targets or episodes than those that ship.
     made_by: notebooks; by default all but that of the claims, which are judged anew.
     """
     stems = {notebook.stem for notebook in runs.notebooks().values()}
@@ -125,7 +131,14 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
         notebook = FURTHER.get(path.stem, path.stem)
         if notebook in (made_by or stems - {"08_claims"}):
             own = replace(run, notebook=notebook)
-            found[path.stem] = study.pooled_rows(own, tables_storage.load(path), path.stem)
+            found[path.stem] = rows = study.pooled_rows(own, tables_storage.load(path), path.stem)
+            for what, (n, before) in table.of_fewer(_shipped(path.stem, rows), rows).items():
+                said = ", ".join(f"{name} {value}" for name, value in zip(table.WHAT, what, strict=True) if value)
+                raise RunError(
+                    f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for {said}. Make "
+                    f"them of as many ({own.command(notebook)}, without smaller parameters), or delete "
+                    f"{RESULTS / path.name} first, to publish these alone"
+                )
     return found
 
 

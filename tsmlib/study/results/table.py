@@ -37,6 +37,7 @@ KEYS = (
 REPLACED_TOGETHER = (
     *("env", "noise", "delay", "model", "planner", "search_space", "execution", "configuration", "seed", "scale"),
 )
+WHAT = (*REPLACED_TOGETHER, "metric")
 Row = dict[str, object]
 K = TypeVar("K")
 V = TypeVar("V")
@@ -198,6 +199,18 @@ def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = 
     methods."""
     there = set(about(own, columns))
     return published[np.array([thing not in there for thing in about(published, columns)], dtype=bool)]
+
+
+def of_fewer(published: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, ...], tuple[int, int]]:
+    """Values of WHAT -> of how many targets or episodes ``own`` and the published rows are, where ``own`` are of
+    fewer."""
+    most: list[dict[tuple[str, ...], int]] = []
+    for rows in (own, published):
+        most.append({})
+        for what, n in zip(about(rows, WHAT), rows["n"].fillna(0).astype(int), strict=True):
+            most[-1][what] = max(n, most[-1].get(what, 0))
+    found, ships = most
+    return {what: (n, ships[what]) for what, n in found.items() if n < ships.get(what, 0)}
 
 
 # Published rows and the reader's own ----------------------------------------------------------------------------------
