@@ -135,8 +135,8 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
             for what, (n, before) in table.of_fewer(_shipped(path.stem, rows), rows).items():
                 said = ", ".join(f"{name} {value}" for name, value in zip(table.WHAT, what, strict=True) if value)
                 raise RunError(
-                    f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for {said}. Make "
-                    f"them of as many ({own.command(notebook)}, without smaller parameters), or delete "
+                    f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for {said}. "
+                    f"Make them of as many ({own.command(notebook)}, without smaller parameters), or delete "
                     f"{RESULTS / path.name} first, to publish these alone"
                 )
     return found
