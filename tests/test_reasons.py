@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from tsmlib.storage import tables as tables_storage
-from tsmlib.study import pages
+from tsmlib.study import pages, publish
 from tsmlib.study.claims import evaluate, ledger
 from tsmlib.study.claims.claim import REPLICATED
 from tsmlib.study.claims.evaluate import state_of
+from tsmlib.study.results.prediction import TRIMMED
 from tsmlib.study.results.table import by_seed, select
-from tsmlib.study.zoo import PAPERS
+from tsmlib.study.zoo import OURS, PAPERS
 
 
 def effects_of(verdicts: Mapping[str, evaluate.Verdict], name: str, reading: str = "") -> list[evaluate.Effect]:
@@ -149,3 +150,17 @@ def test_no_reason_waits_for_a_verdict_that_is_not_given() -> None:
     stored = tables_storage.load(evaluate.RESULTS / "08_claims.csv")
     words = dict(stored[stored["model"] == PAPERS][["claim", "verdict"]].itertuples(index=False, name=None))
     assert {(c.id, word) for c in ledger.claims() for word in c.why if words[c.id] != word} == set()
+
+
+def test_readme_says_of_the_own_likelihood_of_pushing_what_the_rows_do() -> None:
+    said = "Its own likelihood at pushing: lowest of the five; without 5 % of episodes, highest."
+    assert said in publish.README.read_text()
+    about = dict(env="tsm/ReacherPush-v1", metric="ll_own", execution="open loop")
+    models, where = (
+        {OURS, PAPERS, "onestep", "multistep", "lstm"},
+        [dict(about, subset=""), dict(about, subset=TRIMMED)],
+    )
+    rows = tables_storage.load(evaluate.RESULTS / "03_predict.csv")
+    every, without = (select(rows, **one).groupby("model")["value"].mean()[sorted(models)] for one in where)
+    assert len(models) == 5
+    assert (every.idxmin(), without.idxmax()) == (OURS, OURS)

@@ -231,6 +231,18 @@ def test_a_copy_is_named_by_its_path(place: Path, capsys: pytest.CaptureFixture[
     assert "no notebook is called" in capsys.readouterr().err
 
 
+def test_what_a_changed_copy_made_counts_for_nothing_but_itself(place: Path) -> None:
+    copy = write_notebook(place / "mine" / "01_first.ipynb", "import tsmlib")
+    assert main(["run", str(copy)]) == 0
+    own = notebooks.prepare(runs.Notebook("first", copy))
+    assert notebooks.outdated(own) == ""
+    with pytest.raises(RunError, match=r"other cells than 01_first.ipynb has here.*tsmlib run first"):
+        notebooks.require(own.run, "01_first")
+    assert main(["run", "first"]) == 0
+    assert notebooks.require(own.run, "01_first")["state"] == "complete"
+    assert notebooks.outdated(own) == "its cells changed"
+
+
 def test_without_the_tools_of_notebooks_a_run_names_what_to_install(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -35,6 +35,7 @@ from tsmlib.study.runs import RunError
 HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
 needs_snakemake = pytest.mark.skipif(not HAS_SNAKEMAKE, reason="no Snakemake: pip install 'tsmlib[cluster]'")
 NOTEBOOKS = list(runs.notebooks().values())
+STORAGE = ["--default-storage-provider", "fs", "--default-storage-prefix", "markers"]
 
 
 @pytest.fixture(autouse=True)
@@ -600,6 +601,20 @@ def test_a_notebook_states_the_shipped_model_that_it_is_made_from_where_its_run_
     )
     artifacts.save(run.dir / file, {"x": torch.zeros(1)}, kind="model", header={})
     assert notebooks._files(run, needed.needs(run))[file] == artifacts.checksum(run.dir / file)
+
+
+@pytest.mark.parametrize(("more", "forced"), [([], ["done/data/a"]), (STORAGE, ["done/data/a", "done/data/b"])])
+def test_steps_are_done_again_where_their_markers_are_in_storage_that_only_snakemake_sees(
+    more: list[str], forced: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[str] = []
+    monkeypatch.setitem(sys.modules, "snakemake", ModuleType("snakemake"))
+    monkeypatch.setitem(sys.modules, "snakemake.cli", (cli := ModuleType("snakemake.cli")))
+    cli.main = given.extend  # type: ignore[attr-defined]
+    table = {name: workflow.Step("data", f"done/data/{name}", [], "", "", 1, 1) for name in "abc"}
+    files.write_bytes(tmp_path / "done/data/a", b"")
+    workflow._snakemake(table, {"a": "gone", "b": "gone"}, tmp_path, tmp_path / "steps.json", "local", 1, more)
+    assert [word for word in given if word.startswith("done/")] == forced
 
 
 def test_a_notebook_of_other_parameters_or_without_its_table_is_not_there(

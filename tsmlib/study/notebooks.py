@@ -147,7 +147,7 @@ def outdated(execution: Execution) -> str:
     if not (run.dir / execution.notebook.path.name).exists():
         return f"{execution.notebook.path.name} is gone"
     try:
-        require(run, run.notebook)
+        _intact(run, run.notebook)
     except RunError as error:
         return str(error)
     return ""
@@ -210,10 +210,22 @@ def _asked(execution: Execution) -> dict[str, Json]:
 
 
 def require(run: Run, notebook: str) -> Mapping[str, Json]:
-    """The status entry of a notebook of ``run`` that is complete and whose results are as it left them.
+    """The status entry of a notebook of ``run`` that is complete, whose results are as it left them, and whose cells
+    were those that ship.
 
     Raises RunError naming the state and the command that makes what is missing.
     """
+    entry, own = _intact(run, notebook), find(notebook)
+    if own and entry.get("notebook", now := code_sha256(own.path)) != now:
+        raise RunError(
+            f"{notebook} in {run.dir} was executed with other cells than {own.path.name} has here, so nothing else "
+            f"reads what it made. Run the notebook that ships, in place of it: {run.command(own.name)}"
+        )
+    return entry
+
+
+def _intact(run: Run, notebook: str) -> Mapping[str, Json]:
+    """The same, whatever its cells were."""
     from tsmlib.storage import manifest
 
     own = find(notebook)

@@ -147,7 +147,7 @@ def _seeds(rows: pd.DataFrame) -> str:
 
 
 def readme_claims(papers: list[evaluate.Verdict], ours: list[evaluate.Verdict]) -> str:
-    """Three sentences: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
+    """Three lines: how many claims got which verdict, with the paper's model and with ours, and what carries it."""
     carrying = [verdict for verdict in papers if verdict.claim.headline]
     given = ", ".join(
         f"{len(same)} {word.lower()}"

@@ -4,8 +4,9 @@ With the extra ``cluster`` Snakemake runs the steps, on this machine or through 
 the notebooks that are not complete run here one after another, and make ahead what they need (``parallel``). Either way
 the same files, and one that fails ends nothing but what needs it.
 
-The workflow of a scale has a folder beside its seeds, ``runs/<scale>/workflow``: ``steps.json``, a log and a benchmark
-of each step, markers of those that are done, and the versions of the code that made them.
+The workflow of a scale has a folder beside its seeds, ``runs/<scale>/workflow``: the versions of the code that made
+what is there, and with Snakemake ``steps.json``, a log and a benchmark of each step, and markers of those that are
+done.
 """
 
 from __future__ import annotations
@@ -475,8 +476,12 @@ def _snakemake(
     from snakemake.cli import main as snakemake
 
     files.write_bytes(listed, json.dumps({name: asdict(step) for name, step in table.items()}, indent=1).encode())
-    gone = {step.done: again[name] for name, step in table.items() if name in again and (folder / step.done).exists()}
-    for done, why in gone.items():
+    elsewhere = "--default-storage-provider" in more  # where its plugin alone can look
+    gone = {
+        step.done: again[name] for name, step in table.items()
+        if name in again and (elsewhere or (folder / step.done).exists())
+    }  # fmt: skip
+    for done, why in gone.items() if not elsewhere else ():
         print(f"{done.removeprefix('done/')} is done again: {why}")
     options = [
         "--snakefile", str(SNAKEFILE), "--directory", str(folder), "--config", f"steps={listed}",

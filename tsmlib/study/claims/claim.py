@@ -1,7 +1,8 @@
 """A claim of the paper, and the verdicts that it can get.
 
     REPLICATED          every check holds, and keeps its sign under every other reading of the paper that has rows
-    READING-DEPENDENT   the checks hold under some reading, not under all
+    READING-DEPENDENT   every check holds under the first reading, and the estimate of one is on the wrong side under
+                        another; or not under the first, and under another
     NOT REPLICATED      the interval of some check lies beyond its margin, on the wrong side, by Holm's procedure over
                         the claim's checks
     INCONCLUSIVE        the interval of some check holds its margin, or there is none; readings that fail are named

@@ -248,7 +248,7 @@ def change(verdict: Verdict) -> str:
     if verdict.word == UNTESTABLE:
         return "a lead to take a share of." if key.state == "void" else "rows, which are missing."
     if verdict.word == DEPENDENT:
-        return "to know what the paper means: the readings above differ."
+        return f"to know which counts: {_turning(verdict)}."
     if key.low is None:
         return "another training seed, since one has no interval."
     away, low, high = key.beyond
@@ -256,7 +256,7 @@ def change(verdict: Verdict) -> str:
     if verdict.word in (REPLICATED, FAILED):
         found = f"{key.text}, asked {key.check.op} {key.check.margin:g}"
         if verdict.word == REPLICATED:
-            return f"rows by which the interval of a check reaches its margin; the one nearest to it is {found}."
+            return f"rows by which the interval of a check goes past its margin; the one nearest to it is {found}."
         failing = sum(effect.state == "fails" for effect in verdict.checks)
         fewer = f"none of the {failing} checks that fail does" if failing > 1 else "the check that fails does not"
         return f"rows by which {fewer}; {'the deciding one' if failing > 1 else 'it'} is {found}.{several}"
@@ -268,19 +268,36 @@ def change(verdict: Verdict) -> str:
         )
     if key.seeds < 2 or "trials" in key.n:
         return f"more training seeds and trials: the mean of the deciding check lies on the {side} side of its margin."
-    wanted = seeds_to_decide(key)
+    wanted = seeds_to_decide(key, 1 if away > 0 else checks)
     many = f"about {wanted} training seeds" if wanted else "more than 100 training seeds"
     return (
         f"{many} that differ as these do, which put the interval of the deciding check on the {side} side of its "
-        f"margin, where its mean lies.{several}"
+        f"margin, where its mean lies.{several * (away > 0)}"
     )
 
 
-def seeds_to_decide(effect: Effect) -> int:
-    """How many training seeds that differ as these do leave the margin outside of the interval; 0: more than 100."""
+def _turning(verdict: Verdict) -> str:
+    """The first reading, and those by which a claim is replicated where it is not by the first, or turns where it is,
+    each with its verdict."""
+    first = verdict.effects[""]
+    holds = state_of(first) == "holds"
+    others = [
+        f"{reading} ({_under(found)})" for reading, found in verdict.effects.items()
+        if reading and (state_of(found) == "holds") is not holds
+        and not (holds and (state_of(found) == "void" or all(effect.right_side for effect in found)))
+    ]  # fmt: skip
+    return f"{verdict.claim.primary} ({_under(first)}), or {'; '.join(others)}"
+
+
+def seeds_to_decide(effect: Effect, checks: int = 1) -> int:
+    """How many training seeds that differ as these do leave the margin outside of the interval; 0: more than 100.
+
+    checks: of a claim, of which this one is to fail by the first step of Holm's procedure.
+    """
     deviation, away = np.std(effect.by_seed, ddof=1), abs(effect.beyond[0])
     sizes = np.arange(2, 101)
-    enough = sizes[stdtrit(sizes - 1, (1 + effect.check.level) / 2) * deviation / np.sqrt(sizes) < away]
+    quantile = 1 - (1 - effect.check.level) / 2 / checks
+    enough = sizes[stdtrit(sizes - 1, quantile) * deviation / np.sqrt(sizes) < away]
     return int(enough[0]) if len(enough) else 0
 
 
