@@ -272,7 +272,7 @@ def change(verdict: Verdict) -> str:
     many = f"about {wanted} training seeds" if wanted else "more than 100 training seeds"
     return (
         f"{many} that differ as these do, which put the interval of the deciding check on the {side} side of its "
-        f"margin, where its mean lies.{several if away > 0 else ""}"
+        f"margin, where its mean lies." + several * bool(away > 0)
     )
 
 
