@@ -62,5 +62,11 @@ def test_at_scale_paper_the_other_seeds_are_drawn_too_once_they_are_complete(tmp
         study.pooled_rows(run, own)
     manifest.write_json(tmp_path / "seed1" / "status.json", {"03_predict": {"state": "complete"}})
     assert study.pooled_rows(run, own)["seed"].tolist() == [0, 1]
+    changed = {"state": "complete", "changed_copy": True, "notebook": "0f"}
+    manifest.write_json(tmp_path / "seed1" / "status.json", {"03_predict": changed})
+    with pytest.raises(RunError, match="03_predict in .*seed1 was executed from a copy with other cells"):
+        study.pooled_rows(run, own)
+    manifest.write_json(tmp_path / "seed0" / "status.json", {"03_predict": changed | {"state": "running"}})
+    assert study.pooled_rows(run, own)["seed"].tolist() == [0, 1]  # of the same copy
     laptop = Run("03_predict", "laptop", 0, tmp_path / "seed0")
     assert study.pooled_rows(laptop, own).equals(tables.frame(own))  # seeds are pooled at scale paper alone

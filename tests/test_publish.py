@@ -75,16 +75,16 @@ def test_rows_of_fewer_targets_never_take_the_place_of_those_that_ship(
     run, path = seed(tmp_path, 0), tmp_path / "data" / "results" / "03_predict.csv"
     row: dict[str, Any] = dict(metric="kl", value=9, scale="paper", env="tsm/Reacher-v0", seed=0)
     of_few, of_many = [dict(row, n=n) for n in (20, 100)]
+    drawn = [dict(row, metric="travel", n=n) for n in (29, 30)]  # however many episodes a model's samples hit something
     tables_storage.save(run.metrics / "03_predict.csv", [of_few])
-    tables_storage.save(path, [of_many])
-    with pytest.raises(
-        RunError, match="of 20 targets or episodes, expected the 100 that ship, for env tsm/Reacher-v0, seed 0"
-    ):
+    tables_storage.save(path, [of_many, drawn[1]])
+    said = "of 20 targets or episodes, expected the 100 that ship, for env tsm/Reacher-v0, seed 0.*tsmlib run predict,"
+    with pytest.raises(RunError, match=said):
         publish.publish_table(run, "03_predict")
-    assert tables_storage.load(path).equals(tables_storage.frame([of_many]))
-    tables_storage.save(run.metrics / "03_predict.csv", [dict(of_few, env="tsm/ReacherPush-v1"), of_many])
+    assert tables_storage.load(path).equals(tables_storage.frame([of_many, drawn[1]]))
+    tables_storage.save(run.metrics / "03_predict.csv", [dict(of_few, env="tsm/ReacherPush-v1"), of_many, drawn[0]])
     publish.publish_table(run, "03_predict")
-    assert tables_storage.load(path)["n"].tolist() == [20, 100]
+    assert tables_storage.load(path)["n"].tolist() == [20, 100, 29]
 
 
 def test_publishing_compresses_a_large_table_once_and_changes_no_row(

@@ -155,12 +155,7 @@ def test_no_reason_waits_for_a_verdict_that_is_not_given() -> None:
 def test_readme_says_of_the_own_likelihood_of_pushing_what_the_rows_do() -> None:
     said = "Its own likelihood at pushing: lowest of the five; without 5 % of episodes, highest."
     assert said in publish.README.read_text()
-    about = dict(env="tsm/ReacherPush-v1", metric="ll_own", execution="open loop")
-    models, where = (
-        {OURS, PAPERS, "onestep", "multistep", "lstm"},
-        [dict(about, subset=""), dict(about, subset=TRIMMED)],
-    )
-    rows = tables_storage.load(evaluate.RESULTS / "03_predict.csv")
-    every, without = (select(rows, **one).groupby("model")["value"].mean()[sorted(models)] for one in where)
-    assert len(models) == 5
-    assert (every.idxmin(), without.idxmax()) == (OURS, OURS)
+    rows = select(tables_storage.load(evaluate.RESULTS / "03_predict.csv"), env="tsm/ReacherPush-v1", metric="ll_own",
+                  execution="open loop", model=[OURS, PAPERS, "onestep", "multistep", "lstm"])  # fmt: skip
+    assert select(rows, subset="").groupby("model")["value"].mean().idxmin() == OURS
+    assert select(rows, subset=TRIMMED).groupby("model")["value"].mean().idxmax() == OURS

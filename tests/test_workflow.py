@@ -603,7 +603,14 @@ def test_a_notebook_states_the_shipped_model_that_it_is_made_from_where_its_run_
     assert notebooks._files(run, needed.needs(run))[file] == artifacts.checksum(run.dir / file)
 
 
-@pytest.mark.parametrize(("more", "forced"), [([], ["done/data/a"]), (STORAGE, ["done/data/a", "done/data/b"])])
+@pytest.mark.parametrize(
+    ("more", "forced"),
+    [
+        ([], ["done/data/a"]),
+        (STORAGE, ["done/data/a", "done/data/b"]),
+        (["=".join(STORAGE[:2])], ["done/data/a", "done/data/b"]),
+    ],
+)
 def test_steps_are_done_again_where_their_markers_are_in_storage_that_only_snakemake_sees(
     more: list[str], forced: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

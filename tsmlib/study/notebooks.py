@@ -203,22 +203,24 @@ def _asked(execution: Execution) -> dict[str, Json]:
     """What a status states of what its notebook is executed with."""
     from tsmlib.storage.provenance import provenance
 
+    cells, own = code_sha256(execution.notebook.path), find(execution.notebook.stem)
     return {
         "parameters": dict(execution.values), "device": execution.run.device, "provenance": provenance(),
-        "notebook": code_sha256(execution.notebook.path),
+        "notebook": cells, "changed_copy": own is not None and code_sha256(own.path) != cells,
     }  # fmt: skip
 
 
-def require(run: Run, notebook: str) -> Mapping[str, Json]:
-    """The status entry of a notebook of ``run`` that is complete, whose results are as it left them, and whose cells
-    were those that ship.
+def require(run: Run, notebook: str, *, cells: str = "") -> Mapping[str, Json]:
+    """The status entry of a notebook of ``run`` that is complete, whose results are as it left them, and which was no
+    changed copy of the one that shipped then.
 
+    cells: ``code_sha256`` of a changed copy that counts, too.
     Raises RunError naming the state and the command that makes what is missing.
     """
     entry, own = _intact(run, notebook), find(notebook)
-    if own and entry.get("notebook", now := code_sha256(own.path)) != now:
+    if own and entry.get("changed_copy") and entry.get("notebook") != cells:
         raise RunError(
-            f"{notebook} in {run.dir} was executed with other cells than {own.path.name} has here, so nothing else "
+            f"{notebook} in {run.dir} was executed from a copy with other cells than {own.path.name}, so nothing else "
             f"reads what it made. Run the notebook that ships, in place of it: {run.command(own.name)}"
         )
     return entry

@@ -13,7 +13,7 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation import prediction, scoring
 from tsmlib.models.base import DynamicsModel, predict_segment
 from tsmlib.sampling import Noise
-from tsmlib.storage import artifacts, tables
+from tsmlib.storage import artifacts, manifest, tables
 from tsmlib.study.data import dataset
 from tsmlib.study.models import load_or_train
 from tsmlib.study.notebooks import require
@@ -86,14 +86,16 @@ def pooled_rows(
 ) -> pd.DataFrame:
     """The given rows, and at scale paper those of the other seeds beside this run.
 
-    name: the table's, by default the notebook's. Where another seed's notebook did not come to its end: RunError if
-    ``whole``, else that seed is left out, and it is said.
+    name: the table's, by default the notebook's. Where another seed's notebook did not come to its end, or was a copy
+    with other cells than this run's: RunError if ``whole``, else that seed is left out, and it is said.
     """
+    own = manifest.statuses(run.dir).get(run.notebook)
+    cells = str(own.get("notebook", "")) if isinstance(own, dict) else ""
     file, parts = f"{name or run.notebook}.csv", [tables.frame(rows)]
     for other in run.seeds() if run.scale == "paper" else ():
         if other.dir != run.dir and (path := other.dir / "metrics" / file).exists():
             try:
-                require(other, run.notebook)
+                require(other, run.notebook, cells=cells)
             except RunError as error:
                 if whole:
                     raise

@@ -125,19 +125,19 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
     RunError where one did not come to its end, or rows are of fewer targets or episodes than those that ship.
     made_by: notebooks; by default all but that of the claims, which are judged anew.
     """
-    stems = {notebook.stem for notebook in runs.notebooks().values()}
+    word = {notebook.stem: notebook.name for notebook in runs.notebooks().values()}
     found = dict[str, pd.DataFrame]()
     for path in sorted(run.metrics.glob("*.csv")):
         notebook = FURTHER.get(path.stem, path.stem)
-        if notebook in (made_by or stems - {"08_claims"}):
+        if notebook in (made_by or word.keys() - {"08_claims"}):
             own = replace(run, notebook=notebook)
             found[path.stem] = rows = study.pooled_rows(own, tables_storage.load(path), path.stem)
             for what, (n, before) in table.of_fewer(_shipped(path.stem, rows), rows).items():
-                said = ", ".join(f"{name} {value}" for name, value in zip(table.WHAT, what, strict=True) if value)
+                told = [f"{name} {value}" for name, value in zip(table.REPLACED_TOGETHER, what, strict=True) if value]
                 raise RunError(
-                    f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for {said}. "
-                    f"Make them of as many ({own.command(notebook)}, without smaller parameters), or delete "
-                    f"{RESULTS / path.name} first, to publish these alone"
+                    f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for "
+                    f"{', '.join(told)}. Make them of as many (python -m tsmlib run {word[notebook]}, with that scale "
+                    f"and seed, and no smaller parameters), or delete {RESULTS / path.name} first, to publish these alone"
                 )
     return found
 

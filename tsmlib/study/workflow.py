@@ -48,6 +48,7 @@ INSTALL = f"{sys.executable} -m pip install 'tsmlib[cluster]'"
 MEMORY = {"data": 2000, "model": 2000, "scores": 4000, "plan": 2000, "policy": 2000, "notebook": 4000}  # MB, first try
 COPY = 500  # MB more for each further seed of a training of several: its data
 AT_ONCE = 10  # seeds of a group
+STORAGE = "--default-storage-provider"  # of Snakemake: markers lie elsewhere
 READS = {"06_robustness": ("03_predict", "04_latent")}  # notebooks whose tables of the same seed another one shows
 MINUTES = {"10_explore": 240}  # that a notebook takes at scale paper on one core, where it is more than USUAL_MINUTES
 USUAL_MINUTES = 30
@@ -476,13 +477,16 @@ def _snakemake(
     from snakemake.cli import main as snakemake
 
     files.write_bytes(listed, json.dumps({name: asdict(step) for name, step in table.items()}, indent=1).encode())
-    elsewhere = "--default-storage-provider" in more  # where its plugin alone can look
+    elsewhere = any(word.partition("=")[0] == STORAGE for word in more)  # where its plugin alone can look
     gone = {
         step.done: again[name] for name, step in table.items()
         if name in again and (elsewhere or (folder / step.done).exists())
     }  # fmt: skip
-    for done, why in gone.items() if not elsewhere else ():
-        print(f"{done.removeprefix('done/')} is done again: {why}")
+    if elsewhere:
+        print(f"{len(gone)} steps are done, whatever their markers in storage say")
+    else:
+        for done, why in gone.items():
+            print(f"{done.removeprefix('done/')} is done again: {why}")
     options = [
         "--snakefile", str(SNAKEFILE), "--directory", str(folder), "--config", f"steps={listed}",
         "--nolock", "--keep-going", "--retries", "2", "--rerun-incomplete", "--rerun-triggers", "mtime", "params",

@@ -122,12 +122,16 @@ STATES = ("void", "fails", "missing", "open", "holds")  # of a whole rule the fi
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim, one of VERDICTS, why, and the effects of each reading."""
+    """A claim, one of VERDICTS, why, and the effects of each reading.
+
+    turning: readings by which a claim that is DEPENDENT gets another verdict than by the first.
+    """
 
     claim: Claim
     word: str
     why: str
     effects: Mapping[str, Sequence[Effect]]
+    turning: Sequence[str] = ()
 
     @property
     def key(self) -> Effect:
@@ -284,7 +288,8 @@ def judge(claim: Claim, rows: Tables) -> Verdict:
     elif first in ("fails", "open") and holds:
         first_reading = claim.primary[0].upper() + claim.primary[1:]
         word, why = DEPENDENT, f"It holds with: {'; '.join(holds)}. {first_reading}, {why}"
-    return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects)
+    turning = () if word != DEPENDENT else turned if first == "holds" else holds
+    return Verdict(claim, word, " ".join(filter(None, [why, claim.why.get(word, "")])), effects, turning)
 
 
 def state_of(effects: Sequence[Effect]) -> str:

@@ -248,7 +248,9 @@ def change(verdict: Verdict) -> str:
     if verdict.word == UNTESTABLE:
         return "a lead to take a share of." if key.state == "void" else "rows, which are missing."
     if verdict.word == DEPENDENT:
-        return f"to know which counts: {_turning(verdict)}."
+        read = {verdict.claim.primary: "", **{reading: reading for reading in verdict.turning}}
+        told = [f"{name} ({_under(verdict.effects[reading])})" for name, reading in read.items()]
+        return f"to know which counts: {told[0]}, or {'; '.join(told[1:])}."
     if key.low is None:
         return "another training seed, since one has no interval."
     away, low, high = key.beyond
@@ -270,23 +272,11 @@ def change(verdict: Verdict) -> str:
         return f"more training seeds and trials: the mean of the deciding check lies on the {side} side of its margin."
     wanted = seeds_to_decide(key, 1 if away > 0 else checks)
     many = f"about {wanted} training seeds" if wanted else "more than 100 training seeds"
+    holm = f", by Holm's procedure over {checks} checks" * (checks > 1)
     return (
         f"{many} that differ as these do, which put the interval of the deciding check on the {side} side of its "
-        f"margin, where its mean lies." + several * bool(away > 0)
+        f"margin, where its mean lies{f'.{several}' if away > 0 else f'{holm}.'}"
     )
-
-
-def _turning(verdict: Verdict) -> str:
-    """The first reading, and those by which a claim is replicated where it is not by the first, or turns where it is,
-    each with its verdict."""
-    first = verdict.effects[""]
-    holds = state_of(first) == "holds"
-    others = [
-        f"{reading} ({_under(found)})" for reading, found in verdict.effects.items()
-        if reading and (state_of(found) == "holds") is not holds
-        and not (holds and (state_of(found) == "void" or all(effect.right_side for effect in found)))
-    ]  # fmt: skip
-    return f"{verdict.claim.primary} ({_under(first)}), or {'; '.join(others)}"
 
 
 def seeds_to_decide(effect: Effect, checks: int = 1) -> int:

@@ -37,7 +37,6 @@ KEYS = (
 REPLACED_TOGETHER = (
     *("env", "noise", "delay", "model", "planner", "search_space", "execution", "configuration", "seed", "scale"),
 )
-WHAT = (*REPLACED_TOGETHER, "metric")
 Row = dict[str, object]
 K = TypeVar("K")
 V = TypeVar("V")
@@ -202,12 +201,12 @@ def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = 
 
 
 def of_fewer(published: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, ...], tuple[int, int]]:
-    """Values of WHAT -> of how many targets or episodes ``own`` and the published rows are, where ``own`` are of
-    fewer."""
+    """Values of REPLACED_TOGETHER -> of how many targets or episodes ``own`` and the published rows are at most, where
+    ``own`` are of fewer. Rows without a number are left out."""
     most: list[dict[tuple[str, ...], int]] = []
-    for rows in (own, published):
+    for rows in (own.dropna(subset=["n"]), published.dropna(subset=["n"])):
         most.append({})
-        for what, n in zip(about(rows, WHAT), rows["n"].fillna(0).astype(int), strict=True):
+        for what, n in zip(about(rows), rows["n"].astype(int), strict=True):
             most[-1][what] = max(n, most[-1].get(what, 0))
     found, ships = most
     return {what: (n, ships[what]) for what, n in found.items() if n < ships.get(what, 0)}
