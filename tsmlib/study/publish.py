@@ -137,7 +137,8 @@ def pooled(run: Run, made_by: Collection[str] = ()) -> dict[str, pd.DataFrame]:
                 raise RunError(
                     f"{path.stem} has rows of {n} targets or episodes, expected the {before} that ship, for "
                     f"{', '.join(told)}. Make them of as many (python -m tsmlib run {word[notebook]}, with that scale "
-                    f"and seed, and no smaller parameters), or delete {RESULTS / path.name} first, to publish these alone"
+                    "and seed, and no smaller parameters), or, to publish these alone, delete "
+                    f"{RESULTS / path.name} first"
                 )
     return found
 
