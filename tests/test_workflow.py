@@ -29,7 +29,7 @@ from tsmlib.study import needed, notebooks, parameters, runs, workflow, zoo
 from tsmlib.study.data import HELD_OUT_SEED, TASK_SEED, dataset
 from tsmlib.study.parameters import ParameterError
 from tsmlib.study.policies import Budget
-from tsmlib.study.remote_jobs import ask_again
+from tsmlib.study.remote_jobs import ask_again, cancel_held
 from tsmlib.study.runs import RunError
 
 HAS_SNAKEMAKE = importlib.util.find_spec("snakemake") is not None
@@ -695,7 +695,28 @@ def test_snakemake_and_the_pool_make_the_same_files(place: Path) -> None:
         assert len({path for path in log.rglob("*.log") if path.stat().st_mtime > began}) == steps_again
 
 
-def test_jobs_of_which_a_check_says_nothing_are_asked_of_again() -> None:
+def slurm_says(folder: Path, monkeypatch: pytest.MonkeyPatch, *queue: str) -> Path:
+    """Commands in place of Slurm's, of which ``squeue`` prints these lines; where ``scancel`` notes what it is told."""
+    for name, script in (("squeue", f"cat {folder}/queue"), ("scancel", f"echo $@ >> {folder}/cancelled")):
+        files.write_bytes(path := folder / "bin" / name, f"#!/bin/sh\n{script}\n".encode())
+        path.chmod(0o755)
+    (folder / "queue").write_text("\n".join(queue))
+    monkeypatch.setenv("PATH", str(folder / "bin"), prepend=os.pathsep)
+    (folder / "cancelled").touch()
+    return folder / "cancelled"
+
+
+def test_a_job_that_slurm_holds_is_cancelled_so_that_it_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = ("launch failed requeued held", "launch_failed_requeued_held", "job requeued in held state")
+    queue = ["1|Priority", *(f"{i}|{reason}" for i, reason in enumerate(held, start=2)), f"9|{held[0]}", "5|BeginTime"]
+    cancelled = slurm_says(tmp_path, monkeypatch, *queue)
+    cancel_held([SimpleNamespace(external_jobid=str(i)) for i in range(1, 7)])  # 9 is of another workflow
+    assert cancelled.read_text().split() == ["2", "3", "4"]
+
+
+def test_jobs_of_which_a_check_says_nothing_are_asked_of_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Executor:
         """Of four jobs one succeeds, one fails, one runs; of the last nothing is known."""
 
@@ -720,6 +741,7 @@ def test_jobs_of_which_a_check_says_nothing_are_asked_of_again() -> None:
     async def left(jobs: list[SimpleNamespace]) -> list[str]:
         return [job.external_jobid async for job in executor.check_active_jobs(jobs)]
 
+    slurm_says(tmp_path, monkeypatch)
     jobs = [SimpleNamespace(external_jobid=str(i)) for i in range(1, 5)]
     executor = Executor()
     assert asyncio.run(left(jobs)) == ["3"]

@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import nbformat
 import numpy as np
@@ -70,7 +71,8 @@ def killed_runs(trials: int) -> Outcome:
             state = json.loads((place / "runs/smoke/seed0/01_first.status.json").read_text())["state"]
             found.count(code != 0 and state != "complete", f"{how}: exit {code}, {state}")
             run = runs.resolve("02_second", scale="smoke", run_dir=str(place / "runs"))
-            said = refusal(lambda: notebooks.require(run, "01_first"), RunError)  # noqa: B023
+            with patch.object(runs, "NOTEBOOKS", place / "notebooks"):
+                said = refusal(lambda: notebooks.require(run, "01_first"), RunError)  # noqa: B023
             found.count("python -m tsmlib run first" in said, f"{how}: {said}")
             if how == "SIGKILL":
                 with contextlib.suppress(ProcessLookupError):
