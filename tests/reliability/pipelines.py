@@ -107,6 +107,7 @@ def cells_out_of_order(trials: int) -> Outcome:
                             found.count("may differ from the notebook's" in said, f"{word}, cell {index}: {new}")
                         ours = ("NameError", "StoreError", "ParameterError", "RunError")
                         known = reply["status"] == "ok" or reply["ename"] in ours
+                        known = known or str(reply["evalue"]).startswith("the reward fails on")  # of another robot
                         found.count(
                             known, f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}"
                         )
