@@ -141,6 +141,11 @@ class Slurm:
     def start_node(self, node: str) -> None:
         subprocess.run(["slurmd", "-f", self.place / "slurm.conf", "-N", node], env=self.environment, check=True)
 
+    def resume(self) -> None:
+        """Nodes that Slurm has set aside, as one on which it started a job twice, take jobs again."""
+        for node in NODES:
+            self.command("scontrol", "update", f"NodeName={node}", "State=RESUME")
+
     def pid(self, name: str) -> int:
         """Of slurmctld, slurmd-n1 or munge/pid."""
         return int((self.place / name).read_text())
@@ -261,7 +266,7 @@ def strike(cluster: Slurm, how: str, process: subprocess.Popen[bytes], place: Pa
         kill(psutil.Process(cluster.pid(f"slurmd-{node}.pid")))
         for each in cluster.processes(job):
             kill(each)
-        wait_for(lambda: "down" in cluster.command("sinfo", "-h", "-n", node, "-o", "%T"))
+        wait_for(lambda: cluster.command("sinfo", "-h", "-n", node, "-o", "%T") in ("down*", "down", "drained*"))
         cluster.start_node(node)
     elif how == "controller":
         kill(psutil.Process(cluster.pid("slurmctld.pid")))
@@ -304,6 +309,7 @@ def tried(cluster: Slurm, killed: Sequence[str], place: Path, expected: object, 
     quick = ["--slurm-init-seconds-before-status-checks", "2", "--seconds-between-status-checks", "2"]
     options = ["--executor", "slurm", "--jobs", "4", "--", *quick]
     found, said = Outcome(), f"{', '.join(killed)} after {after} steps"
+    cluster.resume()
     process = workflow(place, *options, environment=cluster.environment)
     try:
         for how in killed:
