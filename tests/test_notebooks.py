@@ -82,7 +82,7 @@ def test_what_notebooks_assert_of_a_seed_s_own_rows_holds_for_every_published_se
         for _, own in rows.groupby("seed"):
             shares, errors = own[own["metric"].str.endswith("_share")], own[own["metric"] == "gradient_error"]
             share = shares.pivot_table(index="env", columns="metric", values="value")
-            names = dict(share=share, found=tables.records(shares), errors=tables.records(errors))
+            names = dict(share=share, counted=tables.records(shares), errors=tables.records(errors))
             exec(compile(ast.Module(lines, []), stem, "exec"), names)
 
 
