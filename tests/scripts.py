@@ -10,10 +10,12 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Iterable
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import ModuleType
 from unittest.mock import patch
+
+import pytest
 
 
 def run_script(path: Path, *options: str) -> str:
@@ -22,6 +24,14 @@ def run_script(path: Path, *options: str) -> str:
     with patch.object(sys, "argv", [str(path), *options]), redirect_stdout(printed):
         runpy.run_path(str(path), run_name="__main__")
     return printed.getvalue()
+
+
+def refused(path: Path, *options: str) -> str:
+    """What the script says to standard error as it refuses its options, with exit status 2."""
+    said = io.StringIO()
+    with redirect_stderr(said), pytest.raises(SystemExit, match="2"):
+        run_script(path, *options)
+    return said.getvalue()
 
 
 def load_script(path: Path, name: str = "") -> ModuleType:

@@ -203,13 +203,13 @@ def others(published: pd.DataFrame, own: pd.DataFrame, columns: Sequence[str] = 
 def of_fewer(published: pd.DataFrame, own: pd.DataFrame) -> dict[tuple[str, ...], tuple[int, int]]:
     """Values of REPLACED_TOGETHER -> of how many targets or episodes ``own`` and the published rows are at most, where
     ``own`` are of fewer. Rows without a number are left out."""
-    most: list[dict[tuple[str, ...], int]] = []
-    for rows in (own.dropna(subset=["n"]), published.dropna(subset=["n"])):
-        most.append({})
-        for what, n in zip(about(rows), rows["n"].astype(int), strict=True):
-            most[-1][what] = max(n, most[-1].get(what, 0))
-    found, ships = most
+    found, ships = _most(own), _most(published)
     return {what: (n, ships[what]) for what, n in found.items() if n < ships.get(what, 0)}
+
+
+def _most(rows: pd.DataFrame) -> dict[tuple[str, ...], int]:
+    rows = rows.dropna(subset=["n"]).sort_values("n")
+    return dict(zip(about(rows), rows["n"].astype(int), strict=True))  # of the same the last, which is the most
 
 
 # Published rows and the reader's own ----------------------------------------------------------------------------------
