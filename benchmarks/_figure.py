@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from tsmlib.figures.checks import finite
-from tsmlib.figures.style import BLUE, ORANGE, PALE, RED, entry, legend, panels, styled
+from tsmlib.plots.checks import finite
+from tsmlib.plots.style import BLUE, ORANGE, PALE, RED, entry, legend, panels, styled
 
 LOOKS: dict[str, dict[str, Any]] = {  # a colour for each; black is the true simulator
     "train": dict(color=BLUE, marker="o"),
@@ -21,11 +21,20 @@ LOOKS: dict[str, dict[str, Any]] = {  # a colour for each; black is the true sim
     "simulate": dict(color="#111111", marker="x"),
 }
 UNCLEAR = 0.5  # spread of exponents over rounds from which on none is printed
-UNITS = {"segment length": "steps", "horizon": "steps", "batch": "windows", "seeds": "policies at once"}
+UNITS = {
+    "segment length": "steps",
+    "horizon": "steps",
+    "batch": "windows",
+    "seeds": "policies at once",
+}
 WORDS = {
-    "train": "training update", "imagine": "predicting", "plan": "planning iteration", "score": "scoring",
-    "learn": "policy update", "simulate": "MuJoCo",
-}  # fmt: skip
+    "train": "training update",
+    "imagine": "predicting",
+    "plan": "planning iteration",
+    "score": "scoring",
+    "learn": "policy update",
+    "simulate": "MuJoCo",
+}
 
 Curve = tuple[np.ndarray, np.ndarray]  # sizes (K,), seconds (R, K)
 
@@ -64,17 +73,29 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         unit = f" ({UNITS[title]})" if title in UNITS else ""
         ax.set(xscale="log", yscale="log", title=title.capitalize() + unit)
         ax.set_xticks(every, [f"{size:g}" for size in every])
-        ax.yaxis.set_major_locator(FixedLocator([a * 10.0**b for b in range(-2, 4) for a in (1, 2, 5)]))
+        ax.yaxis.set_major_locator(
+            FixedLocator([a * 10.0**b for b in range(-2, 4) for a in (1, 2, 5)])
+        )
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_minor_locator(NullLocator())
         low, high = ax.get_ylim()
-        room = (high / low) ** (0.13 * len(notes))  # for the notes: below lines that rise, above those that should fall
+        room = (high / low) ** (
+            0.13 * len(notes)
+        )  # for the notes: below lines that rise, above those that should fall
         ax.set_ylim((low / room, high) if slope > 0 else (low, high * room))
         for i, (note, shade) in enumerate(reversed(notes) if slope > 0 else notes):
             y, anchor = (0.02 + 0.09 * i, "bottom") if slope > 0 else (0.98 - 0.09 * i, "top")
-            ax.text(1.0, y, note.replace("-", "\u2212"), transform=ax.transAxes, ha="right", va=anchor, color=shade,
-                    fontsize=6)  # fmt: skip
+            ax.text(
+                1.0,
+                y,
+                note.replace("-", "\u2212"),
+                transform=ax.transAxes,
+                ha="right",
+                va=anchor,
+                color=shade,
+                fontsize=6,
+            )
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]

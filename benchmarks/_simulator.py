@@ -20,12 +20,19 @@ def raw(starts: np.ndarray, actions: np.ndarray, *, threads: int) -> Callable[[]
     """
     model = load_model(ENV)
     substeps = round(0.02 / model.opt.timestep)
-    physics = np.zeros((len(starts), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
-    physics[:, 1:9] = starts[:, [0, 1, 6, 7, 2, 3, 8, 9]]  # after the time, positions and velocities
+    physics = np.zeros(
+        (len(starts), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    )
+    physics[:, 1:9] = starts[
+        :, [0, 1, 6, 7, 2, 3, 8, 9]
+    ]  # after the time, positions and velocities
     data = [mujoco.MjData(model) for _ in range(threads)]
     pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
     parts = [
-        (physics[first : first + CHUNK], np.repeat(actions[first : first + CHUNK].astype(float), substeps, axis=1))
+        (
+            physics[first : first + CHUNK],
+            np.repeat(actions[first : first + CHUNK].astype(float), substeps, axis=1),
+        )
         for first in range(0, len(starts), CHUNK)
     ]
 

@@ -59,7 +59,9 @@ def by_mj_step(starts: np.ndarray, torques: np.ndarray) -> np.ndarray:
             data.ctrl[:] = action
             mujoco.mj_step(model, data, nstep=substeps)
             states.append(np.concatenate([data.qpos, data.qvel]))
-    return np.array(states, np.float32).reshape(len(starts), STEPS, 8)[..., [0, 1, 4, 5, 2, 3, 6, 7]]
+    return np.array(states, np.float32).reshape(len(starts), STEPS, 8)[
+        ..., [0, 1, 4, 5, 2, 3, 6, 7]
+    ]
 
 
 def main() -> None:
@@ -95,24 +97,49 @@ def main() -> None:
     limit = raw(starts, torques.numpy(), threads=threads)
     ways = {**{way: partial(keep, way) for way in calls}, "raw": limit}
     seconds = interleaved(ways, arguments.rounds, warm=False)
-    speeds = {way: (few if way in ("env.step", "mj_step") else n) * STEPS / seconds[way] for way in ways}
+    speeds = {
+        way: (few if way in ("env.step", "mj_step") else n) * STEPS / seconds[way] for way in ways
+    }
     bound = f"mujoco.rollout, {threads} threads"
     rows = [
         Row.of(
-            "collect in one call: steps", speeds["bulk"], f"loop over {way}", speeds[way], limit=bound,
-            bound=speeds["raw"], peak=peaks["bulk"], threads=threads, env=ENV, sim="mujoco", model="none",
-            horizon=STEPS, configuration=way, metric="steps_per_second",
+            "collect in one call: steps",
+            speeds["bulk"],
+            f"loop over {way}",
+            speeds[way],
+            limit=bound,
+            bound=speeds["raw"],
+            peak=peaks["bulk"],
+            threads=threads,
+            env=ENV,
+            sim="mujoco",
+            model="none",
+            horizon=STEPS,
+            configuration=way,
+            metric="steps_per_second",
         )
         for way in ("env.step", "mj_step")
-    ]  # fmt: skip
-    cores = {way: (n if way == "bulk" else few) * STEPS / np.array(taken[1:]) for way, taken in used.items()}
+    ]
+    cores = {
+        way: (n if way == "bulk" else few) * STEPS / np.array(taken[1:])
+        for way, taken in used.items()
+    }
     rows.append(
         Row.of(
-            "collect in one call: steps per CPU second", cores["bulk"], "loop over env.step", cores["env.step"],
-            peak=peaks["bulk"], threads=threads, env=ENV, sim="mujoco", model="none", horizon=STEPS,
-            configuration="env.step", metric="steps_per_core_second",  # fairer where others load the machine
+            "collect in one call: steps per CPU second",
+            cores["bulk"],
+            "loop over env.step",
+            cores["env.step"],
+            peak=peaks["bulk"],
+            threads=threads,
+            env=ENV,
+            sim="mujoco",
+            model="none",
+            horizon=STEPS,
+            configuration="env.step",
+            metric="steps_per_core_second",  # fairer where others load the machine
         )
-    )  # fmt: skip
+    )
     print(f"{ENV}, {n} episodes of {STEPS} steps, {threads} threads, {arguments.rounds} rounds")
     save("collect", rows)
 

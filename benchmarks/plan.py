@@ -33,8 +33,8 @@ from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam, cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.study import runs
-from tsmlib.study.models import load_pretrained
+from reproduction import runs
+from reproduction.models import load_pretrained
 
 ENV = "tsm/ReacherPush-v1"
 
@@ -47,7 +47,9 @@ def models(run: runs.Run, env: str) -> tuple[TSM, ActionPrior, str]:
     return study.initialise(run, "tsm", data), study.initialise(run, "prior", data), "untrained"
 
 
-def timed(call: Callable[[Tensor], Tensor], name: str, seconds: dict[str, float]) -> Callable[[Tensor], Tensor]:
+def timed(
+    call: Callable[[Tensor], Tensor], name: str, seconds: dict[str, float]
+) -> Callable[[Tensor], Tensor]:
     """``call``, adding what it takes to ``seconds[name]``."""
 
     def run(argument: Tensor) -> Tensor:
@@ -62,11 +64,22 @@ def timed(call: Callable[[Tensor], Tensor], name: str, seconds: dict[str, float]
 def main() -> None:
     options = parser(__doc__, rounds=3)
     options.add_argument("--targets", type=int, default=100)
-    options.add_argument("--iterations", type=int, default=100, help="of the whole plan (default 100, as in the paper)")
-    options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
+    options.add_argument(
+        "--iterations",
+        type=int,
+        default=100,
+        help="of the whole plan (default 100, as in the paper)",
+    )
+    options.add_argument(
+        "--horizon", type=int, default=50, help="steps (default 50, as in the paper)"
+    )
     options.add_argument("--few", type=int, default=4, help="iterations in a round (default 4)")
-    options.add_argument("--candidates", type=int, default=16, help="of the cross-entropy method (default 16)")
-    options.add_argument("--samples", type=int, default=0, help="that judge a candidate (default 0, the mode)")
+    options.add_argument(
+        "--candidates", type=int, default=16, help="of the cross-entropy method (default 16)"
+    )
+    options.add_argument(
+        "--samples", type=int, default=0, help="that judge a candidate (default 0, the mode)"
+    )
     options.add_argument("--whole", action="store_true", help="run the whole plan too, minutes")
     arguments = parsed(options)
     few, samples = arguments.few, arguments.samples
@@ -92,10 +105,21 @@ def main() -> None:
 
     fast, plain = through(model), through(PlainTSM(model))
     few_adam = partial(adam, reward=task.reward, start=n_targets, iterations=few)
-    few_cem = partial(cem, reward=task.reward, start=n_targets, iterations=1, candidates=arguments.candidates,
-                      elites=max(2, arguments.candidates // 4))  # fmt: skip
-    simulated = max(1, max(1, samples) * n_targets // 4)  # rollouts, a part of those of one iteration
-    start, torques = task.start, 0.1 * torch.randn(n_targets, horizon, 2, generator=torch.Generator().manual_seed(0))
+    few_cem = partial(
+        cem,
+        reward=task.reward,
+        start=n_targets,
+        iterations=1,
+        candidates=arguments.candidates,
+        elites=max(2, arguments.candidates // 4),
+    )
+    simulated = max(
+        1, max(1, samples) * n_targets // 4
+    )  # rollouts, a part of those of one iteration
+    start, torques = (
+        task.start,
+        0.1 * torch.randn(n_targets, horizon, 2, generator=torch.Generator().manual_seed(0)),
+    )
     ways: dict[str, Callable[[], object]] = {
         "latent, Adam": lambda: few_adam(fast, space=latent(prior)),
         "latent, Adam plain": lambda: few_adam(plain, space=latent(plain_prior)),
@@ -105,7 +129,11 @@ def main() -> None:
         "latent, CEM plain": lambda: few_cem(plain, space=latent(plain_prior)),
         "simulate": lambda: simulate(start, torques, simulated),
     }
-    words = {"latent, Adam": ("latent", "adam"), "direct, Adam": ("direct", "adam"), "latent, CEM": ("latent", "cem")}
+    words = {
+        "latent, Adam": ("latent", "adam"),
+        "direct, Adam": ("direct", "adam"),
+        "latent, CEM": ("latent", "cem"),
+    }
     products = {f"{word} sgemm": Products.of(ways[word]).alone() for word in words}
     peaks = {way: peak_bytes(call) for way, call in ways.items()}
     taken = interleaved(ways | products, arguments.rounds, warm=False)
@@ -118,35 +146,56 @@ def main() -> None:
         way = dict(common, planner=planner, search_space=search_space)
         rows.append(
             Row.of(
-                f"plan, {word}, {n_targets} targets: iterations", done / taken[word], "plain eager float32",
-                done / taken[f"{word} plain"], limit=SGEMM, bound=done / taken[f"{word} sgemm"], peak=peaks[word],
-                configuration="plain", metric="iterations_per_second", **way,
+                f"plan, {word}, {n_targets} targets: iterations",
+                done / taken[word],
+                "plain eager float32",
+                done / taken[f"{word} plain"],
+                limit=SGEMM,
+                bound=done / taken[f"{word} sgemm"],
+                peak=peaks[word],
+                configuration="plain",
+                metric="iterations_per_second",
+                **way,
             )
-        )  # fmt: skip
+        )
         if planner == "cem":
             continue
         scale, n_rollouts = arguments.iterations / few, few * max(1, samples) * n_targets
         rows.append(
             Row.of(
                 f"plan, {word}, {n_targets} targets, {arguments.iterations} iterations, extrapolated: seconds",
-                scale * taken[word], f"executing its steps in MuJoCo, {threads} threads",
-                scale * taken["simulate"] * n_rollouts / simulated, unit="s", peak=peaks[word],
-                configuration="simulate", metric="plan_seconds", **way,
+                scale * taken[word],
+                f"executing its steps in MuJoCo, {threads} threads",
+                scale * taken["simulate"] * n_rollouts / simulated,
+                unit="s",
+                peak=peaks[word],
+                configuration="simulate",
+                metric="plan_seconds",
+                **way,
             )
-        )  # fmt: skip
+        )
     if arguments.whole:
-        whole = partial(adam, fast, task.reward, latent(prior), n_targets, iterations=arguments.iterations)
+        whole = partial(
+            adam, fast, task.reward, latent(prior), n_targets, iterations=arguments.iterations
+        )
         began = time.perf_counter()
         peak = peak_bytes(whole)
         extrapolated = np.median(taken["latent, Adam"]) * arguments.iterations / few
         rows.append(
             Row.of(
-                "plan, latent, Adam, all of it once: seconds", np.array([time.perf_counter() - began]),
-                "its extrapolation from the rounds", extrapolated, unit="s", peak=peak, planner="adam",
+                "plan, latent, Adam, all of it once: seconds",
+                np.array([time.perf_counter() - began]),
+                "its extrapolation from the rounds",
+                extrapolated,
+                unit="s",
+                peak=peak,
+                planner="adam",
                 search_space="latent",
-                configuration="whole", metric="plan_seconds", **common,
+                configuration="whole",
+                metric="plan_seconds",
+                **common,
             )
-        )  # fmt: skip
+        )
     seconds["gradients and the rest"] = 2 * seconds["plan"] - sum(seconds.values())
     for part in ("codes to torques", "torques to states", "gradients and the rest"):
         print(f"{part:24} {seconds[part] / seconds['plan']:5.0%} of the latent plan")
@@ -161,7 +210,12 @@ def simulate(start: np.ndarray, actions: Tensor, n_rollouts: int) -> None:
     """Execute ``n_rollouts`` episodes in bulk, the actions over and over."""
     copies = -(-n_rollouts // len(start))
     env = gymnasium.make_vec(ENV, num_envs=copies * len(start))
-    collect(env, open_loop(actions.repeat(copies, 1, 1)), horizon=actions.shape[1], states=np.tile(start, (copies, 1)))
+    collect(
+        env,
+        open_loop(actions.repeat(copies, 1, 1)),
+        horizon=actions.shape[1],
+        states=np.tile(start, (copies, 1)),
+    )
     env.close()
 
 

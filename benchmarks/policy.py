@@ -21,7 +21,7 @@ from tsmlib import study
 from tsmlib.models.base import rollout
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
-from tsmlib.study import runs
+from reproduction import runs
 from tsmlib.trajectory import initial_past
 
 SCHEDULE = 2200  # updates until the rate has decayed to its end, A25
@@ -31,7 +31,9 @@ EPISODES = 20  # of each update and copy, ``learn_policy``'s default
 def main() -> None:
     options = parser(__doc__, rounds=9)
     options.add_argument("--env", default="tsm/Reacher-v0")
-    options.add_argument("--horizon", type=int, default=50, help="steps (default 50, as in the paper)")
+    options.add_argument(
+        "--horizon", type=int, default=50, help="steps (default 50, as in the paper)"
+    )
     options.add_argument("--copies", type=int, default=10)
     options.add_argument("--iterations", type=int, default=3, help="updates per round (default 3)")
     arguments = parsed(options)
@@ -60,7 +62,11 @@ def main() -> None:
             rollout(model, past, torques, generator=torch.Generator().manual_seed(i))
 
     ways: dict[str, Callable[[], object]] = {"imagine": imagine}
-    ways |= {f"{space} {m}": partial(learn, space, m) for space in ("latent", "direct") for m in (1, copies)}
+    ways |= {
+        f"{space} {m}": partial(learn, space, m)
+        for space in ("latent", "direct")
+        for m in (1, copies)
+    }
     products = {  # of the updates alone
         f"sgemm {way}": (Products.of(partial(call, n=2 * n)) - Products.of(call)).alone()
         for way, call in ways.items()
@@ -74,23 +80,43 @@ def main() -> None:
         f"{n} updates in each of {arguments.rounds} rounds"
     )
     rows = []
-    common = dict(env=arguments.env, sim="mujoco", task=task.name, model="tsm", planner="policy", horizon=horizon)
+    common = dict(
+        env=arguments.env,
+        sim="mujoco",
+        task=task.name,
+        model="tsm",
+        planner="policy",
+        horizon=horizon,
+    )
     for space in ("latent", "direct"):
         one, many = (f"{space} {m}" for m in (1, copies))
         whole = SCHEDULE * np.median(seconds[one]) / n
         print(f"one policy, {space}, extrapolated to {SCHEDULE} updates: {whole / 60:.1f} min")
         for what, way, reference, other in (
-            (f"one policy, {space}, an update: seconds", one, "predicting its steps, no gradient", "imagine"),
+            (
+                f"one policy, {space}, an update: seconds",
+                one,
+                "predicting its steps, no gradient",
+                "imagine",
+            ),
             (f"{copies} policies, {space}, an update: seconds", many, "one policy", one),
         ):
             rows.append(
                 Row.of(
-                    what, seconds[way] / n, reference, seconds[other] / n, unit="s", limit=SGEMM,
-                    bound=seconds[f"sgemm {way}"] / n, peak=peaks[way],
+                    what,
+                    seconds[way] / n,
+                    reference,
+                    seconds[other] / n,
+                    unit="s",
+                    limit=SGEMM,
+                    bound=seconds[f"sgemm {way}"] / n,
+                    peak=peaks[way],
                     search_space=space,
-                    configuration="copies" if way == many else "one", metric="seconds", **common,
+                    configuration="copies" if way == many else "one",
+                    metric="seconds",
+                    **common,
                 )
-            )  # fmt: skip
+            )
     save("policy", rows)
 
 

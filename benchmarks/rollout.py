@@ -18,7 +18,7 @@ from _simulator import ENV, raw
 
 from tsmlib import study
 from tsmlib.models.base import rollout
-from tsmlib.study import runs, zoo
+from tsmlib import zoo
 from tsmlib.trajectory import initial_past
 
 
@@ -27,7 +27,9 @@ def main() -> None:
     options.add_argument("--models", default=f"{zoo.PAPERS},{zoo.OURS},lstm,onestep")
     options.add_argument("--rows", default="100,400,1600", help="imagined at once")
     options.add_argument("--horizon", type=int, default=50)
-    options.add_argument("--episodes", type=int, default=100, help="that the simulator executes in each round")
+    options.add_argument(
+        "--episodes", type=int, default=100, help="that the simulator executes in each round"
+    )
     arguments = parsed(options)
     sizes = [int(word) for word in arguments.rows.split(",")]
     data = study.random_data(ENV, max(sizes), seed=0, horizon=arguments.horizon)
@@ -39,7 +41,10 @@ def main() -> None:
         net = study.initialise(run, model, data)
         ways: dict[str, Callable[[], object]] = {"simulator": simulator}
         for size in sizes:
-            ways |= {f"{word} {size}": imagine(net, data, size, word == "bfloat16") for word in ("float32", "bfloat16")}
+            ways |= {
+                f"{word} {size}": imagine(net, data, size, word == "bfloat16")
+                for word in ("float32", "bfloat16")
+            }
             ways[f"sgemm {size}"] = Products.of(ways[f"float32 {size}"]).alone()
         peaks = {way: peak_bytes(call) for way, call in ways.items()}
         seconds = interleaved(ways, arguments.rounds, warm=False, progress=model)
@@ -49,13 +54,24 @@ def main() -> None:
             for word in ("float32", "bfloat16"):
                 rows.append(
                     Row.of(
-                        f"imagine with {model}, {word}, {size} rows: steps", steps / seconds[f"{word} {size}"],
-                        "mujoco.rollout, one thread", simulated, limit=SGEMM, bound=steps / seconds[f"sgemm {size}"],
-                        peak=peaks[f"{word} {size}"], env=ENV, sim="mujoco", model=model, configuration=word,
-                        metric="steps_per_second", horizon=arguments.horizon,
+                        f"imagine with {model}, {word}, {size} rows: steps",
+                        steps / seconds[f"{word} {size}"],
+                        "mujoco.rollout, one thread",
+                        simulated,
+                        limit=SGEMM,
+                        bound=steps / seconds[f"sgemm {size}"],
+                        peak=peaks[f"{word} {size}"],
+                        env=ENV,
+                        sim="mujoco",
+                        model=model,
+                        configuration=word,
+                        metric="steps_per_second",
+                        horizon=arguments.horizon,
                     )
-                )  # fmt: skip
-    print(f"{ENV}, {arguments.horizon} steps, {arguments.rounds} rounds, {arguments.threads} threads")
+                )
+    print(
+        f"{ENV}, {arguments.horizon} steps, {arguments.rounds} rounds, {arguments.threads} threads"
+    )
     save("rollout", rows)
 
 

@@ -25,15 +25,19 @@ from _rounds import SGEMM, Products, Row, interleaved, on_the_cpu, parsed, parse
 
 from tsmlib import study
 from tsmlib.models.tsm import TSM
-from tsmlib.study import runs, zoo
-from tsmlib.study.zoo import OURS, Updates
+from tsmlib import zoo
+from tsmlib.zoo import OURS, Updates
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
 
 ENV = "tsm/ReacherPush-v1"
 BEFORE = "tsm+energy+direct"  # what rtsm took the place of
-WORDS = {"teacher_forced_loss": "teacher-forced", "loss": "free-running", "energy_loss": "energy score"}
+WORDS = {
+    "teacher_forced_loss": "teacher-forced",
+    "loss": "free-running",
+    "energy_loss": "energy score",
+}
 ONE_STEP = {"onestep", "ensemble", "ensemble+mse"}
 Data = tuple[Trajectories, Trajectories]
 
@@ -42,9 +46,15 @@ def main() -> None:
     options = parser(__doc__, rounds=5)
     options.add_argument("--models", default=",".join([*zoo.words("dynamics"), "prior"]))
     options.add_argument("--updates", type=int, default=10, help="in every call (default 10)")
-    options.add_argument("--batches", default="128,256,512,1024", help="windows per update, tsm free-running")
-    options.add_argument("--batch", type=int, default=0, help="windows per update; 0: as in the schedule (default)")
-    options.add_argument("--episodes", type=int, default=200, help="to draw windows from (default 200)")
+    options.add_argument(
+        "--batches", default="128,256,512,1024", help="windows per update, tsm free-running"
+    )
+    options.add_argument(
+        "--batch", type=int, default=0, help="windows per update; 0: as in the schedule (default)"
+    )
+    options.add_argument(
+        "--episodes", type=int, default=200, help="to draw windows from (default 200)"
+    )
     arguments = parsed(options)
     run = runs.resolve("bench", scale="laptop")
     data = study.random_data(ENV, arguments.episodes, seed=0), study.random_data(ENV, 1, seed=1)
@@ -62,11 +72,15 @@ def main() -> None:
     if arguments.batches:
         sizes = [int(word) for word in arguments.batches.split(",")]
         rows += batch_rows(study.initialise(run, "tsm", data[0]), sizes, data, arguments.updates, 2)
-    print(f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads")
+    print(
+        f"{ENV}, {arguments.rounds} rounds of {arguments.updates} updates, {arguments.threads} threads"
+    )
     save("train", rows)
 
 
-def training(net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool | None = None) -> Callable[[], object]:
+def training(
+    net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool | None = None
+) -> Callable[[], object]:
     """``updates`` updates of a stage, as the study has them.
 
     bf16: matrix products in bfloat16, native or not; None: as ``fit`` chooses by the stage and the processor.
@@ -74,10 +88,16 @@ def training(net: Any, stage: Updates, data: Data, *, updates: int, bf16: bool |
 
     def call() -> None:
         options = TrainingOptions(
-            past_len=net.past_len, future_len=stage.future_len, steps=updates,
-            batch_size=stage.batch, validate_every=updates, lr=1e-5, muon=1e-5 if stage.muon else 0.0,
-            weight_decay=stage.weight_decay, bf16=stage.bf16 if bf16 is None else bf16,
-        )  # fmt: skip
+            past_len=net.past_len,
+            future_len=stage.future_len,
+            steps=updates,
+            batch_size=stage.batch,
+            validate_every=updates,
+            lr=1e-5,
+            muon=1e-5 if stage.muon else 0.0,
+            weight_decay=stage.weight_decay,
+            bf16=stage.bf16 if bf16 is None else bf16,
+        )
         chosen = native_bf16() if bf16 is None else bf16
         with mock.patch("tsmlib.training.fit.native_bf16", return_value=chosen):
             fit(net, getattr(net, stage.loss), *data, options)
@@ -89,29 +109,46 @@ def stage_row(net: Any, model: str, stage: Updates, data: Data, arguments: Any) 
     """Supervised targets per second of one stage."""
     bf16 = stage.bf16 and native_bf16()
     plain = PlainTSM(net) if isinstance(net, TSM) else net
-    other = "plain eager float32" if plain is not net else f"itself in {'float32' if bf16 else 'bfloat16'}"
+    other = (
+        "plain eager float32"
+        if plain is not net
+        else f"itself in {'float32' if bf16 else 'bfloat16'}"
+    )
     fast = training(net, stage, data, updates=arguments.updates, bf16=bf16)
     products = Products.of(fast)
     ways = {
         "fast": fast,
-        "plain": training(plain, stage, data, updates=arguments.updates, bf16=plain is net and not bf16),
+        "plain": training(
+            plain, stage, data, updates=arguments.updates, bf16=plain is net and not bf16
+        ),
         "sgemm": products.alone(),
     }
     ways["plain"]()
     peak = peak_bytes(fast)
     seconds = interleaved(ways, arguments.rounds, warm=False, progress=f"{model}: {stage.loss}")
-    targets = arguments.updates * stage.batch * stage.future_len  # states, or torques, that a loss compares
+    targets = (
+        arguments.updates * stage.batch * stage.future_len
+    )  # states, or torques, that a loss compares
     windows = arguments.updates * stage.batch / seconds["fast"]
     name = stage.loss if stage.loss not in WORDS or model in ONE_STEP else WORDS[stage.loss]
     name = {"loss": "one step ahead", "multi_step_loss": "free-running"}.get(name, name)
     name += ", longer windows" * (stage.future_len > 20)
     print(f"{model}, {name}: {sorted(windows)[len(windows) // 2]:,.0f} windows a second")
     return Row.of(
-        f"train {model}, {name}: targets", targets / seconds["fast"],
-        other, targets / seconds["plain"],
-        limit=SGEMM, bound=targets / seconds["sgemm"], peak=peak, env=ENV, sim="mujoco", model=model,
-        configuration=stage.loss, metric="targets_per_second", horizon=stage.future_len,
-    )  # fmt: skip
+        f"train {model}, {name}: targets",
+        targets / seconds["fast"],
+        other,
+        targets / seconds["plain"],
+        limit=SGEMM,
+        bound=targets / seconds["sgemm"],
+        peak=peak,
+        env=ENV,
+        sim="mujoco",
+        model=model,
+        configuration=stage.loss,
+        metric="targets_per_second",
+        horizon=stage.future_len,
+    )
 
 
 def before_row(run: runs.Run, data: Data, arguments: Namespace) -> Row:
@@ -121,17 +158,26 @@ def before_row(run: runs.Run, data: Data, arguments: Namespace) -> Row:
     """
     losses, ways = {OURS: "loss", BEFORE: "energy_loss"}, {}
     for model, loss in losses.items():
-        stage = next(s for s in study.schedule(run, ENV, model) if s.loss == loss and s.future_len == 20)
+        stage = next(
+            s for s in study.schedule(run, ENV, model) if s.loss == loss and s.future_len == 20
+        )
         stage = replace(stage, batch=arguments.batch or 128)
         net = study.initialise(run, model, data[0])
         ways[model] = on_the_cpu(training(net, stage, data, updates=arguments.updates))
     seconds = interleaved(ways, arguments.rounds, progress=f"{OURS} and {BEFORE}")
     speed = {model: arguments.updates / taken for model, taken in seconds.items()}
     return Row.of(
-        f"train {OURS}, free-running, two samples, beside {BEFORE}: updates per CPU second", speed[OURS], BEFORE,
-        speed[BEFORE], env=ENV, sim="mujoco", model=OURS, configuration="beside", metric="updates_per_second",
+        f"train {OURS}, free-running, two samples, beside {BEFORE}: updates per CPU second",
+        speed[OURS],
+        BEFORE,
+        speed[BEFORE],
+        env=ENV,
+        sim="mujoco",
+        model=OURS,
+        configuration="beside",
+        metric="updates_per_second",
         horizon=20,
-    )  # fmt: skip
+    )
 
 
 def batch_rows(net: Any, sizes: list[int], data: Data, updates: int, rounds: int) -> list[Row]:
@@ -151,16 +197,24 @@ def batch_rows(net: Any, sizes: list[int], data: Data, updates: int, rounds: int
 
     return [
         Row.of(
-            f"train tsm, free-running, {word}, batch {batch}: windows", speed(word, batch),
+            f"train tsm, free-running, {word}, batch {batch}: windows",
+            speed(word, batch),
             f"{'float32, the same batch' if word == 'bfloat16' else f'float32, batch {sizes[0]}'}",
             speed("float32", batch if word == "bfloat16" else sizes[0]),
-            limit=SGEMM, bound=speed("sgemm", batch), peak=peaks[f"{word} {batch}"], env=ENV,
-            sim="mujoco", model="tsm", configuration="batch", metric="windows_per_second", horizon=20,
+            limit=SGEMM,
+            bound=speed("sgemm", batch),
+            peak=peaks[f"{word} {batch}"],
+            env=ENV,
+            sim="mujoco",
+            model="tsm",
+            configuration="batch",
+            metric="windows_per_second",
+            horizon=20,
         )
         for batch in sizes
         for word in ("bfloat16", "float32")
         if word == "bfloat16" or batch != sizes[0]
-    ]  # fmt: skip
+    ]
 
 
 if __name__ == "__main__":

@@ -30,7 +30,9 @@ myst_heading_anchors = 3
 myst_heading_slug_func = "pages.anchor"
 nb_execution_mode = "off"
 nitpicky = True
-nitpick_ignore_regex = [(r"py:.*", r"(?!tsmlib\.).*|.*\.[A-Z]")]  # types of other libraries, and type variables
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!tsmlib\.).*|.*\.[A-Z]")
+]  # types of other libraries, and type variables
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # a slider without its kernel shows nothing new
 suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets of executed notebooks
 

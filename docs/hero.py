@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 import tsmlib as tsm
-from tsmlib.figures import animation, style
+from tsmlib.plots import animation, style
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
 from tsmlib.storage.files import write_bytes
-from tsmlib.study import media, zoo
-from tsmlib.study.results.planning import by_final_distance
+from tsmlib import zoo
+from reproduction.results.planning import by_final_distance
 
 LARGEST = 3_000_000  # bytes
 WORDS = ("rtsm", "onestep")
@@ -28,9 +28,17 @@ def planned(task: Task, word: str) -> Trial:
     """Plans through a shipped model, executed; shown as predicted is the rollout of its mode."""
     net, prior = tsm.load_pretrained(word, env=task.env), tsm.load_pretrained("prior", env=task.env)
     space, past = tsm.LatentActions(prior, task.horizon), task.past(net.past_len)
-    judge, screened = (tsm.expected_predictor, 0.25) if net.stochastic else (tsm.model_predictor, 1.0)
+    judge, screened = (
+        (tsm.expected_predictor, 0.25) if net.stochastic else (tsm.model_predictor, 1.0)
+    )
     plan = tsm.cem(
-        judge(net, past), task.reward, space, len(task), candidates=96, screened=screened, progress=f"plans of {word}"
+        judge(net, past),
+        task.reward,
+        space,
+        len(task),
+        candidates=96,
+        screened=screened,
+        progress=f"plans of {word}",
     )
     return tsm.execute(task, tsm.reevaluate(plan, tsm.model_predictor(net, past), task.reward))
 
@@ -44,10 +52,14 @@ def save_webp(film: np.ndarray, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="tsm/ReacherPush-v1")
     parser.add_argument("--targets", type=int, default=8)
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "figures", help="a folder")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).resolve().parents[1] / "figures", help="a folder"
+    )
     given = parser.parse_args()
     task = tsm.load_task(given.env).take(given.targets)
     trials = {zoo.method(word, "latent", "cem"): planned(task, word) for word in WORDS}

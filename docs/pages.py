@@ -26,9 +26,13 @@ MATHML = LatexToMathML(fancy_error=False)  # LatexError ends the build
 SPECIAL = re.compile(r"([\\*|_`])")
 
 
-def process(app: object, what: str, name: str, found: object, options: object, lines: list[str]) -> None:
+def process(
+    app: object, what: str, name: str, found: object, options: object, lines: list[str]
+) -> None:
     """Turn the ``lines`` of a docstring into reStructuredText that looks like them. Sphinx's own signature."""
-    paragraphs = [list(part) for filled, part in groupby(lines, key=lambda line: bool(line.strip())) if filled]
+    paragraphs = [
+        list(part) for filled, part in groupby(lines, key=lambda line: bool(line.strip())) if filled
+    ]
     lines[:] = [line for paragraph in paragraphs for line in [*converted(paragraph), ""]]
 
 
@@ -38,7 +42,10 @@ def converted(paragraph: list[str]) -> list[str]:
     if min(indents):
         return ["::", "", *("    " + line for line in paragraph)]
     if max(indents) or paragraph[0].startswith(("- ", "1. ")):
-        return ["| " + " " * indent + escaped(line.strip()) for indent, line in zip(indents, paragraph, strict=True)]
+        return [
+            "| " + " " * indent + escaped(line.strip())
+            for indent, line in zip(indents, paragraph, strict=True)
+        ]
     return [escaped(line) for line in paragraph]
 
 
@@ -81,7 +88,11 @@ def write_modules() -> None:
         if not path.with_suffix(".pyi").exists():  # what a facade gives has its page already
             lines += ["   :members:", f"   :exclude-members: {', '.join(public.get(name, []))}"]
         if name in public:
-            lines += ["", "On pages of their own: " + ", ".join(f":py:obj:`~tsmlib.{one}`" for one in public[name])]
+            lines += [
+                "",
+                "On pages of their own: "
+                + ", ".join(f":py:obj:`~tsmlib.{one}`" for one in public[name]),
+            ]
         (target / f"{name}.rst").write_text("\n".join([*lines, ""]))
 
 
@@ -107,7 +118,9 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
         if cell.cell_type == "markdown":
             cell.source = linked(cell.source.replace("](../docs/", "](../"))
     command = f"`python -m tsmlib run {stored.stem.partition('_')[2]}`, then `make docs`"
-    notebook.cells.insert(1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*"))
+    notebook.cells.insert(
+        1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*")
+    )
     return notebook
 
 
@@ -148,7 +161,9 @@ def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
     else:
         target.mkdir(parents=True)
         said = "The explorer was not built with this documentation; build both: make explorer docs"
-        (target / "index.html").write_text(f"<!doctype html><title>tsmlib explorer</title><p>{said}</p>")
+        (target / "index.html").write_text(
+            f"<!doctype html><title>tsmlib explorer</title><p>{said}</p>"
+        )
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -32,13 +32,17 @@ from tsmlib.models.tsm import TSM
 from tsmlib.planning.tasks import HORIZON, TOLERANCE
 from tsmlib.storage import files
 from tsmlib.storage.files import Json
-from tsmlib.study import zoo
-from tsmlib.study.models import load_pretrained
-from tsmlib.study.tasks import draw_task
+from tsmlib import zoo
+from reproduction.models import load_pretrained
+from reproduction.tasks import draw_task
 
 FORMAT = 3  # of the manifest and of the files that it names; src/files.js asks for the same
 PAST_LEN = 10
-TASKS = {"push": "tsm/ReacherPush-v1", "obstacle": "tsm/ReacherObstacle-v0", "reach": "tsm/Reacher-v0"}
+TASKS = {
+    "push": "tsm/ReacherPush-v1",
+    "obstacle": "tsm/ReacherObstacle-v0",
+    "reach": "tsm/Reacher-v0",
+}
 MODELS = ("rtsm", "tsm", "lstm", "onestep")
 Arrays = dict[str, Tensor]
 
@@ -60,7 +64,9 @@ def of_layer(name: str, layer: nn.Module, scale: Tensor | None = None) -> Arrays
 def of_stack(decoder: CausalDecoder, scale: Tensor) -> Arrays:
     """A stack of gated layers (Eq. 1) with its head: ReLU, and a hidden layer where there is one."""
     if decoder.state_skip or not all(layer.residual for layer in list(decoder.layers)[:-1]):
-        raise ValueError("the page knows stacks with residual connections and no state skip; export another model")
+        raise ValueError(
+            "the page knows stacks with residual connections and no state skip; export another model"
+        )
     channels, found = decoder.inlet.out_features, of_layer("inlet", decoder.inlet)
     for i, (layer, code) in enumerate(
         zip(decoder.layers, decoder.codes.weight.chunk(len(decoder.layers)), strict=True)
@@ -76,7 +82,9 @@ def of_stack(decoder: CausalDecoder, scale: Tensor) -> Arrays:
 
 def of_cell(cell: nn.Linear, features: Features) -> Arrays:
     """A cell [s, u, h] -> gates with its inputs in the order of the page's rows, [h, s, u]."""
-    seen, h = cell.weight.split([cell.in_features - cell.out_features // 4, cell.out_features // 4], dim=1)
+    seen, h = cell.weight.split(
+        [cell.in_features - cell.out_features // 4, cell.out_features // 4], dim=1
+    )
     return linear("cell", torch.cat([h, seen], dim=1), cell.bias)
 
 
@@ -89,31 +97,51 @@ def network(model: nn.Module) -> tuple[dict[str, Json], Arrays]:
     """What the page is told of a model, and its arrays. ValueError for a class that the page does not know."""
     match model:
         case ActionPrior():
-            shape: dict[str, Json] = {"dilations": list(model.decoder.dilations), "codes": model.latent_dim, "hold": 10}
-            return {"kind": "prior", **shape}, {"std": model.std} | of_stack(model.decoder, model.std)
+            shape: dict[str, Json] = {
+                "dilations": list(model.decoder.dilations),
+                "codes": model.latent_dim,
+                "hold": 10,
+            }
+            return {"kind": "prior", **shape}, {"std": model.std} | of_stack(
+                model.decoder, model.std
+            )
         case TSM():
-            shape = {"dilations": list(model.decoder.dilations), "codes": model.latent_dim, "hold": model.segment_len}
+            shape = {
+                "dilations": list(model.decoder.dilations),
+                "codes": model.latent_dim,
+                "hold": model.segment_len,
+            }
             return {"kind": "gated", **shape}, statistics(model.features) | of_stack(
                 model.decoder, model.features.step_std
             )
         case RecurrentTSM():
             hidden, _, out = model.decoder.head
-            arrays = of_cell(model.decoder.cell, model.features) | linear("codes", model.decoder.codes.weight, None)
+            arrays = of_cell(model.decoder.cell, model.features) | linear(
+                "codes", model.decoder.codes.weight, None
+            )
             arrays |= of_layer("hidden", hidden) | of_layer("last", out, model.features.step_std)
             return {"kind": "recurrent", "codes": model.latent_dim, "hold": model.code_len}, (
                 statistics(model.features) | arrays
             )
         case LSTM():
-            arrays = of_cell(model.cell, model.features) | of_layer("last", model.out, model.features.step_std)
+            arrays = of_cell(model.cell, model.features) | of_layer(
+                "last", model.out, model.features.step_std
+            )
             return {"kind": "recurrent", "codes": 0, "hold": 0}, statistics(model.features) | arrays
         case OneStep():
             layers = [layer for layer in model.net if isinstance(layer, nn.Linear)]
-            arrays = {k: v for i, layer in enumerate(layers[:-1]) for k, v in of_layer(f"{i}", layer).items()}
+            arrays = {
+                k: v
+                for i, layer in enumerate(layers[:-1])
+                for k, v in of_layer(f"{i}", layer).items()
+            }
             arrays |= of_layer("last", layers[-1], model.features.step_std)
             return {"kind": "feedforward", "layers": len(layers) - 1, "codes": 0, "hold": 0}, (
                 statistics(model.features) | arrays
             )
-    raise ValueError(f"the page cannot run a {type(model).__name__}; it knows the segment models and their baselines")
+    raise ValueError(
+        f"the page cannot run a {type(model).__name__}; it knows the segment models and their baselines"
+    )
 
 
 @torch.no_grad()
@@ -126,7 +154,9 @@ def strongest_codes(model: DynamicsModel, env: str, n: int = 2) -> list[int]:
     torques = torch.zeros(len(task), model.code_len, 2) + 0.1
     moved = []
     for axis in torch.eye(model.latent_dim):
-        low, high = (model.decode(past, torques, (side * axis).expand(len(task), -1)) for side in (-2.0, 2.0))
+        low, high = (
+            model.decode(past, torques, (side * axis).expand(len(task), -1)) for side in (-2.0, 2.0)
+        )
         moved.append(float(model.features.difference(low, high).norm(dim=(1, 2)).mean()))
     return sorted(range(model.latent_dim), key=lambda i: -moved[i])[:n]
 
@@ -142,9 +172,12 @@ def write_network(folder: Path, name: str, model: nn.Module) -> dict[str, Json]:
     data = b"".join(parts)
     files.write_bytes(folder / f"{name}.f32", data)
     return {
-        **about, "file": f"{name}.f32", "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest(),
+        **about,
+        "file": f"{name}.f32",
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
         "arrays": cast(Json, places),
-    }  # fmt: skip
+    }
 
 
 def write_physics(folder: Path, name: str, env: str) -> dict[str, Json]:
@@ -165,10 +198,16 @@ def write_physics(folder: Path, name: str, env: str) -> dict[str, Json]:
         if isinstance(value, np.ndarray) and value.dtype == np.float64:
             other = getattr(again, word)
             if value.shape != other.shape:
-                raise ValueError(f"{env}: {word} is {value.shape} as compiled and {other.shape} from its MJCF")
+                raise ValueError(
+                    f"{env}: {word} is {value.shape} as compiled and {other.shape} from its MJCF"
+                )
             if not np.array_equal(value, other):
                 exact[word] = value.ravel().tolist()
-    return {"file": f"{name}.xml", "substeps": round(geometry.DT / model.opt.timestep), "exact": cast(Json, exact)}
+    return {
+        "file": f"{name}.xml",
+        "substeps": round(geometry.DT / model.opt.timestep),
+        "exact": cast(Json, exact),
+    }
 
 
 def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
@@ -185,28 +224,47 @@ def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
             look = zoo.look(word)
             network = write_network(folder, f"{spec.name}-{word}", cast(nn.Module, model))
             knobs = strongest_codes(model, env)
-            models[word] = cast(Json, {"network": network, "name": look.name, "colour": look.colour, "knobs": knobs})
-        prior = write_network(folder, f"{spec.name}-prior", cast(nn.Module, load_pretrained("prior", env=env)))
+            models[word] = cast(
+                Json, {"network": network, "name": look.name, "colour": look.colour, "knobs": knobs}
+            )
+        prior = write_network(
+            folder, f"{spec.name}-prior", cast(nn.Module, load_pretrained("prior", env=env))
+        )
         described[task] = {
-            "env": env, "stateDim": spec.state_dim, "models": models, "prior": prior,
+            "env": env,
+            "stateDim": spec.state_dim,
+            "models": models,
+            "prior": prior,
             "physics": write_physics(folder, spec.name, env),
             "horizon": HORIZON["push" if task == "push" else "reach"],
             "tolerance": TOLERANCE["push" if task == "push" else "reach"],
-            "start": {"angles": list(geometry.START_ANGLES[task]), "block": list(geometry.BLOCK_RING)},
+            "start": {
+                "angles": list(geometry.START_ANGLES[task]),
+                "block": list(geometry.BLOCK_RING),
+            },
             "target": list(ring),
-        }  # fmt: skip
+        }
     manifest: dict[str, Json] = {
-        "format": FORMAT, "dt": geometry.DT, "pastLen": PAST_LEN, "tasks": described,
+        "format": FORMAT,
+        "dt": geometry.DT,
+        "pastLen": PAST_LEN,
+        "tasks": described,
         "arm": {
-            "links": list(geometry.LINK_LENGTHS), "capsule": geometry.LINK1_CAPSULE, "radius": geometry.ARM_RADIUS,
-            "elbow": geometry.ELBOW_LIMIT, "block": geometry.BLOCK_RADIUS, "wall": geometry.WALL,
+            "links": list(geometry.LINK_LENGTHS),
+            "capsule": geometry.LINK1_CAPSULE,
+            "radius": geometry.ARM_RADIUS,
+            "elbow": geometry.ELBOW_LIMIT,
+            "block": geometry.BLOCK_RADIUS,
+            "wall": geometry.WALL,
             "clearance": geometry.BLOCK_CLEARANCE,
         },
-    }  # fmt: skip
+    }
     files.write_bytes(folder / "manifest.json", json.dumps(manifest).encode())
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Export the networks and the physics of the explorer.")
+    parser = argparse.ArgumentParser(
+        description="Export the networks and the physics of the explorer."
+    )
     parser.add_argument("folder", type=Path)
     write(parser.parse_args().folder)

@@ -38,9 +38,9 @@ from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import files
-from tsmlib.study import explorer
-from tsmlib.study.models import load_pretrained
-from tsmlib.study.tasks import draw_task, load_task
+from reproduction import explorer
+from reproduction.models import load_pretrained
+from reproduction.tasks import draw_task, load_task
 
 HERE = Path(__file__).parent
 MEASURED = HERE / "measured.json"
@@ -59,7 +59,9 @@ DRAGS = 22  # seed of the random scenes
 def ask(*questions: dict[str, Any]) -> list[Any]:
     """The answers of test/engine.mjs."""
     command = ["node", str(HERE / "test" / "engine.mjs")]
-    done = subprocess.run(command, input=json.dumps(questions), capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, input=json.dumps(questions), capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout)
 
 
@@ -81,7 +83,10 @@ def parity() -> dict[str, Any]:
     (found,) = ask(asked | {"actions": actions.flatten(1).tolist()})
     physics = np.abs(np.array(found).reshape(true.shape) - true)[..., [0, 1, 4, 5, 6, 7]].max()
     past, actions = task.past(10), actions[:, :50]
-    pasts = [{"states": x.flatten().tolist(), "actions": u.flatten().tolist()} for x, u in zip(*past, strict=True)]
+    pasts = [
+        {"states": x.flatten().tolist(), "actions": u.flatten().tolist()}
+        for x, u in zip(*past, strict=True)
+    ]
     asked = {"what": "rollout", "task": "push", "model": "rtsm", "pasts": pasts}
     (found,) = ask(asked | {"actions": actions.flatten(1).tolist()})
     expected = rollout(model, past, actions).numpy()
@@ -97,8 +102,14 @@ def plans(targets: int) -> dict[str, Any]:
     for seed in range(SEEDS):
         plan = cem(predict, task.reward, space, len(task), elites=6, seed=seed, **OPEN)
         plan = reevaluate(plan, fresh_predictor(model, task.past(10), seed=seed + 1), task.reward)
-        python.append(said(execute(task, plan)) | {"predicted": float(plan.predicted_return.mean())})
-    return {"n": len(task), "python": python, "page": [in_page(task, seed=1000 * k, first=OPEN) for k in (1, 2)]}
+        python.append(
+            said(execute(task, plan)) | {"predicted": float(plan.predicted_return.mean())}
+        )
+    return {
+        "n": len(task),
+        "python": python,
+        "page": [in_page(task, seed=1000 * k, first=OPEN) for k in (1, 2)],
+    }
 
 
 def closed(targets: int) -> list[dict[str, Any]]:
@@ -128,20 +139,30 @@ def closed_in_python(task: Task, again: dict[str, int], seed: int) -> dict[str, 
     model, prior = of_pushing()
     space, predict = LatentActions(prior, task.horizon), model_predictor(model, task.past(10))
     first = cem(predict, task.reward, space, len(task), elites=6, seed=seed, **OPEN)
-    planner = partial(cem, elites=max(2, again["candidates"] // 10), seed=seed, **again)  # as many as in the page
+    planner = partial(
+        cem, elites=max(2, again["candidates"] // 10), seed=seed, **again
+    )  # as many as in the page
     return said(mpc(task, model, space, planner, plan=first, seed=seed))
 
 
 def in_page(task: Task, **asked: Any) -> dict[str, float]:
     """Means over the targets of a task, planned and executed in the page's own code with a full search."""
     asked |= {"what": "plan", "task": "push", "model": "rtsm", "space": "latent"}
-    (found,) = ask(asked | {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()})
-    return {word: float(np.mean([one[word] for one in found])) for word in ("predicted", "executed", "success", "cpu")}
+    (found,) = ask(
+        asked | {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()}
+    )
+    return {
+        word: float(np.mean([one[word] for one in found]))
+        for word in ("predicted", "executed", "success", "cpu")
+    }
 
 
 def said(trial: Trial) -> dict[str, float]:
     assert trial.success is not None
-    return {"executed": float(trial.executed_return.mean()), "success": float(trial.success.float().mean())}
+    return {
+        "executed": float(trial.executed_return.mean()),
+        "success": float(trial.success.float().mean()),
+    }
 
 
 def page() -> dict[str, Any]:
@@ -149,12 +170,19 @@ def page() -> dict[str, Any]:
     with explorer.server(port=0) as running:
         thread = threading.Thread(target=running.serve_forever)
         thread.start()
-        command = ["node", str(HERE / "test" / "measure.mjs"), f"http://127.0.0.1:{running.server_port}/"]
+        command = [
+            "node",
+            str(HERE / "test" / "measure.mjs"),
+            f"http://127.0.0.1:{running.server_port}/",
+        ]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         running.shutdown()
         thread.join()
     done.check_returncode()
-    found = json.loads(done.stdout) | {"load": round(os.getloadavg()[0], 1), "processors": os.cpu_count()}
+    found = json.loads(done.stdout) | {
+        "load": round(os.getloadavg()[0], 1),
+        "processors": os.cpu_count(),
+    }
     if found["load"] > BUSY and (before := read().get("page")):
         lasting = ("gzip_bytes", "plan_cpu_ms", "longest_task_ms", "violations", "looked_at")
         found |= {word: value for word, value in before.items() if word not in lasting}
@@ -176,42 +204,89 @@ def table(measured: dict[str, Any]) -> None:
     found += "".join(f"| {' | '.join(row)} |\n" for row in rows(measured))
     text = PAGE.read_text()
     pattern = r"(?s)(<!-- table -->\n).*?(<!-- end of table -->)"
-    files.write_bytes(PAGE, re.sub(pattern, lambda match: f"{match[1]}\n{found}\n{match[2]}", text).encode())
+    files.write_bytes(
+        PAGE, re.sub(pattern, lambda match: f"{match[1]}\n{found}\n{match[2]}", text).encode()
+    )
 
 
 def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
-    seen, near, open_loop, loops = (measured.get(part) for part in ("page", "parity", "plans", "closed"))
+    seen, near, open_loop, loops = (
+        measured.get(part) for part in ("page", "parity", "plans", "closed")
+    )
     found = []
     if seen:
         seconds = {word: f"{seen[word] / 1000:.2f} s" for word in TIMES}
         found += [
             ("ready after load", "2 s", f"{seconds['ready_ms']} (median of {seen['loads']})"),
-            ("open-loop plan, 64 candidates x 6", "1.0 s",
-             f"{seconds['plan_ms']} (median of {seen['plans']}, the fastest {seconds['plan_least_ms']})"),
-            ("CPU time of an open-loop try, the busiest worker", "", f"{seconds['plan_cpu_ms']} (mean of 10)"),
-            ("longest task of the main thread", "50 ms", f"{seen['longest_task_ms']:.0f} ms of CPU"),
-            ("later plan, for 0.2 s of arm time", "0.2 s, else a smaller search",
-             f"{seconds['replan_ms']} (median of {seen['replans']}, {seen['replan_within_200_ms']:.0%} within 0.2 s), "
-             f"candidates x iterations chosen: {seen['replan_searches']}"),
-            ("page, compressed (gzip), until it is ready", "4 MB", f"{1e-6 * seen['gzip_bytes']:.2f} MB"),
-            ("violations that axe-core finds", "0", f"{seen['violations']} ({seen['looked_at']} states of the page)"),
-        ]  # fmt: skip
-        found.append(("load while times by the clock were taken", "", f"{seen['load']} on {seen['processors']} cores"))
+            (
+                "open-loop plan, 64 candidates x 6",
+                "1.0 s",
+                f"{seconds['plan_ms']} (median of {seen['plans']}, the fastest {seconds['plan_least_ms']})",
+            ),
+            (
+                "CPU time of an open-loop try, the busiest worker",
+                "",
+                f"{seconds['plan_cpu_ms']} (mean of 10)",
+            ),
+            (
+                "longest task of the main thread",
+                "50 ms",
+                f"{seen['longest_task_ms']:.0f} ms of CPU",
+            ),
+            (
+                "later plan, for 0.2 s of arm time",
+                "0.2 s, else a smaller search",
+                f"{seconds['replan_ms']} (median of {seen['replans']}, {seen['replan_within_200_ms']:.0%} within 0.2 s), "
+                f"candidates x iterations chosen: {seen['replan_searches']}",
+            ),
+            (
+                "page, compressed (gzip), until it is ready",
+                "4 MB",
+                f"{1e-6 * seen['gzip_bytes']:.2f} MB",
+            ),
+            (
+                "violations that axe-core finds",
+                "0",
+                f"{seen['violations']} ({seen['looked_at']} states of the page)",
+            ),
+        ]
+        found.append(
+            (
+                "load while times by the clock were taken",
+                "",
+                f"{seen['load']} on {seen['processors']} cores",
+            )
+        )
     if near:
         found += [
-            ("CPU time of an open-loop try, node, one thread", "", f"{near['cpu']:.2f} s (mean of 10)"),
-            ("model in page against torch, 50 steps", "1e-4", f"{near['model']:.0e} m, rad (n = {near['n']})"),
-            ("MuJoCo in page against Python, 100 steps", "1e-9", f"{near['physics']:.0e} m, rad (n = {near['n']})"),
-        ]  # fmt: skip
+            (
+                "CPU time of an open-loop try, node, one thread",
+                "",
+                f"{near['cpu']:.2f} s (mean of 10)",
+            ),
+            (
+                "model in page against torch, 50 steps",
+                "1e-4",
+                f"{near['model']:.0e} m, rad (n = {near['n']})",
+            ),
+            (
+                "MuJoCo in page against Python, 100 steps",
+                "1e-9",
+                f"{near['physics']:.0e} m, rad (n = {near['n']})",
+            ),
+        ]
     if open_loop:
         executed = [one["executed"] for one in open_loop["python"]]
         middle, half = statistics.interval(executed)
         mean = np.mean([one["executed"] for one in open_loop["page"]])
-        found.append((
-            f"executed return, {open_loop['n']} frozen targets", "within the interval of planner seeds",
-            f"{mean:.2f} (two seeds); in Python {middle:.2f} ± {half:.2f} (95 % interval), "
-            f"{min(executed):.2f} to {max(executed):.2f} over {len(executed)} seeds",
-        ))  # fmt: skip
+        found.append(
+            (
+                f"executed return, {open_loop['n']} frozen targets",
+                "within the interval of planner seeds",
+                f"{mean:.2f} (two seeds); in Python {middle:.2f} ± {half:.2f} (95 % interval), "
+                f"{min(executed):.2f} to {max(executed):.2f} over {len(executed)} seeds",
+            )
+        )
     return found + loop_rows(loops or [])
 
 
@@ -222,14 +297,20 @@ def loop_rows(runs: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
         groups.setdefault((run["n"], run["search"], run["by"]), []).append(run)
     found = []
     for (n, search, by), same in groups.items():
-        success, executed = (np.mean([run[word] for run in same]) for word in ("success", "executed"))
+        success, executed = (
+            np.mean([run[word] for run in same]) for word in ("success", "executed")
+        )
         seeds = ", ".join(str(run["seed"]) for run in same)
         said = f"{success:.2f}, executed return {executed:.2f} (planner's seed {seeds})"
         python = groups.get((n, search, "python"), [])
         if by == "page" and python:
-            said += f"; {success / np.mean([run['success'] for run in python]):.2f} of Python's share"
+            said += (
+                f"; {success / np.mean([run['success'] for run in python]):.2f} of Python's share"
+            )
         where = "the page" if by == "page" else "Python"
-        what = f"success within 5 cm, closed loop in {where}, later plans {search}, {n} random scenes"
+        what = (
+            f"success within 5 cm, closed loop in {where}, later plans {search}, {n} random scenes"
+        )
         found.append((what, "0.9 of Python's share" if by == "page" else "", said))
     return found
 
@@ -237,15 +318,20 @@ def loop_rows(runs: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
 @torch.no_grad()
 def main(asked: list[str], targets: int) -> None:
     parts: dict[str, Callable[[], object]] = {
-        "parity": parity, "plans": partial(plans, targets), "closed": partial(closed, targets), "page": page,
-    }  # fmt: skip
+        "parity": parity,
+        "plans": partial(plans, targets),
+        "closed": partial(closed, targets),
+        "page": page,
+    }
     for part in [word for word in parts if word in asked or not asked]:
         keep(part, parts[part]())
     table(read())
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Measure the explorer and write the table of docs/explorer.md.")
+    parser = argparse.ArgumentParser(
+        description="Measure the explorer and write the table of docs/explorer.md."
+    )
     parser.add_argument("parts", nargs="*", choices=["parity", "plans", "closed", "page", "table"])
     parser.add_argument("--targets", type=int, default=100)
     arguments = parser.parse_args()

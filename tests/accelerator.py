@@ -19,7 +19,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 DEVICE = "meta"  # the one device without numbers of its own that every build of torch can differentiate on
-INDEXED = ("aten::index", "aten::_unsafe_index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
+INDEXED = (
+    "aten::index",
+    "aten::_unsafe_index",
+    "aten::index_put",
+    "aten::index_put_",
+    "aten::_index_put_impl_",
+)
 
 
 class There(Tensor):
@@ -36,8 +42,12 @@ class There(Tensor):
         return there
 
     @classmethod
-    def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if function is Tensor.__getitem__:  # torch would itself bring a list to the device, past __torch_dispatch__
+    def __torch_function__(
+        cls, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        if (
+            function is Tensor.__getitem__
+        ):  # torch would itself bring a list to the device, past __torch_dispatch__
             x, index = args
             last = index[-1] if isinstance(index, tuple) else index
             if isinstance(last, list):
@@ -45,7 +55,9 @@ class There(Tensor):
         return torch._C._disabled_torch_function_impl(function, types, args, kwargs or {})
 
     @classmethod
-    def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _run(operation, args, kwargs or {})
 
 
@@ -60,8 +72,16 @@ class Accelerator(TorchDispatchMode):
         enable, autocast = torch.set_autocast_enabled, torch.autocast
         fused = [*optimizer._get_fused_kernels_supported_devices(), DEVICE]
         for where, name, instead in (
-            (torch, "set_autocast_enabled", lambda kind, on: None if kind == DEVICE else enable(kind, on)),
-            (torch, "autocast", lambda kind, *_, **how: autocast("cpu" if kind == DEVICE else kind, *_, **how)),
+            (
+                torch,
+                "set_autocast_enabled",
+                lambda kind, on: None if kind == DEVICE else enable(kind, on),
+            ),
+            (
+                torch,
+                "autocast",
+                lambda kind, *_, **how: autocast("cpu" if kind == DEVICE else kind, *_, **how),
+            ),
             (optimizer, "_get_fused_kernels_supported_devices", lambda: fused),
         ):
             self.patches.enter_context(mock.patch.object(where, name, instead))
@@ -71,7 +91,9 @@ class Accelerator(TorchDispatchMode):
         self.patches.close()
         super().__exit__(*error)
 
-    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         self.count += any(isinstance(leaf, There) for leaf in tree_leaves(args))
         return _run(operation, args, kwargs or {})
 
@@ -91,14 +113,28 @@ def _run(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
                 )
     if kwargs.get("device") is not None:
         there, kwargs = torch.device(kwargs["device"]).type == DEVICE, {**kwargs, "device": "cpu"}
-    if there and isinstance(drawn := kwargs.get("generator"), torch.Generator) and drawn.device.type != DEVICE:
+    if (
+        there
+        and isinstance(drawn := kwargs.get("generator"), torch.Generator)
+        and drawn.device.type != DEVICE
+    ):
         raise RuntimeError(f"{name}: a generator of the processor draws on the accelerator")
-    numbers, named = tree_map(lambda leaf: leaf.here if isinstance(leaf, There) else leaf, (args, kwargs))
+    numbers, named = tree_map(
+        lambda leaf: leaf.here if isinstance(leaf, There) else leaf, (args, kwargs)
+    )
     found = operation(*numbers, **named)
     if not there:
         return found
-    changed = {id(tensor.here): tensor for tensor in tensors if isinstance(tensor, There)}  # in place
+    changed = {
+        id(tensor.here): tensor for tensor in tensors if isinstance(tensor, There)
+    }  # in place
     return tree_map(
-        lambda leaf: changed[id(leaf)] if id(leaf) in changed else There(leaf) if isinstance(leaf, Tensor) else leaf,
+        lambda leaf: (
+            changed[id(leaf)]
+            if id(leaf) in changed
+            else There(leaf)
+            if isinstance(leaf, Tensor)
+            else leaf
+        ),
         found,
     )

@@ -44,7 +44,9 @@ class Case:
     constant: tuple[int, ...] = ()
     losses: tuple[tuple[str, tuple[str, ...]], ...] = (("loss", ()),)
     stochastic: bool = True
-    recall: Callable[[Any, Window], Tensor] = lambda model, seen: predict_segment(model, seen.past, seen.future.actions)
+    recall: Callable[[Any, Window], Tensor] = lambda model, seen: predict_segment(
+        model, seen.past, seen.future.actions
+    )
 
     def model(self, dtype: torch.dtype = torch.float64) -> Any:
         """The model with the statistics of ``motion``, always the same weights."""
@@ -65,30 +67,45 @@ SMALL = dict(channels=8, segment_len=10, beta=0.1)
 
 MODELS = {
     "tsm": Case(lambda dx: TSM(dx, DU, angles=ANGLES, **SMALL), **SAME),
-    "tsm, push": Case(lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL), state_dim=10, **SAME),
+    "tsm, push": Case(
+        lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL), state_dim=10, **SAME
+    ),
     "tsm, obstacle": Case(
-        lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL), state_dim=10, constant=(6, 7, 8, 9), **SAME
+        lambda dx: TSM(dx, DU, angles=ANGLES, head_channels=16, **SMALL),
+        state_dim=10,
+        constant=(6, 7, 8, 9),
+        **SAME,
     ),
     "tsm, state skip": Case(lambda dx: TSM(dx, DU, angles=ANGLES, state_skip=16, **SMALL), **SAME),
     "onestep": Case(
-        lambda dx: OneStep(dx, DU, angles=ANGLES, hidden=16, layers=2), stochastic=False,
+        lambda dx: OneStep(dx, DU, angles=ANGLES, hidden=16, layers=2),
+        stochastic=False,
         losses=(("loss", ()), ("multi_step_loss", ())),
     ),
-    "lstm": Case(lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False),
+    "lstm": Case(
+        lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False
+    ),
     "rtsm": Case(
         lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20, mode_weight=0.5),
         losses=(("loss", ()), ("point_loss", ("decoder.codes",))),
     ),
     "rtsm, obstacle": Case(
-        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20), state_dim=10, constant=(6, 7, 8, 9),
+        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20),
+        state_dim=10,
+        constant=(6, 7, 8, 9),
         losses=(("loss", ()), ("point_loss", ("decoder.codes",))),
     ),
-    "ensemble": Case(lambda dx: Ensemble(dx, DU, angles=ANGLES, hidden=16, layers=2, segment_len=10)),
+    "ensemble": Case(
+        lambda dx: Ensemble(dx, DU, angles=ANGLES, hidden=16, layers=2, segment_len=10)
+    ),
     "ensemble+mse, obstacle": Case(
-        lambda dx: Ensemble(dx, DU, angles=ANGLES, gaussian=False, hidden=16, layers=2, segment_len=10), state_dim=10,
+        lambda dx: Ensemble(
+            dx, DU, angles=ANGLES, gaussian=False, hidden=16, layers=2, segment_len=10
+        ),
+        state_dim=10,
         constant=(6, 7, 8, 9),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(params=MODELS.values(), ids=MODELS.keys())
@@ -99,7 +116,11 @@ def case(request: pytest.FixtureRequest) -> Case:
 def motion(case: Case, n: int, steps: int, *, seed: int = 0) -> Segment:
     """A made-up world (n, steps, .): every dimension follows the actions with some inertia, in no particular units."""
     draw = torch.Generator().manual_seed(seed)
-    actions = torch.randn(n, -(-steps // 5), DU, generator=draw).clamp(-1, 1).repeat_interleave(5, 1)[:, :steps]
+    actions = (
+        torch.randn(n, -(-steps // 5), DU, generator=draw)
+        .clamp(-1, 1)
+        .repeat_interleave(5, 1)[:, :steps]
+    )
     pull = torch.randn(DU, case.state_dim, generator=draw)
     x = torch.randn(n, case.state_dim, generator=draw)
     states = []
@@ -111,9 +132,14 @@ def motion(case: Case, n: int, steps: int, *, seed: int = 0) -> Segment:
     return Segment(torch.stack(states, 1), actions)
 
 
-def window(case: Case, past_len: int, future_len: int, *, n: int = B, dtype: torch.dtype = torch.float64) -> Window:
+def window(
+    case: Case, past_len: int, future_len: int, *, n: int = B, dtype: torch.dtype = torch.float64
+) -> Window:
     """A past and the future that followed it."""
-    parts = (part.to(dtype).split([past_len, future_len], 1) for part in motion(case, n, past_len + future_len, seed=3))
+    parts = (
+        part.to(dtype).split([past_len, future_len], 1)
+        for part in motion(case, n, past_len + future_len, seed=3)
+    )
     return Window(*(Segment(*pair) for pair in zip(*parts, strict=True)))
 
 
@@ -157,7 +183,10 @@ def test_only_the_last_steps_of_a_long_past_count(case: Case) -> None:
     model = case.model()
     past, future = window(case, model.past_len + 9, 13)
     torch.testing.assert_close(
-        rollout(model, past, future.actions), rollout(model, past.last(model.past_len), future.actions), rtol=0, atol=0
+        rollout(model, past, future.actions),
+        rollout(model, past.last(model.past_len), future.actions),
+        rtol=0,
+        atol=0,
     )
 
 
@@ -170,10 +199,14 @@ def test_an_action_changes_no_state_before_it(case: Case, k: int) -> None:
     past, future = window(case, model.past_len, 23)
     other = future.actions.clone()
     other[:, k] += 0.5
-    before, after = (rollout(model, past, u, generator=generator()) for u in (future.actions, other))
+    before, after = (
+        rollout(model, past, u, generator=generator()) for u in (future.actions, other)
+    )
     assert torch.equal(before[:, :k], after[:, :k])
     moving = [d for d in range(case.state_dim) if d not in case.constant]
-    assert (before[:, k] != after[:, k])[:, moving].all()  # u_k moves x_{k+1}, which is states[:, k]
+    assert (before[:, k] != after[:, k])[
+        :, moving
+    ].all()  # u_k moves x_{k+1}, which is states[:, k]
 
 
 def test_a_decoder_output_sees_the_present_and_the_receptive_field_only() -> None:
@@ -201,7 +234,9 @@ def test_a_rollout_is_segments_chained_by_hand(case: Case) -> None:
             states = predict_segment(model, whole.last(model.past_len), u, generator=noise)
             whole = whole.then(Segment(states, u))  # the predicted future is the next past
             at += u.shape[1]
-        by_rollout = rollout(model, past, future.actions, generator=None if seed is None else generator(seed))
+        by_rollout = rollout(
+            model, past, future.actions, generator=None if seed is None else generator(seed)
+        )
         assert torch.equal(whole.last(23).states, by_rollout)
 
 
@@ -215,20 +250,28 @@ def test_a_plan_of_the_prior_is_segments_chained_by_hand(prior: ActionPrior) -> 
 
 # Two decoding paths --------------------------------------------------------------------------------------------------
 
-CODED = [name for name, case in MODELS.items() if hasattr(case.build(case.state_dim), "decode") and "three" not in name]
+CODED = [
+    name
+    for name, case in MODELS.items()
+    if hasattr(case.build(case.state_dim), "decode") and "three" not in name
+]
 TSMS = [name for name in CODED if isinstance(MODELS[name].build(6), TSM)]
 
 
 @pytest.mark.parametrize("name", TSMS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
-def test_all_positions_at_once_and_one_by_one_agree(name: str, dtype: torch.dtype, tolerance: float) -> None:
+def test_all_positions_at_once_and_one_by_one_agree(
+    name: str, dtype: torch.dtype, tolerance: float
+) -> None:
     model, z = MODELS[name].model(dtype), torch.randn(B, 8, generator=generator()).to(dtype)
     past, future = seen = window(MODELS[name], model.past_len, 10, dtype=dtype)
     at_once = model.decode_teacher_forced(seen, z)
     cache = model.decoder.begin(model.inputs(past.states[:, :-1], past.actions[:, 1:]), z)
     x, codes, one_by_one = past.states[:, -1], model.decoder.codes(z), []
     for true, u in zip(future.states.unbind(1), future.actions.unbind(1), strict=True):
-        one_by_one.append(x + model.features.step_std * model.decoder.step(model.inputs(x, u), codes, cache))
+        one_by_one.append(
+            x + model.features.step_std * model.decoder.step(model.inputs(x, u), codes, cache)
+        )
         x = true
     torch.testing.assert_close(torch.stack(one_by_one, 1), at_once, rtol=tolerance, atol=tolerance)
 
@@ -254,7 +297,9 @@ def test_both_paths_of_the_prior_agree(prior: ActionPrior) -> None:
     cache = prior.decoder.begin(past.actions[:, :-1] / prior.std, z)
     u, codes, one_by_one = past.actions[:, -1], prior.decoder.codes(z), []
     for true in future.actions.unbind(1):
-        one_by_one.append((u + prior.std * prior.decoder.step(u / prior.std, codes, cache)).clamp(-1, 1))
+        one_by_one.append(
+            (u + prior.std * prior.decoder.step(u / prior.std, codes, cache)).clamp(-1, 1)
+        )
         u = true
     torch.testing.assert_close(torch.stack(one_by_one, 1), at_once, rtol=1e-10, atol=1e-10)
     free = prior.decode(past.actions, z)
@@ -275,7 +320,9 @@ def test_a_cache_may_begin_with_nothing_known() -> None:
 # Differentiability ---------------------------------------------------------------------------------------------------
 
 
-def assert_gradient(value: Callable[[], Tensor], variables: Sequence[Tensor], *, tolerance: float = 1e-5) -> None:
+def assert_gradient(
+    value: Callable[[], Tensor], variables: Sequence[Tensor], *, tolerance: float = 1e-5
+) -> None:
     """Each variable's gradient agrees with a central difference along the gradient plus a random direction."""
     assert max(gradients.relative_errors(value, variables)) <= tolerance
 
@@ -294,9 +341,14 @@ def test_a_return_is_differentiable_in_actions_and_past(case: Case) -> None:
 
 @pytest.mark.parametrize("name", CODED)
 def test_a_predicted_segment_is_differentiable_in_its_code(name: str) -> None:
-    model, z = MODELS[name].model(), torch.randn(B, 8, generator=generator()).double().requires_grad_()
+    model, z = (
+        MODELS[name].model(),
+        torch.randn(B, 8, generator=generator()).double().requires_grad_(),
+    )
     past, future = window(MODELS[name], model.past_len, 10)
-    assert_gradient(lambda: model.decode(past, future.actions, z).square().sum(), [z], tolerance=5e-5)
+    assert_gradient(
+        lambda: model.decode(past, future.actions, z).square().sum(), [z], tolerance=5e-5
+    )
 
 
 def test_every_loss_is_differentiable_in_every_parameter_it_uses(case: Case) -> None:
@@ -304,7 +356,9 @@ def test_every_loss_is_differentiable_in_every_parameter_it_uses(case: Case) -> 
     seen = window(case, model.past_len, 2 * model.segment_len)
     for loss, unused in case.losses:
         used = parameters(model, but=unused)
-        assert_gradient(lambda loss=loss: getattr(model, loss)(seen, generator()), list(used.values()))
+        assert_gradient(
+            lambda loss=loss: getattr(model, loss)(seen, generator()), list(used.values())
+        )
 
 
 def test_every_parameter_is_trained_by_a_loss(case: Case) -> None:
@@ -314,7 +368,9 @@ def test_every_parameter_is_trained_by_a_loss(case: Case) -> None:
     for loss, unused in case.losses:
         model.zero_grad(set_to_none=True)
         getattr(model, loss)(seen, generator()).backward()
-        touched = {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
+        touched = {
+            name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()
+        }
         assert touched == set(parameters(model, but=unused)), loss
         trained |= touched
     assert trained == set(parameters(model))
@@ -327,7 +383,9 @@ def parameters(model: nn.Module, *, but: tuple[str, ...] = ()) -> dict[str, nn.P
 def test_the_prior_is_differentiable_in_codes_and_every_parameter(prior: ActionPrior) -> None:
     past, future = actions_window(20)
     z = torch.randn(B, 3, 8, generator=generator()).double().requires_grad_()
-    assert prior.plan(past.actions, z).abs().max() < 1  # the bounds are not met, where the gradient would be zero
+    assert (
+        prior.plan(past.actions, z).abs().max() < 1
+    )  # the bounds are not met, where the gradient would be zero
     assert_gradient(lambda: prior.plan(past.actions, z).square().sum(), [z])
     assert_gradient(lambda: prior.loss(Window(past, future), generator()), list(prior.parameters()))
 
@@ -345,7 +403,9 @@ def test_a_row_does_not_depend_on_its_batch(case: Case) -> None:
 
     together = predicted(slice(None))
     for i in range(B):
-        torch.testing.assert_close(predicted(slice(i, i + 1))[0], together[i], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            predicted(slice(i, i + 1))[0], together[i], rtol=1e-12, atol=1e-12
+        )
     order = torch.randperm(B, generator=generator())
     torch.testing.assert_close(predicted(order), together[order], rtol=1e-12, atol=1e-12)
 
@@ -354,7 +414,9 @@ def test_a_row_of_the_prior_does_not_depend_on_its_batch(prior: ActionPrior) -> 
     past, z = actions_window()[0].actions, torch.randn(B, 2, 8, generator=generator()).double()
     together = prior.plan(past, z)
     for i in range(B):
-        torch.testing.assert_close(prior.plan(past[i : i + 1], z[i : i + 1])[0], together[i], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            prior.plan(past[i : i + 1], z[i : i + 1])[0], together[i], rtol=1e-12, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("size", [1, 2, 4])
@@ -381,10 +443,14 @@ def test_candidates_with_shared_noise_meet_the_same_futures(case: Case) -> None:
     same = rows(past, [0] * B)
     pasts = Segment(*(part.repeat(candidates, 1, 1) for part in same))
     actions = future.actions[:1].expand(candidates * B, -1, -1)
-    states = rollout(model, pasts, actions, generator=SharedNoise(generator(), B)).unflatten(0, (candidates, B))
+    states = rollout(model, pasts, actions, generator=SharedNoise(generator(), B)).unflatten(
+        0, (candidates, B)
+    )
     torch.testing.assert_close(states[1:], states[:1].expand_as(states[1:]), rtol=1e-12, atol=1e-12)
     if case.stochastic:
-        assert (states[0, 0] - states[0, 1]).abs().max() > 1e-3  # but different targets meet different ones
+        assert (
+            states[0, 0] - states[0, 1]
+        ).abs().max() > 1e-3  # but different targets meet different ones
 
 
 # Determinism ---------------------------------------------------------------------------------------------------------
@@ -453,7 +519,9 @@ def test_the_prior_learns_one_segment_by_heart() -> None:
     assert error.square().mean() < 2e-2 * future.actions.var(1).mean()
 
 
-def overfit(model: nn.Module, loss: Callable[[torch.Generator], Tensor], steps: int = 200, lr: float = 2e-2) -> None:
+def overfit(
+    model: nn.Module, loss: Callable[[torch.Generator], Tensor], steps: int = 200, lr: float = 2e-2
+) -> None:
     optimizer = torch.optim.Adam(model.parameters(), lr=lr)
     noise = generator()
     for step in range(steps):

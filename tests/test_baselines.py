@@ -35,7 +35,10 @@ def window(past_len: int, future_len: int, **options: float) -> Window:
 
 def trained(model: OneStep | LSTM | Ensemble, loss: str, seen: Window, steps: int = 300) -> None:
     model.features.fit(torch.cat([seen.past.states, seen.future.states], 1))
-    optimizer, draw = torch.optim.Adam(model.parameters(), lr=5e-3), torch.Generator().manual_seed(0)
+    optimizer, draw = (
+        torch.optim.Adam(model.parameters(), lr=5e-3),
+        torch.Generator().manual_seed(0),
+    )
     for _ in range(steps):
         optimizer.zero_grad()
         getattr(model, loss)(seen, draw).backward()
@@ -64,7 +67,9 @@ def test_a_one_step_model_has_no_memory() -> None:
     model, (past, future) = in_units(OneStep(DX, DU)), window(10, 5)
     forgotten = Segment(past.states.clone(), torch.zeros_like(past.actions))
     forgotten.states[:, :-1] = 0
-    assert torch.equal(rollout(model, past, future.actions), rollout(model, forgotten, future.actions))
+    assert torch.equal(
+        rollout(model, past, future.actions), rollout(model, forgotten, future.actions)
+    )
 
 
 def test_over_one_step_both_losses_of_the_one_step_model_agree_but_for_units() -> None:
@@ -83,7 +88,10 @@ def test_a_multi_step_loss_is_the_error_of_a_rollout() -> None:
         model.features.fit(future.states)
         error = (rollout(model, past, future.actions) - future.states) / model.features.std
         torch.testing.assert_close(
-            getattr(model, loss)(seen, torch.Generator()), error.square().sum((1, 2)).mean(), rtol=1e-5, atol=1e-5
+            getattr(model, loss)(seen, torch.Generator()),
+            error.square().sum((1, 2)).mean(),
+            rtol=1e-5,
+            atol=1e-5,
         )
 
 
@@ -114,7 +122,12 @@ def futures(ensemble: Ensemble, n: int = 200) -> Tensor:
     """(n, 20, DX): as many samples of one future."""
     past, future = window(1, 20)
     one = Segment(past.states[:1].expand(n, -1, -1), past.actions[:1].expand(n, -1, -1))
-    return rollout(ensemble, one, future.actions[:1].expand(n, -1, -1), generator=torch.Generator().manual_seed(0))
+    return rollout(
+        ensemble,
+        one,
+        future.actions[:1].expand(n, -1, -1),
+        generator=torch.Generator().manual_seed(0),
+    )
 
 
 def test_an_ensemble_of_squared_errors_has_as_many_futures_as_members() -> None:
@@ -133,7 +146,9 @@ def test_every_member_gets_its_share_of_samples() -> None:
 
 def test_a_gaussian_ensemble_states_the_noise_of_its_world(gaussian: Ensemble) -> None:
     seen = window(1, 20, noise=NOISE, seed=5)
-    x, u = (part.flatten(0, 1).expand(5, -1, -1) for part in (states_before(seen), seen.future.actions))
+    x, u = (
+        part.flatten(0, 1).expand(5, -1, -1) for part in (states_before(seen), seen.future.actions)
+    )
     _, log_variance = gaussian.increments(x, u)
     stated = (0.5 * log_variance).exp() * gaussian.features.step_std
     torch.testing.assert_close(stated.mean((0, 1)), torch.full((DX,), NOISE), rtol=0.1, atol=0)
@@ -148,7 +163,9 @@ def test_the_noise_of_a_gaussian_ensemble_builds_up_along_a_rollout(gaussian: En
 
 def test_members_differ_where_there_were_no_data(gaussian: Ensemble) -> None:
     def disagreement(size: float) -> Tensor:
-        x = size * torch.randn(5, 1, DX, generator=torch.Generator().manual_seed(1)).expand(5, 100, DX)
+        x = size * torch.randn(5, 1, DX, generator=torch.Generator().manual_seed(1)).expand(
+            5, 100, DX
+        )
         mean, _ = gaussian.increments(x, torch.zeros(5, 100, DU))
         return mean.std(0).mean()
 

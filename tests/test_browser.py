@@ -20,11 +20,16 @@ import nbformat
 import numpy as np
 import pytest
 
-from tsmlib import figures
+from tsmlib import plots as figures
 
-BROWSER, DRIVER = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
+BROWSER, DRIVER = (
+    shutil.which("chromium") or shutil.which("google-chrome"),
+    shutil.which("chromedriver"),
+)
 
-pytestmark = pytest.mark.skipif(not (BROWSER and DRIVER), reason="neither Chromium nor its driver is installed")
+pytestmark = pytest.mark.skipif(
+    not (BROWSER and DRIVER), reason="neither Chromium nor its driver is installed"
+)
 pytest.importorskip("jupyterlab")
 
 
@@ -37,7 +42,9 @@ def free_port() -> int:
 @contextmanager
 def process(command: list[str], answers: str, **options: Any) -> Iterator[None]:
     """A server, from when ``answers`` does to the end of the block."""
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options)
+    server = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options
+    )
     try:
         wait_for(lambda: urllib.request.urlopen(answers, timeout=30).status == 200)
         yield
@@ -60,15 +67,23 @@ class Page:
     """A page in a browser without a window, by the WebDriver protocol."""
 
     def __init__(self, driver: str, folder: Path) -> None:
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-                 "--window-size=1440,900", f"--user-data-dir={folder}"]  # fmt: skip
+        flags = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--window-size=1440,900",
+            f"--user-data-dir={folder}",
+        ]
         asked = {"browserName": "chrome", "goog:chromeOptions": {"binary": BROWSER, "args": flags}}
         self.session = driver + "/session"
         self.session += "/" + self.ask("", capabilities={"alwaysMatch": asked})["sessionId"]
 
     def ask(self, path: str, **body: Any) -> Any:
         data, kind = json.dumps(body).encode(), {"Content-Type": "application/json"}
-        with urllib.request.urlopen(urllib.request.Request(self.session + path, data, kind), timeout=300) as answer:
+        with urllib.request.urlopen(
+            urllib.request.Request(self.session + path, data, kind), timeout=300
+        ) as answer:
             return json.load(answer)["value"]
 
     def script(self, text: str) -> Any:
@@ -77,7 +92,9 @@ class Page:
     def picture(self, selector: str) -> bytes:
         """What one element looks like."""
         (element,) = self.script(f"return document.querySelector('{selector}')").values()
-        with urllib.request.urlopen(f"{self.session}/element/{element}/screenshot", timeout=300) as answer:
+        with urllib.request.urlopen(
+            f"{self.session}/element/{element}/screenshot", timeout=300
+        ) as answer:
             return base64.b64decode(json.load(answer)["value"])
 
 
@@ -86,7 +103,9 @@ def write_notebook(path: Path) -> None:
     frames = np.zeros((30, 60, 80, 3), np.uint8)
     for step in range(30):
         frames[step, :, 2 * step : 2 * step + 20] = 250
-    video = base64.b64encode(figures.save_video(frames, path.with_suffix(".mp4")).read_bytes()).decode()
+    video = base64.b64encode(
+        figures.save_video(frames, path.with_suffix(".mp4")).read_bytes()
+    ).decode()
     source = f'<source src="data:video/mp4;base64,{video}" type="video/mp4">'
     data = {"image/png": base64.b64encode(figures.embed(frames, fps=10).data).decode()}
     markup = {"text/html": f"<video controls>{source}</video>"}
@@ -100,18 +119,33 @@ def test_a_film_moves_in_a_notebook_that_is_not_trusted(tmp_path: Path) -> None:
     write_notebook(tmp_path / "film.ipynb")
     lab, driver = (f"http://127.0.0.1:{free_port()}" for _ in range(2))
     places = {f"JUPYTER_{kind}_DIR": str(tmp_path / kind) for kind in ("DATA", "CONFIG", "RUNTIME")}
-    settings = [f"--ServerApp.port={lab.rpartition(':')[2]}", "--ServerApp.ip=127.0.0.1", "--IdentityProvider.token=",
-                f"--ServerApp.root_dir={tmp_path}", "--allow-root", "--no-browser"]  # fmt: skip
+    settings = [
+        f"--ServerApp.port={lab.rpartition(':')[2]}",
+        "--ServerApp.ip=127.0.0.1",
+        "--IdentityProvider.token=",
+        f"--ServerApp.root_dir={tmp_path}",
+        "--allow-root",
+        "--no-browser",
+    ]
     with (
-        process([sys.executable, "-m", "jupyterlab", *settings], lab + "/api", env={**os.environ, **places}),
+        process(
+            [sys.executable, "-m", "jupyterlab", *settings],
+            lab + "/api",
+            env={**os.environ, **places},
+        ),
         process([str(DRIVER), f"--port={driver.rpartition(':')[2]}"], driver + "/status"),
     ):
         page = Page(driver, tmp_path / "profile")
         page.ask("/url", url=lab + "/lab/tree/film.ipynb")
         area = "document.querySelector('.jp-OutputArea')"
-        assert wait_for(lambda: page.script(f"return {area}?.querySelector('img')?.naturalWidth")) == 80
+        assert (
+            wait_for(lambda: page.script(f"return {area}?.querySelector('img')?.naturalWidth"))
+            == 80
+        )
         wait_for(lambda: page.script(f"return {area}.querySelector('video') !== null"))
-        source = page.script(f"return {area}.querySelector('video source')?.getAttribute('src') ?? ''")
+        source = page.script(
+            f"return {area}.querySelector('video source')?.getAttribute('src') ?? ''"
+        )
         assert source == ""  # the notebook is not trusted
         shown = ".jp-OutputArea img"
         assert wait_for(lambda: page.picture(shown) != page.picture(shown), seconds=30)

@@ -53,7 +53,9 @@ def test_collected_episodes_are_the_simulators_rollouts(env_id: str) -> None:
     data = collect(env, open_loop(actions), horizon=12, seed=5)
     start, _ = env.reset(seed=5)
     np.testing.assert_array_equal(data.states[:, 0], start.astype(np.float32))
-    np.testing.assert_array_equal(data.states[:, 1:], env.unwrapped.rollout(actions.numpy()).astype(np.float32))
+    np.testing.assert_array_equal(
+        data.states[:, 1:], env.unwrapped.rollout(actions.numpy()).astype(np.float32)
+    )
     np.testing.assert_array_equal(data.actions, actions)
     arm = env.unwrapped
     assert (data.env, data.dt, data.names, data.angles) == (env_id, 0.02, tuple(arm.names), (0, 1))
@@ -95,7 +97,9 @@ def test_what_is_recorded_is_what_the_arm_received() -> None:
 
 @pytest.mark.parametrize("horizon", [0, -5])
 def test_a_horizon_without_steps_is_refused(horizon: int) -> None:
-    with pytest.raises(ValueError, match=f"horizon is {horizon}, expected a positive number of steps"):
+    with pytest.raises(
+        ValueError, match=f"horizon is {horizon}, expected a positive number of steps"
+    ):
         collect(arms(REACHER, 1), open_loop(torques(1, 5)), horizon=horizon)
 
 
@@ -103,7 +107,9 @@ def test_a_controller_without_an_answer_is_refused() -> None:
     def three_steps(past: Segment) -> Tensor:
         return torques(2, 3)[:, : 0 if past.actions.any() else 3]
 
-    with pytest.raises(ValueError, match="the controller gave no actions when asked at step 3 of 10"):
+    with pytest.raises(
+        ValueError, match="the controller gave no actions when asked at step 3 of 10"
+    ):
         collect(arms(REACHER, 2), three_steps, horizon=10, seed=0)
 
 
@@ -125,7 +131,10 @@ def test_torques_are_smooth_bounded_and_a_function_of_their_generator() -> None:
     assert drawn.diff(dim=1)[:, 20:].std() < 0.8 * drawn[:, 20:].std()
     now, later = drawn[:, 20:-1].flatten(), drawn[:, 21:].flatten()
     assert torch.corrcoef(torch.stack([now, later]))[0, 1] > 0.7
-    assert smooth_torques(500, 50, generator=torch.Generator().manual_seed(0), rms=2.0).abs().max() == 1
+    assert (
+        smooth_torques(500, 50, generator=torch.Generator().manual_seed(0), rms=2.0).abs().max()
+        == 1
+    )
     assert torch.equal(torques(5, 9), torques(5, 9))
     assert not torch.equal(torques(5, 9), torques(5, 9, seed=1))
 
@@ -166,9 +175,15 @@ def test_the_environments_reward_is_the_tasks(env: str) -> None:
 
 def test_a_reward_is_distance_and_torque_of_its_own_target() -> None:
     draw = torch.Generator().manual_seed(0)
-    states, actions = torch.randn(5, 3, 7, 10, generator=draw), torch.randn(5, 3, 7, 2, generator=draw)
+    states, actions = (
+        torch.randn(5, 3, 7, 10, generator=draw),
+        torch.randn(5, 3, 7, 2, generator=draw),
+    )
     target = torch.randn(3, 2, generator=draw)
-    for reward, at in ((rewards.reach(target, torque_weight=0.3), 4), (rewards.push(target, torque_weight=0.3), 6)):
+    for reward, at in (
+        (rewards.reach(target, torque_weight=0.3), 4),
+        (rewards.push(target, torque_weight=0.3), 6),
+    ):
         found = reward(states, actions)
         assert found.shape == (5, 3, 7)
         for c, b, t in ((0, 0, 0), (4, 2, 6), (1, 2, 3)):
@@ -185,11 +200,16 @@ def test_a_reward_has_a_finite_slope_at_its_target() -> None:
 
 @pytest.mark.parametrize("env", ["tsm/Reacher-v0", "tsm/ReacherPush-v1"])
 def test_random_torques_are_none_of_the_training_data(env: str) -> None:
-    known, task = torch.from_numpy(study.random_data(env, 200, seed=0).actions), study.load_task(env)
+    known, task = (
+        torch.from_numpy(study.random_data(env, 200, seed=0).actions),
+        study.load_task(env),
+    )
     torques = random_torques(task)
     assert (torques[:, None] - known[:, : task.horizon]).abs().amax((2, 3)).min() > 0.01
     of_data = smooth_torques(len(task), task.horizon, generator=torch.Generator().manual_seed(0))
-    assert not torch.allclose(torques, of_data)  # their noise, cut into episodes of the task's length
+    assert not torch.allclose(
+        torques, of_data
+    )  # their noise, cut into episodes of the task's length
 
 
 def test_the_gap_is_predicted_minus_true() -> None:
@@ -197,9 +217,13 @@ def test_the_gap_is_predicted_minus_true() -> None:
     actions = random_torques(task)
     predicted = torch.tensor([-1.0, -2.0, 0.0, 5.0])
     plan = Plan(
-        actions=actions, parameters=actions, states=torch.zeros(1, 4, 20, 6), predicted_return=predicted,
-        curve=predicted[None], seconds=1.0,
-    )  # fmt: skip
+        actions=actions,
+        parameters=actions,
+        states=torch.zeros(1, 4, 20, 6),
+        predicted_return=predicted,
+        curve=predicted[None],
+        seconds=1.0,
+    )
     trial, plain = execute(task, plan), execute(task, actions)
     torch.testing.assert_close(trial.executed_return, plain.executed_return)
     torch.testing.assert_close(trial.gap, predicted - plain.executed_return)
@@ -247,7 +271,7 @@ def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
     assert trial.observed is not None
     whole = Trajectories(
         trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, ("",) * 6, ("",) * 6
-    ).padded(10)  # fmt: skip
+    ).padded(10)
     assert len(seen) == 20
     for t, past in enumerate(seen):
         assert torch.equal(past.states, whole.states[:, t : t + 10])
@@ -255,7 +279,9 @@ def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
     np.testing.assert_array_equal(trial.states[:, 0], task.start)
 
 
-@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}, {"noise": NOISE, "delay": DELAY}])
+@pytest.mark.parametrize(
+    "how", [{"noise": NOISE}, {"delay": DELAY}, {"noise": NOISE, "delay": DELAY}]
+)
 def test_a_trial_of_an_imperfect_arm_can_be_repeated(how: dict[str, Any]) -> None:
     def brake(past: Segment) -> Tensor:
         return -0.02 * past.states[:, -1:, 2:4]
@@ -275,14 +301,20 @@ def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> 
     late = torch.cat([torch.zeros(4, DELAY, 2), actions], 1)[:, :20]
     assert torch.equal(trial.states, execute(some_task(env), late).states)
     assert torch.equal(trial.actions, actions)
-    charged = task.reward(trial.states[:, 1:], late).sum(-1)  # what arrives, as the environment's own reward
+    charged = task.reward(trial.states[:, 1:], late).sum(
+        -1
+    )  # what arrives, as the environment's own reward
     torch.testing.assert_close(trial.executed_return, charged)
     at_once = execute(some_task(env), actions)
-    assert torch.equal(trial.states[:, : DELAY + 1], execute(some_task(env), 0 * actions).states[:, : DELAY + 1])
+    assert torch.equal(
+        trial.states[:, : DELAY + 1], execute(some_task(env), 0 * actions).states[:, : DELAY + 1]
+    )
     assert not torch.allclose(trial.states, at_once.states, atol=1e-3)
 
 
-def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scored_by_true_states() -> None:
+def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scored_by_true_states() -> (
+    None
+):
     task, model = imperfect_task(noise=NOISE), Wrong()
     trial = mpc(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
     assert trial.observed is not None
@@ -306,17 +338,35 @@ def test_a_plan_that_is_never_made_again_is_executed_open_loop() -> None:
     open_loop = execute(task, trial.actions)
     assert torch.equal(trial.states, open_loop.states)
     torch.testing.assert_close(trial.executed_return, open_loop.executed_return)
-    torch.testing.assert_close(trial.plan.predicted_return, trial.executed_return)  # the simulator keeps its word
+    torch.testing.assert_close(
+        trial.plan.predicted_return, trial.executed_return
+    )  # the simulator keeps its word
     torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:])
 
 
-@pytest.mark.parametrize(("over", "every"), [("actions", 1), ("actions", 7), ("codes", 10), ("codes", 20)])
+@pytest.mark.parametrize(
+    ("over", "every"), [("actions", 1), ("actions", 7), ("codes", 10), ("codes", 20)]
+)
 def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int) -> None:
     torch.manual_seed(0)
-    task, prior = some_task(horizon=30), ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
-    space = LatentActions(prior.requires_grad_(False), 30) if over == "codes" else DirectActions(30, rms=0.3)
-    plan = cem(predictors.simulator_predictor(REACHER, task.start), task.reward, space, 4, candidates=12, elites=3,
-               iterations=2)  # fmt: skip
+    task, prior = (
+        some_task(horizon=30),
+        ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2)),
+    )
+    space = (
+        LatentActions(prior.requires_grad_(False), 30)
+        if over == "codes"
+        else DirectActions(30, rms=0.3)
+    )
+    plan = cem(
+        predictors.simulator_predictor(REACHER, task.start),
+        task.reward,
+        space,
+        4,
+        candidates=12,
+        elites=3,
+        iterations=2,
+    )
     trial = mpc(task, None, space, as_it_is, every=every, plan=plan)
     assert trial.plan is not None
     torch.testing.assert_close(trial.actions, plan.actions, rtol=1e-4, atol=1e-6)
@@ -346,7 +396,9 @@ class Wrong:
     past_len: int = 3
     asked: list[Segment] = dataclasses.field(default_factory=list)
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         self.asked.append(past)
         return past.states[:, -1:] + actions.cumsum(1).sum(-1, keepdim=True)
 
@@ -356,18 +408,24 @@ def test_of_a_hundred_steps_ten_plans_are_made_each_for_the_steps_that_are_left(
     prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2)).requires_grad_(False)
     made: list[tuple[SearchSpace, Tensor | int, Plan]] = []
 
-    def planner(predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int) -> Plan:
+    def planner(
+        predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int
+    ) -> Plan:
         plan = mppi(predict, reward, space, start, candidates=3, iterations=1)
         made.append((space, start, plan))
         return plan
 
     task = some_task(n=2, horizon=100)
     trial = mpc(task, None, LatentActions(prior, 100), planner, every=10)
-    assert [space.shape for space, _, _ in made] == [(10 - k, 8) for k in range(10)]  # a code for every ten steps
+    assert [space.shape for space, _, _ in made] == [
+        (10 - k, 8) for k in range(10)
+    ]  # a code for every ten steps
     assert [plan.actions.shape[1] for _, _, plan in made] == list(range(100, 0, -10))
     for (_, _, before), (_, start, _) in pairwise(made):
         assert isinstance(start, Tensor)
-        assert torch.equal(start[0], before.parameters[:, 1:])  # the codes that are left, as they were
+        assert torch.equal(
+            start[0], before.parameters[:, 1:]
+        )  # the codes that are left, as they were
     executed = torch.cat([plan.actions[:, :10] for _, _, plan in made], 1)
     assert torch.equal(trial.actions, executed)
 
@@ -383,7 +441,10 @@ def test_a_closed_loop_judges_its_candidates_by_what_it_is_told_to() -> None:
     planner = partial(mppi, candidates=3, iterations=1)
     mpc(task, model, DirectActions(20), planner, every=8, judge=judge, seed=5)  # type: ignore[arg-type]
     assert asked == [(5, 3), (21, 3), (37, 3)]  # other noise for each plan
-    assert {len(past.states) // 4 for past in model.asked} == {3, 32}  # a candidate's samples, and the fresh ones
+    assert {len(past.states) // 4 for past in model.asked} == {
+        3,
+        32,
+    }  # a candidate's samples, and the fresh ones
 
 
 def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
@@ -394,10 +455,16 @@ def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
     trial = mpc(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
     whole = Trajectories(
         trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
-    ).padded(3)  # fmt: skip
-    observed = {past.states[:4].numpy().tobytes() + past.actions[:4].numpy().tobytes() for past in model.asked}
+    ).padded(3)
+    observed = {
+        past.states[:4].numpy().tobytes() + past.actions[:4].numpy().tobytes()
+        for past in model.asked
+    }
     for now in (0, 8, 16):
-        expected = whole.states[:, now : now + 3].contiguous(), whole.actions[:, now : now + 3].contiguous()
+        expected = (
+            whole.states[:, now : now + 3].contiguous(),
+            whole.actions[:, now : now + 3].contiguous(),
+        )
         assert expected[0].numpy().tobytes() + expected[1].numpy().tobytes() in observed
 
 
@@ -408,7 +475,13 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
         return -(states[..., 5] - height).abs()  # fails on any other horizon
 
     task = some_task().with_reward("rise", rise)
-    trial = mpc(task, None, DirectActions(20, rms=0.3), partial(cem, candidates=24, elites=4, iterations=3), every=6)
+    trial = mpc(
+        task,
+        None,
+        DirectActions(20, rms=0.3),
+        partial(cem, candidates=24, elites=4, iterations=3),
+        every=6,
+    )
     assert trial.plan is not None
     torch.testing.assert_close(trial.plan.curve[-1], trial.executed_return, rtol=1e-3, atol=1e-4)
     assert (trial.executed_return > 0.7 * execute(task, zero_torques(task)).executed_return).all()
@@ -417,24 +490,35 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
 @pytest.mark.parametrize("over", ["actions", "codes"])
 @pytest.mark.parametrize(
     "build",
-    [partial(TSM, channels=8), partial(OneStep, hidden=16), partial(LSTM, hidden=16), partial(Ensemble, hidden=16),
-     partial(Ensemble, hidden=16, gaussian=False)],
+    [
+        partial(TSM, channels=8),
+        partial(OneStep, hidden=16),
+        partial(LSTM, hidden=16),
+        partial(Ensemble, hidden=16),
+        partial(Ensemble, hidden=16, gaussian=False),
+    ],
     ids=["tsm", "onestep", "lstm", "ensemble", "ensemble+mse"],
-)  # fmt: skip
+)
 def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
     torch.manual_seed(0)
     task, model = some_task(PUSH, n=2), build(10, 2)
     model.features.step_std.fill_(0.01)
     prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
-    planner = partial(adam, iterations=1, lr=0.1) if over == "codes" else partial(mppi, iterations=1, candidates=4)
+    planner = (
+        partial(adam, iterations=1, lr=0.1)
+        if over == "codes"
+        else partial(mppi, iterations=1, candidates=4)
+    )
     trial = mpc(task, model, space, planner, every=7)  # no multiple of the prior's segment
     assert trial.plan is not None
     assert trial.actions.shape == (2, 20, 2)
     assert trial.actions.abs().max() <= 1
     assert trial.plan.curve.shape == (3, 2)
     assert trial.plan.states.shape == (1, 2, 20, 10)
-    torch.testing.assert_close(execute(task, trial.actions).states, trial.states, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        execute(task, trial.actions).states, trial.states, rtol=1e-4, atol=1e-5
+    )
 
 
 def test_a_closed_loop_without_steps_is_refused() -> None:
@@ -476,7 +560,11 @@ def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
 def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
     for env in (REACHER, PUSH):
         plain, task = study.load_task(env, split), study.load_task(imperfect(env, **how), split)
-        assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (plain.name, plain.horizon, env)
+        assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (
+            plain.name,
+            plain.horizon,
+            env,
+        )
         assert task.env != env
         np.testing.assert_array_equal(task.start, plain.start)
         assert torch.equal(task.target, plain.target)
@@ -484,7 +572,9 @@ def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: st
 
 def test_pushing_without_an_object_is_refused() -> None:
     with pytest.raises(ValueError, match=f"there is nothing to push in {REACHER}"):
-        dataclasses.replace(some_task(), name="push", reward_for=rewards.push, position=rewards.BLOCK)
+        dataclasses.replace(
+            some_task(), name="push", reward_for=rewards.push, position=rewards.BLOCK
+        )
 
 
 def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.policies.learning import LearningOptions, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
-from tsmlib.study import runs, zoo
+from tsmlib import zoo
 from tsmlib.training.fit import TrainingOptions, fit, fixed_windows
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
@@ -56,10 +56,14 @@ def on(place: str, make: Callable[[str], T]) -> T:
 def agree(found: Tensor, expected: Tensor, device: str) -> bool:
     """On the same device, and equal up to rounding: the same, imitated, or that of a real accelerator."""
     close = 1e-6 if device == DEVICE else 1e-3
-    return found.device == expected.device and torch.allclose(found, expected, rtol=close, atol=close)
+    return found.device == expected.device and torch.allclose(
+        found, expected, rtol=close, atol=close
+    )
 
 
-@pytest.fixture(params=["tsm", "tsm, state skip", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"])
+@pytest.fixture(
+    params=["tsm", "tsm, state skip", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"]
+)
 def case(request: pytest.FixtureRequest) -> Case:
     return MODELS[request.param]
 
@@ -97,9 +101,15 @@ def test_a_model_trained_on_it_comes_back_the_same(case: Case, device: str) -> N
         def trained(place: str, loss: str = loss) -> tuple[Tensor, Tensor]:
             model = case.model(torch.float32)
             curve = fit(
-                model, getattr(model, loss), data, held_out,
-                TrainingOptions(model.past_len, 10, steps=2, batch_size=4, validate_every=2, warmup=0), device=place,
-            )  # fmt: skip
+                model,
+                getattr(model, loss),
+                data,
+                held_out,
+                TrainingOptions(
+                    model.past_len, 10, steps=2, batch_size=4, validate_every=2, warmup=0
+                ),
+                device=place,
+            )
             return torch.tensor([curve.train, curve.validation]), weights(model)
 
         (there, found), (here, expected) = on(device, trained), on(PROCESSOR, trained)
@@ -110,7 +120,9 @@ def test_a_model_trained_on_it_comes_back_the_same(case: Case, device: str) -> N
 
 
 @pytest.mark.filterwarnings("ignore:for .* to a meta parameter")  # which would have no numbers
-def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, tmp_path: Path) -> None:
+def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(
+    device: str, tmp_path: Path
+) -> None:
     data, held_out = episodes(MODELS["tsm"], 12, 0), episodes(MODELS["tsm"], 4, 1)
 
     def trained(*places: str) -> dict[str, Tensor]:
@@ -129,10 +141,14 @@ def test_a_training_that_stopped_on_it_goes_on_there_or_elsewhere(device: str, t
 
             def run(place: str, model: Any = model, loss: Any = loss) -> None:
                 fit(
-                    model, loss, data, held_out,
+                    model,
+                    loss,
+                    data,
+                    held_out,
                     TrainingOptions(10, 10, steps=4, batch_size=8, validate_every=2, warmup=0),
-                    checkpoint=folder, device=place,
-                )  # fmt: skip
+                    checkpoint=folder,
+                    device=place,
+                )
 
             with suppress(KeyboardInterrupt):
                 on(place, run)
@@ -154,7 +170,10 @@ def test_a_model_there_is_rolled_out_from_here(case: Case, device: str) -> None:
 
     def imagined(place: str) -> list[Tensor]:
         model.to(place)
-        return [rollout(model, past, actions, generator=g) for g in (None, torch.Generator().manual_seed(0))]
+        return [
+            rollout(model, past, actions, generator=g)
+            for g in (None, torch.Generator().manual_seed(0))
+        ]
 
     here, there = on(PROCESSOR, imagined), on(device, imagined)
     assert all(agree(a, b, device) for a, b in zip(there, here, strict=True))
@@ -167,26 +186,33 @@ def test_it_scores_as_the_processor_does(case: Case, device: str) -> None:
     def scores(place: str) -> prediction.Scores:
         return prediction.score(
             case.model(torch.float32).to(place), features, data, held_out, samples=3, horizon=20
-        )  # fmt: skip
+        )
 
     there, here = on(device, scores), on(PROCESSOR, scores)
     assert all(agree(there.values[metric], here.values[metric], device) for metric in here.values)
 
 
-@pytest.mark.parametrize("planner", [partial(adam, iterations=1), partial(cem, candidates=4, elites=2, iterations=1)])
+@pytest.mark.parametrize(
+    "planner", [partial(adam, iterations=1), partial(cem, candidates=4, elites=2, iterations=1)]
+)
 @pytest.mark.parametrize("over", ["codes", "actions"])
 def test_it_finds_the_same_plan(planner: Planner, over: str, device: str) -> None:
     start = motion(MODELS["tsm"], TARGETS, 2).states[:, 0].float()
 
     def found(place: str) -> tuple[Tensor, ...]:
         model, prior = new_model().to(place), new_prior().float().to(place)
-        space: SearchSpace = LatentActions(prior, HORIZON) if over == "codes" else DirectActions(HORIZON)
+        space: SearchSpace = (
+            LatentActions(prior, HORIZON) if over == "codes" else DirectActions(HORIZON)
+        )
         predict = model_predictor(model, initial_past(start, model.past_len, DU), samples=2)
         plan = planner(predict, to_the_origin, space, TARGETS)
         left, parameters = space.after(plan.parameters, 7)  # what a closed loop goes on from
         return plan.actions, plan.predicted_return, left.decode(parameters[None])
 
-    assert all(agree(there, here, device) for there, here in zip(on(device, found), on(PROCESSOR, found), strict=True))
+    assert all(
+        agree(there, here, device)
+        for there, here in zip(on(device, found), on(PROCESSOR, found), strict=True)
+    )
 
 
 @pytest.mark.parametrize("through", ["codes", "actions"])
@@ -204,7 +230,9 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
             policy = OneStepPolicy(6, DU, angles=(0, 1), copies=2)
 
         def draw(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-            return starts[torch.randint(8, (n,), generator=generator)], torch.randn(n, 2, generator=generator)
+            return starts[torch.randint(8, (n,), generator=generator)], torch.randn(
+                n, 2, generator=generator
+            )
 
         model, options = new_model(), LearningOptions(horizon=12, iterations=2, episodes=3)
         learn_policy(policy.to(place), model.to(place), reward, draw, options)
@@ -223,11 +251,18 @@ def test_a_model_and_a_prior_there_are_scored_as_they_are_here(device: str) -> N
     actions, window = torch.from_numpy(test.actions[:, :20]), fixed_windows(test, 10, 10)
 
     def scored(place: str) -> dict[str, Tensor]:
-        model, prior, generator = new_model().to(place), new_prior().float().to(place), torch.Generator().manual_seed(0)
-        return prediction.score(model, model.features, test, validation, samples=2, horizon=10).values | {
-            "sampled": sample_actions(prior, 2, 20, generator), "reconstructed": reconstruct(prior, actions),
+        model, prior, generator = (
+            new_model().to(place),
+            new_prior().float().to(place),
+            torch.Generator().manual_seed(0),
+        )
+        return prediction.score(
+            model, model.features, test, validation, samples=2, horizon=10
+        ).values | {
+            "sampled": sample_actions(prior, 2, 20, generator),
+            "reconstructed": reconstruct(prior, actions),
             "rebuilt": torch.tensor(rebuilt(prior, window)),
-        }  # fmt: skip
+        }
 
     there, here = on(device, scored), on(PROCESSOR, scored)
     for name, expected in here.items():
@@ -252,15 +287,23 @@ def test_what_study_makes_there_is_what_it_makes_here(
             study.plan(run, task, study.method("onestep", "latent", "cem")),
             study.plan(run, task, study.method("onestep", "direct", "adam+starts"), every=25),
         ]
-        later = study.along_the_way(run, task, study.method("onestep", "direct", "adam"), iterations=1, at=[1])[1].plan
+        later = study.along_the_way(
+            run, task, study.method("onestep", "direct", "adam"), iterations=1, at=[1]
+        )[1].plan
         assert later is not None
-        policy, header = study.learn(run, task, study.method("onestep", "direct", "policy"), study.Budget(2, 1))
+        policy, header = study.learn(
+            run, task, study.method("onestep", "direct", "policy"), study.Budget(2, 1)
+        )
         assert header["device"] == place
-        assessed = study.policies.assess(policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0)
+        assessed = study.policies.assess(
+            policy, study.load_or_train(run, REACHER, "onestep")[0], task, seed=0
+        )
         return (
-            *(plan.actions for plan in plans), *(plan.predicted_return for plan in (*plans, later)),
-            *study.scores(run, REACHER, "onestep").values.values(), *assessed.values(),
-        )  # fmt: skip
+            *(plan.actions for plan in plans),
+            *(plan.predicted_return for plan in (*plans, later)),
+            *study.scores(run, REACHER, "onestep").values.values(),
+            *assessed.values(),
+        )
 
     for there, here in zip(on(device, made), on(PROCESSOR, made), strict=True):
         assert there.device.type == PROCESSOR

@@ -12,17 +12,27 @@ import yaml
 
 import tsmlib
 from tsmlib.storage import tables
-from tsmlib.study import pages, publish
-from tsmlib.study.runs import ROOT
+from reproduction import pages, publish
+from reproduction.runs import ROOT
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 BUILT = DOCS / "_build" / "html"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-LOADED = re.compile(r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=[\"'](?:https?:)?//[^>]*>")
+LOADED = re.compile(
+    r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=[\"'](?:https?:)?//[^>]*>"
+)
 WRITTEN = [page for page in sorted(DOCS.rglob("*.md")) if "_build" not in page.parts]
-OPTIONAL = {"mbrl_lib": "mbrl.models", "own_data": "minari"}  # page -> what its program needs that may be missing
+OPTIONAL = {
+    "mbrl_lib": "mbrl.models",
+    "own_data": "minari",
+}  # page -> what its program needs that may be missing
 COMMAND = re.compile(r"\bpython ((?:-m tsmlib|benchmarks/)[^`\n]*)")
-COMMANDING = [README, ROOT / "CONTRIBUTING.md", *WRITTEN, *sorted((ROOT / "benchmarks").glob("*/README.md"))]
+COMMANDING = [
+    README,
+    ROOT / "CONTRIBUTING.md",
+    *WRITTEN,
+    *sorted((ROOT / "benchmarks").glob("*/README.md")),
+]
 PAGES = [
     page for page in WRITTEN if BLOCK.search(page.read_text()) and page.stem != "own_data"
 ]  # which has its own test
@@ -38,7 +48,9 @@ def run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, 
 
 
 def test_the_page_on_reproducing_has_a_command_for_every_table_that_ships() -> None:
-    (block,) = re.findall(r"^rows=.*?^```", (DOCS / "reproducing.md").read_text(), re.DOTALL | re.MULTILINE)
+    (block,) = re.findall(
+        r"^rows=.*?^```", (DOCS / "reproducing.md").read_text(), re.DOTALL | re.MULTILINE
+    )
     shipped = {path.name.partition(".")[0] for path in publish.RESULTS.glob("*.csv*")}
     assert not [name for name in sorted(shipped) if not re.search(rf"\b{name}\b", block)]
 
@@ -55,16 +67,22 @@ def test_the_plans_in_the_readme_are_far_better_than_doing_nothing(
     predicted = -names["plan"].predicted_return.mean()
     cost, nothing = (-names[name].executed_return.mean() for name in ("trial", "idle"))
     assert cost <= 0.6 * nothing
-    assert abs(cost - predicted) <= 0.1 * cost  # as predicted by samples that had no part in choosing the plan
+    assert (
+        abs(cost - predicted) <= 0.1 * cost
+    )  # as predicted by samples that had no part in choosing the plan
     assert (tmp_path / "reach.mp4").stat().st_size > 1000
     first, _ = BLOCK.findall(README.read_text())
-    exec(first[first.index("past, space =") :], names)  # again, for the other target by the other model
+    exec(
+        first[first.index("past, space =") :], names
+    )  # again, for the other target by the other model
     cost, nothing = (-names[name].executed_return.mean() for name in ("trial", "idle"))
     assert cost <= 0.6 * nothing
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_the_program_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_program_of_a_page_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip(OPTIONAL.get(page.stem, "tsmlib"))
     run(page, tmp_path, monkeypatch)
 
@@ -83,7 +101,12 @@ def test_a_plan_made_from_logs_alone_takes_the_cart_to_its_goal(
 
 @pytest.mark.parametrize(
     "page",
-    [README, *sorted(DOCS.glob("[!_]*.md")), *sorted(DOCS.glob("[!_]*/*.md")), ROOT / "CONTRIBUTING.md"],
+    [
+        README,
+        *sorted(DOCS.glob("[!_]*.md")),
+        *sorted(DOCS.glob("[!_]*/*.md")),
+        ROOT / "CONTRIBUTING.md",
+    ],
     ids=str,
 )
 def test_a_page_names_commands_and_files_that_exist(page: Path) -> None:
@@ -96,7 +119,9 @@ def test_a_page_names_commands_and_files_that_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", COMMANDING, ids=str)
 def test_a_command_of_a_page_is_a_script_that_has_its_options(page: Path) -> None:
-    text = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), page.read_text())  # unwrapped
+    text = re.sub(
+        r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), page.read_text()
+    )  # unwrapped
     lines = text.replace("\\\n", " ").splitlines()
     for command in [found for line in lines for found in COMMAND.findall(line)]:
         script, *words = re.split(" -- | #", command)[0].split()
@@ -164,23 +189,37 @@ def test_a_notebook_is_shown_as_it_was_executed_unless_it_has_changed_since(
     assert "what came out" not in str(shown)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem
+)
 def test_no_notebook_links_to_a_local_picture(path: Path) -> None:
     cells = [cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown"]
     assert not re.findall(r"!\[[^\]]*\]\((?!https:)[^)]+\)", "\n".join(cells))
 
 
-@pytest.mark.parametrize("page", sorted((DOCS / "explanation").glob("*.md")), ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", sorted((DOCS / "explanation").glob("*.md")), ids=lambda page: page.stem
+)
 def test_the_equation_that_a_piece_of_code_is_stands_above_it(page: Path) -> None:
-    above = re.split(r"^```\{literalinclude\}[^`]*^```\n", page.read_text(), flags=re.MULTILINE)[:-1]
+    above = re.split(r"^```\{literalinclude\}[^`]*^```\n", page.read_text(), flags=re.MULTILINE)[
+        :-1
+    ]
     for text in above:
-        assert "$$" in text.rpartition("\n## ")[2] or not text.strip(), text  # or it shares the one before
+        assert "$$" in text.rpartition("\n## ")[2] or not text.strip(), (
+            text
+        )  # or it shares the one before
 
 
-def test_gradients_over_codes_leave_smaller_gaps_and_return_less_as_the_page_on_the_prior_says() -> None:
+def test_gradients_over_codes_leave_smaller_gaps_and_return_less_as_the_page_on_the_prior_says() -> (
+    None
+):
     rows = tables.load(ROOT / "data" / "results" / "05_control.csv")
-    rows = rows[(rows["planner"] == "adam") & (rows["execution"] == "open loop") & rows["iteration"].isna()]
-    found = rows.pivot_table(index=["env", "model"], columns=["metric", "search_space"], values="value")
+    rows = rows[
+        (rows["planner"] == "adam") & (rows["execution"] == "open loop") & rows["iteration"].isna()
+    ]
+    found = rows.pivot_table(
+        index=["env", "model"], columns=["metric", "search_space"], values="value"
+    )
     found = found[["gap_absolute", "return_true"]].dropna()
     assert len(found) >= 7  # the baselines' plans of reaching are direct alone
     assert (found["gap_absolute"]["latent"] < found["gap_absolute"]["direct"]).all()
@@ -195,9 +234,13 @@ def test_codes_tell_futures_apart_where_the_object_is_hit_and_not_where_it_is_mi
     assert hit.min() > 1.0
 
 
-def test_by_the_cross_entropy_method_both_search_spaces_return_about_the_same_as_that_page_says() -> None:
+def test_by_the_cross_entropy_method_both_search_spaces_return_about_the_same_as_that_page_says() -> (
+    None
+):
     rows = tables.load(ROOT / "data" / "results" / "05_control.csv")
-    rows = rows[(rows["planner"] == "cem") & (rows["execution"] == "open loop") & rows["iteration"].isna()]
+    rows = rows[
+        (rows["planner"] == "cem") & (rows["execution"] == "open loop") & rows["iteration"].isna()
+    ]
     found = rows[rows["metric"] == "return_true"].pivot_table(
         index=["env", "model"], columns="search_space", values="value"
     )

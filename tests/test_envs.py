@@ -41,7 +41,9 @@ def torques(n: int = N, steps: int = T, seed: int = 0) -> np.ndarray:
 def test_gymnasium_finds_no_fault(env_id: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*Box observation space (minimum|maximum) value is.*")
+        warnings.filterwarnings(
+            "ignore", message=".*Box observation space (minimum|maximum) value is.*"
+        )
         warnings.filterwarnings("ignore", message=".*MuJoCo cannot render here.*")
         check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped)
 
@@ -70,11 +72,15 @@ def test_the_block_starts_within_reach_and_clear_of_the_arm(env_id: str) -> None
     np.testing.assert_array_equal(states[:, 8:], 0)
 
 
-def test_arms_begin_stretched_out_along_x_but_in_every_direction_where_they_push(env_id: str) -> None:
+def test_arms_begin_stretched_out_along_x_but_in_every_direction_where_they_push(
+    env_id: str,
+) -> None:
     angles = arms(env_id, 300).reset(seed=0)[0][:, :2]
     for joint, most in zip(angles.T, START_ANGLES[EnvSpec.parse(env_id).task], strict=True):
         assert 0.95 * most < np.abs(joint).max() <= most
-        assert np.abs(np.histogram(joint, 6, (-most, most))[0] - 50).max() < 25  # uniform: 50 each, give or take 6.5
+        assert (
+            np.abs(np.histogram(joint, 6, (-most, most))[0] - 50).max() < 25
+        )  # uniform: 50 each, give or take 6.5
 
 
 def test_targets_lie_in_the_tasks_ring_uniformly_over_its_area(env_id: str) -> None:
@@ -157,7 +163,10 @@ def test_rewards_and_the_limit_of_time_go_on_from_a_snapshot_too(env_id: str) ->
     other.reset(seed=99)
     other.set_state(env.get_state())
     for over in (False, True):
-        (_, reward, _, truncated, info), (_, again, _, ended, found) = env.step(nothing), other.step(nothing)
+        (_, reward, _, truncated, info), (_, again, _, ended, found) = (
+            env.step(nothing),
+            other.step(nothing),
+        )
         np.testing.assert_array_equal(again, reward)
         np.testing.assert_array_equal(found["target"], info["target"])
         assert (truncated == over).all()
@@ -204,7 +213,9 @@ def test_bad_input_is_refused_by_name(env_id: str) -> None:
     env.reset(options={"states": start})
     with pytest.raises(ValueError, match="episode 3, step 17"):
         env.rollout(actions)
-    np.testing.assert_array_equal(env.rollout(torques()), expected)  # nothing was simulated in between
+    np.testing.assert_array_equal(
+        env.rollout(torques()), expected
+    )  # nothing was simulated in between
     with pytest.raises(ValueError, match=r"expected \(N=12, T, 2\)"):
         env.rollout(torques()[:5])
     with pytest.raises(ValueError, match="'states'.*expected"):

@@ -37,7 +37,9 @@ class Linear:
     def loss(self, window: Window, generator: Noise) -> Tensor:
         raise NotImplementedError
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         x, states = past.states[:, -1], []
         for u in actions.unbind(1):
             x = KEEP * x + u
@@ -56,7 +58,9 @@ class Mode(Linear):
 
     stochastic = False
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         assert generator is None
         return super().predict_segment(past, actions)
 
@@ -65,9 +69,17 @@ def episodes(n: int = N, seed: int = 0) -> Trajectories:
     rng = np.random.default_rng(seed)
     states, actions = rng.normal(size=(n, T + 1, 2)), rng.uniform(-1, 1, (n, T, 2))
     for t in range(T):
-        states[:, t + 1] = KEEP.numpy() * states[:, t] + actions[:, t] + NOISE * rng.normal(size=(n, 2))
+        states[:, t + 1] = (
+            KEEP.numpy() * states[:, t] + actions[:, t] + NOISE * rng.normal(size=(n, 2))
+        )
     return Trajectories(
-        states.astype(np.float32), actions.astype(np.float32), "tsm/Linear-v0", 0.02, ("a", "b"), ("m", "m"), ()
+        states.astype(np.float32),
+        actions.astype(np.float32),
+        "tsm/Linear-v0",
+        0.02,
+        ("a", "b"),
+        ("m", "m"),
+        (),
     )
 
 
@@ -143,7 +155,9 @@ class Strays(Mode):
 
 def test_two_ways_of_running_a_model_that_disagree_are_told() -> None:
     past = Segment(torch.zeros(4, PAST, 2), torch.zeros(4, PAST, 2))
-    window = Window(past, Segment(torch.zeros(4, 8, 2), torch.zeros(4, 8, 2)))  # at rest, and no torque
+    window = Window(
+        past, Segment(torch.zeros(4, 8, 2), torch.zeros(4, 8, 2))
+    )  # at rest, and no torque
     assert prediction.ways_apart(Strays(), window)["steps"] == pytest.approx(0.1)
     apart = prediction.ways_apart(TSM(2, 2, angles=(), channels=8, segment_len=8), window)
     assert list(apart) == ["steps", "teacher forcing"]
@@ -172,7 +186,9 @@ def test_every_model_starts_from_the_same_step_however_little_past_it_needs() ->
 
 
 def test_segments_start_from_the_true_past() -> None:
-    samples, truth = predicted_and_true(Mode(), episodes(6), samples=1, horizon=5, starts=(5, 10, 20))
+    samples, truth = predicted_and_true(
+        Mode(), episodes(6), samples=1, horizon=5, starts=(5, 10, 20)
+    )
     assert truth.shape == (18, 5, 2)
     for row, start in ((0, 5), (1, 10), (2, 20), (17, 20)):
         states, actions = episodes(6).states[row // 3], episodes(6).actions[row // 3]
@@ -182,21 +198,29 @@ def test_segments_start_from_the_true_past() -> None:
 
 
 def test_the_same_seed_draws_the_same_samples() -> None:
-    first, second, other = (draw(Linear(), episodes(5), samples=3, seed=seed)[0] for seed in (0, 0, 1))
+    first, second, other = (
+        draw(Linear(), episodes(5), samples=3, seed=seed)[0] for seed in (0, 0, 1)
+    )
     assert torch.equal(first, second)
     assert not torch.equal(first, other)
     assert not torch.equal(first[0], first[1])
 
 
-@pytest.mark.parametrize("options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(0,))])
+@pytest.mark.parametrize(
+    "options", [dict(horizon=HORIZON + 1, starts=(PAST,)), dict(horizon=5, starts=(0,))]
+)
 def test_a_horizon_that_does_not_fit_is_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"at least one step is observed first, and episodes have {T}"):
+    with pytest.raises(
+        ValueError, match=f"at least one step is observed first, and episodes have {T}"
+    ):
         predicted_and_true(Linear(), episodes(3), samples=1, **options)
 
 
 def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_repeated() -> None:
     class Recorder(Linear):
-        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Any = None) -> Tensor:
+        def predict_segment(
+            self, past: Segment, actions: Tensor, *, generator: Any = None
+        ) -> Tensor:
             seen.append(past)
             return super().predict_segment(past, actions, generator=generator)
 
@@ -204,7 +228,9 @@ def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_r
     data = episodes(3)
     predicted_and_true(Recorder(), data, samples=1, horizon=5, starts=(2,))
     states, actions = seen[0]
-    assert torch.equal(states[:3, : PAST - 2], torch.from_numpy(data.states[:, :1]).expand(-1, PAST - 2, -1))
+    assert torch.equal(
+        states[:3, : PAST - 2], torch.from_numpy(data.states[:, :1]).expand(-1, PAST - 2, -1)
+    )
     assert torch.equal(states[:3, PAST - 2 :], torch.from_numpy(data.states[:, 1:3]))
     assert not actions[:3, : PAST - 2].any()
     assert torch.equal(actions[:3, PAST - 2 :], torch.from_numpy(data.actions[:, :2]))
@@ -214,10 +240,25 @@ def test_a_model_that_looks_further_back_than_is_observed_sees_the_first_state_r
     ("features", "validation", "samples", "message"),
     [
         (FEATURES, {}, 0, "samples is 0, expected at least 1"),
-        (FEATURES, dict(env="tsm/Other-v0"), 2, "test data have env 'tsm/Linear-v0', validation data 'tsm/Other-v0'"),
+        (
+            FEATURES,
+            dict(env="tsm/Other-v0"),
+            2,
+            "test data have env 'tsm/Linear-v0', validation data 'tsm/Other-v0'",
+        ),
         (FEATURES, dict(dt=0.01), 2, "test data have dt 0.02, validation data 0.01"),
-        (Features(3, ()), {}, 2, "the model's states have 3 dimensions with angles \\[\\], those of tsm/Linear-v0 2"),
-        (Features(2, (0,)), {}, 2, "with angles \\[0\\], those of tsm/Linear-v0 2 with angles \\[\\]"),
+        (
+            Features(3, ()),
+            {},
+            2,
+            "the model's states have 3 dimensions with angles \\[\\], those of tsm/Linear-v0 2",
+        ),
+        (
+            Features(2, (0,)),
+            {},
+            2,
+            "with angles \\[0\\], those of tsm/Linear-v0 2 with angles \\[\\]",
+        ),
     ],
 )
 def test_what_does_not_belong_together_is_not_scored(
@@ -225,7 +266,12 @@ def test_what_does_not_belong_together_is_not_scored(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         prediction.score(
-            Linear(), features, episodes(3), replace(episodes(3, seed=1), **validation), samples=samples, **OPEN
+            Linear(),
+            features,
+            episodes(3),
+            replace(episodes(3, seed=1), **validation),
+            samples=samples,
+            **OPEN,
         )
 
 
@@ -234,20 +280,32 @@ def test_scores_are_in_units_of_the_training_data_without_what_never_moves() -> 
     still = np.full_like(data.states[..., :1], 3.0)
     names = ("a", "b", "still")
     data = Trajectories(
-        np.concatenate([100 * data.states, still], -1), data.actions, data.env, data.dt, names, ("cm", "cm", "m"), ()
+        np.concatenate([100 * data.states, still], -1),
+        data.actions,
+        data.env,
+        data.dt,
+        names,
+        ("cm", "cm", "m"),
+        (),
     )
     features = Features(3, ()).fit(torch.from_numpy(data.states))
 
     class Copy(Linear):
         """Predicts that nothing changes."""
 
-        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        def predict_segment(
+            self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+        ) -> Tensor:
             return past.states[:, -1:].expand(-1, actions.shape[1], -1)
 
     scores = prediction.score(Copy(), features, data, data, samples=2, **OPEN)
     assert scores.pit.shape == (50, HORIZON, 2)
-    in_cm = (data.states[:, PAST + 1 :, :2] - data.states[:, PAST : PAST + 1, :2]) / data.states[..., :2].std((0, 1))
-    np.testing.assert_allclose(scores.against_horizon()["nrmse"], np.sqrt((in_cm**2).mean((0, 2))), rtol=0.01)
+    in_cm = (data.states[:, PAST + 1 :, :2] - data.states[:, PAST : PAST + 1, :2]) / data.states[
+        ..., :2
+    ].std((0, 1))
+    np.testing.assert_allclose(
+        scores.against_horizon()["nrmse"], np.sqrt((in_cm**2).mean((0, 2))), rtol=0.01
+    )
 
 
 # Likelihoods ---------------------------------------------------------------------------------------------------------
@@ -277,7 +335,9 @@ def test_the_shared_likelihood_is_the_analytic_one(
 def test_the_likelihood_with_a_variance_per_step_and_dimension_is_the_analytic_one(
     predicted: tuple[Tensor, Tensor], values: dict[str, Tensor], fitted: Fitted, mean: Tensor
 ) -> None:
-    torch.testing.assert_close(fitted.horizon, predictive_variance(), rtol=0.35, atol=0)  # 300 trajectories: sd 8 %
+    torch.testing.assert_close(
+        fitted.horizon, predictive_variance(), rtol=0.35, atol=0
+    )  # 300 trajectories: sd 8 %
     assert (fitted.horizon / predictive_variance()).mean() == pytest.approx(1.0, abs=0.1)
     exact = gaussian(predicted[1] - mean, predictive_variance())
     assert values["ll_horizon"].mean() == pytest.approx(exact.mean().item(), abs=0.03)
@@ -291,26 +351,37 @@ def test_the_floor_of_a_model_without_noise_is_its_error() -> None:
 
 
 def test_residual_noise_is_told_apart_from_the_spread_of_the_samples() -> None:
-    samples, truth = 0.8 * normal(200, 4000, 1, 2), math.hypot(0.8, 0.6) * normal(4000, 1, 2, seed=1)
+    samples, truth = (
+        0.8 * normal(200, 4000, 1, 2),
+        math.hypot(0.8, 0.6) * normal(4000, 1, 2, seed=1),
+    )
     own = scoring.fit_own(samples, truth)
     torch.testing.assert_close(own, torch.full((1, 2), 0.36), rtol=0.3, atol=0)
     exact = gaussian(truth, torch.ones(2)).mean()
     assert scoring.ll_own(samples, truth, own).mean() == pytest.approx(exact.item(), abs=0.02)
     for share in (0.7, 1.4):
-        assert scoring.ll_own(samples, truth, share * own).mean() < scoring.ll_own(samples, truth, own).mean()
+        assert (
+            scoring.ll_own(samples, truth, share * own).mean()
+            < scoring.ll_own(samples, truth, own).mean()
+        )
 
 
 def test_the_own_density_of_the_system_is_the_analytic_one(
     predicted: tuple[Tensor, Tensor], values: dict[str, Tensor], mean: Tensor
 ) -> None:
     exact = gaussian(predicted[1] - mean, predictive_variance())
-    assert values["ll_own"].mean() == pytest.approx(exact.mean().item(), abs=0.05)  # a mixture of 400 loses 0.03
+    assert values["ll_own"].mean() == pytest.approx(
+        exact.mean().item(), abs=0.05
+    )  # a mixture of 400 loses 0.03
 
 
 def test_thirty_iterations_are_enough() -> None:
     samples, truth = normal(100, 200, 1, 4), 1.1 * normal(200, 1, 4, seed=1)
     short, long = (scoring.fit_own(samples, truth, iterations=n) for n in (30, 200))
-    assert scoring.ll_own(samples, truth, long).mean() - scoring.ll_own(samples, truth, short).mean() < 0.01
+    assert (
+        scoring.ll_own(samples, truth, long).mean() - scoring.ll_own(samples, truth, short).mean()
+        < 0.01
+    )
 
 
 def test_two_modes_are_told_from_one_in_between() -> None:
@@ -318,7 +389,9 @@ def test_two_modes_are_told_from_one_in_between() -> None:
     samples = torch.where(normal(100, 600, 1, 1, seed=1) > 0, 1.0, -1.0)
     truth = side + 0.1 * normal(600, 1, 1, seed=2)
     scores = measured(samples, truth, scoring.fit(samples, truth, copies=1))
-    exact = math.log(0.5) - 0.5 * (1 + math.log(2 * math.pi * 0.1**2))  # half a nat of Gaussian, and which side
+    exact = math.log(0.5) - 0.5 * (
+        1 + math.log(2 * math.pi * 0.1**2)
+    )  # half a nat of Gaussian, and which side
     assert scores["ll_own"].mean() == pytest.approx(exact, abs=0.05)
     assert scores["ll_own"].mean() > scores["ll_paper"].mean() + 1
 
@@ -359,10 +432,14 @@ def test_energy_score_and_crps_are_those_of_a_double_loop() -> None:
 
 def test_a_few_shifts_of_many_samples_are_unbiased() -> None:
     samples, truth = normal(8, 20_000, 1, 3), normal(20_000, 1, 3, seed=1)
-    for fast, slow in zip(scoring.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True):
+    for fast, slow in zip(
+        scoring.distances(samples, truth, shifts=2), slow_distances(samples, truth), strict=True
+    ):
         difference = (fast - slow)[:, 0]
         assert difference.std() > 0.01
-        assert difference.mean() == pytest.approx(0, abs=4 * difference.std().item() / math.sqrt(20_000))
+        assert difference.mean() == pytest.approx(
+            0, abs=4 * difference.std().item() / math.sqrt(20_000)
+        )
 
 
 def test_the_scores_of_a_normal_are_its_crps() -> None:
@@ -382,7 +459,9 @@ def test_the_true_distribution_scores_best(predicted: tuple[Tensor, Tensor]) -> 
     centre = samples.mean(0)
     best = scoring.distances(samples, truth)
     for width in (0.5, 2.0):
-        for score, other in zip(best, scoring.distances(centre + width * (samples - centre), truth), strict=True):
+        for score, other in zip(
+            best, scoring.distances(centre + width * (samples - centre), truth), strict=True
+        ):
             assert other.mean() > score.mean()
 
 
@@ -392,15 +471,23 @@ def test_residual_noise_makes_a_forecast_of_a_point() -> None:
     fitted = scoring.fit(point, truth, copies=200)
     assert fitted.noise.sqrt().median() == pytest.approx(0.3, rel=0.25)  # the next one of the grid
     scores = measured(point, truth, fitted, copies=200)
-    assert scores["energy_score"].mean() == pytest.approx(0.3 * math.sqrt(2 / math.pi), rel=0.02)  # E|x|
+    assert scores["energy_score"].mean() == pytest.approx(
+        0.3 * math.sqrt(2 / math.pi), rel=0.02
+    )  # E|x|
     for metric in ("energy_score_noise", "crps_noise"):
-        assert scores[metric].mean() == pytest.approx(0.3 / math.sqrt(math.pi), rel=0.03)  # of the best normal
+        assert scores[metric].mean() == pytest.approx(
+            0.3 / math.sqrt(math.pi), rel=0.03
+        )  # of the best normal
 
 
-def test_samples_that_are_right_get_no_noise_and_narrow_ones_get_what_they_lack(fitted: Fitted) -> None:
+def test_samples_that_are_right_get_no_noise_and_narrow_ones_get_what_they_lack(
+    fitted: Fitted,
+) -> None:
     assert fitted.noise.sqrt().median() < 0.15  # the system's own noise builds up to 0.3 .. 0.7
     samples, truth = 0.8 * normal(60, 3000, 1, 2), normal(3000, 1, 2, seed=1)
-    assert scoring.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(0.6, rel=0.25)
+    assert scoring.fit_noise(samples, truth, copies=60).sqrt().median() == pytest.approx(
+        0.6, rel=0.25
+    )
 
 
 # Coverage ------------------------------------------------------------------------------------------------------------
@@ -415,7 +502,9 @@ def test_the_truth_lies_within_the_interval_as_often_as_stated(values: dict[str,
 def test_few_samples_cover_as_often_as_many(count: int) -> None:
     pit = scoring.rank(normal(count, 4000, 1, 4), normal(4000, 1, 4, seed=1), torch.Generator())
     for level in scoring.LEVELS:
-        assert scoring.coverage(pit, float(level)).mean() == pytest.approx(float(level), abs=1 / (count + 1) + 0.01)
+        assert scoring.coverage(pit, float(level)).mean() == pytest.approx(
+            float(level), abs=1 / (count + 1) + 0.01
+        )
 
 
 def test_overconfidence_shows(predicted: tuple[Tensor, Tensor]) -> None:
@@ -435,7 +524,9 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) -> prediction.Scores:
-    return prediction.score(model, FEATURES, data, episodes(40, seed=1), samples=samples, **{**OPEN, **options})
+    return prediction.score(
+        model, FEATURES, data, episodes(40, seed=1), samples=samples, **{**OPEN, **options}
+    )
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -443,8 +534,12 @@ def run(model: Linear, data: Trajectories, samples: int = 20, **options: Any) ->
 def test_scoring_block_by_block_is_scoring_all_samples_at_once(model: Linear) -> None:
     scores = run(model, episodes(21))
     samples, truth = draw(model, episodes(21), samples=20)
-    whole, pit = scoring.measure(samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(scores.pit, pit, rtol=0, atol=1 / 21)  # ranks are drawn between two samples
+    whole, pit = scoring.measure(
+        samples, truth, scores.fitted, 20, torch.Generator().manual_seed(0)
+    )
+    torch.testing.assert_close(
+        scores.pit, pit, rtol=0, atol=1 / 21
+    )  # ranks are drawn between two samples
     assert set(scores.values) == set(whole)
     for metric, value in scores.values.items():
         assert value.shape == (21, HORIZON)
@@ -484,7 +579,9 @@ def test_a_deterministic_model_is_scored_as_the_papers_baselines() -> None:
 
 
 def test_one_gaussian_for_all_is_worth_less_than_its_own_to_the_system_itself() -> None:
-    linear, mode = (run(model, episodes(), samples=100).against_horizon() for model in (Linear(), Mode()))
+    linear, mode = (
+        run(model, episodes(), samples=100).against_horizon() for model in (Linear(), Mode())
+    )
     assert linear["ll_paper"].mean() > mode["ll_paper"].mean() + 0.05  # the unequal protocol
     assert linear["ll_shared"].mean() == pytest.approx(mode["ll_shared"].mean().item(), abs=0.02)
     assert linear["energy_score_noise"].mean() < mode["energy_score_noise"].mean()
@@ -500,9 +597,13 @@ def test_the_caller_chooses_what_to_average_over() -> None:
     curve = scores.against_horizon(steps)["energy_score"]
     assert curve[7] == pytest.approx(energy[3:5, 7].mean().item())
     assert curve[6].isnan()
-    expected = [scoring.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in scoring.LEVELS]
+    expected = [
+        scoring.coverage(scores.pit[3:5, 7:8], float(level)).mean() for level in scoring.LEVELS
+    ]
     torch.testing.assert_close(scores.calibration(steps), torch.stack(expected))
-    torch.testing.assert_close(scores.calibration(half)[9], scoring.coverage(scores.pit[:15], 0.5).mean())
+    torch.testing.assert_close(
+        scores.calibration(half)[9], scoring.coverage(scores.pit[:15], 0.5).mean()
+    )
 
 
 def test_segments_are_scored_as_the_horizon_is() -> None:
@@ -514,7 +615,9 @@ def test_segments_are_scored_as_the_horizon_is() -> None:
 
 def test_a_diverged_sample_counts_as_worst_and_is_reported() -> None:
     broken, sound = run(Linear(breaks=0.2), episodes(50)), run(Linear(), episodes(50))
-    assert broken.outside.mean() == pytest.approx(0.2 * 2, abs=0.1)  # three segments, the last of two steps
+    assert broken.outside.mean() == pytest.approx(
+        0.2 * 2, abs=0.1
+    )  # three segments, the last of two steps
     assert sound.outside.max() == 0
     for metric, value in broken.values.items():
         assert torch.isfinite(value).all(), metric
@@ -529,7 +632,9 @@ def test_a_diverged_sample_counts_as_worst_and_is_reported() -> None:
 
 def test_a_rollout_that_leaves_the_physical_range_is_reported() -> None:
     class Off(Mode):
-        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        def predict_segment(
+            self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+        ) -> Tensor:
             states = super().predict_segment(past, actions)
             states[0, 0, 1] = 30.0
             return states

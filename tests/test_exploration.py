@@ -47,7 +47,9 @@ def learners(seed: int = 0) -> tuple[tsm.RecurrentTSM, tsm.ActionPrior]:
 
 
 def options(**changes: Any) -> tsm.ExplorationOptions:
-    once = tsm.TrainingOptions(past_len=10, future_len=10, steps=4, batch_size=8, validate_every=2, lr=1e-3)
+    once = tsm.TrainingOptions(
+        past_len=10, future_len=10, steps=4, batch_size=8, validate_every=2, lr=1e-3
+    )
     usual = dict(model=once, prior=once, rounds=2, candidates=4, elites=2, iterations=1)
     return tsm.ExplorationOptions(**(usual | changes))
 
@@ -69,16 +71,27 @@ def bits(*parts: torch.nn.Module | None) -> list[str]:
 def test_every_round_adds_its_episodes_and_trains_model_and_prior() -> None:
     model, prior = learners()
     before, seen = bits(model, prior), []
-    found = explored(model, prior, measure=lambda model, prior: {"asked": 1.0}, callback=seen.append)
+    found = explored(
+        model, prior, measure=lambda model, prior: {"asked": 1.0}, callback=seen.append
+    )
     assert len(found.train) == 6 + 2 * (EPISODES - 1)
     assert len(found.held_out) == 2 + 2
-    assert [record["env_steps"] for record in found.records] == [EPISODES * HORIZON, 2 * EPISODES * HORIZON]
+    assert [record["env_steps"] for record in found.records] == [
+        EPISODES * HORIZON,
+        2 * EPISODES * HORIZON,
+    ]
     assert [each and len(each) for each in found.episodes] == [EPISODES, EPISODES]
     for record in found.records:
         assert record.keys() >= {
-            "executed_return", "success", "final_distance", "predicted_return", "gap", "validation", "prior_validation",
+            "executed_return",
+            "success",
+            "final_distance",
+            "predicted_return",
+            "gap",
+            "validation",
+            "prior_validation",
             "asked",
-        }  # fmt: skip
+        }
         assert record["lost"] == 0
         assert all(np.isfinite(list(record.values())))
     assert [progress.values for progress in seen] == found.records
@@ -108,9 +121,12 @@ def test_a_killed_loop_goes_on_with_the_same_bits(
             return self.call(*given, **named)
 
     where, n = {
-        "episodes": ("mpc", 2), "prior": ("fine_tune", 3), "model": ("fine_tune", 4),
-        "record": ("_trained", 2), "next": ("mpc", 1),
-    }[killed_at]  # fmt: skip
+        "episodes": ("mpc", 2),
+        "prior": ("fine_tune", 3),
+        "model": ("fine_tune", 4),
+        "record": ("_trained", 2),
+        "next": ("mpc", 1),
+    }[killed_at]
     with monkeypatch.context() as patched:
         patched.setattr(exploration, where, Once(getattr(exploration, where), n))
         with pytest.raises(Killed):
@@ -128,13 +144,17 @@ def test_a_killed_loop_goes_on_with_the_same_bits(
 def test_what_is_no_number_comes_back_from_the_folder(tmp_path: Path) -> None:
     endless = options(rounds=1, model=replace(options().model, clip=math.inf))
     for _ in range(2):
-        found = explored(*learners(), options=endless, folder=tmp_path, measure=lambda *_: {"unknown": math.nan})
+        found = explored(
+            *learners(), options=endless, folder=tmp_path, measure=lambda *_: {"unknown": math.nan}
+        )
         assert math.isnan(found.records[0]["unknown"])
 
 
 def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
     explored(*learners(), options=options(rounds=1), folder=tmp_path)
-    with pytest.raises(StoreError, match=r"is of another exploration: .*seed.*Delete .* to start anew"):
+    with pytest.raises(
+        StoreError, match=r"is of another exploration: .*seed.*Delete .* to start anew"
+    ):
         explored(*learners(), options=options(rounds=1), folder=tmp_path, seed=4)
     with pytest.raises(StoreError, match="began with"):
         explored(*learners(seed=1), options=options(rounds=1), folder=tmp_path)
@@ -179,10 +199,14 @@ def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as
     other = learners()[0]
     other.load_state_dict(model.state_dict())
     tsm.fit(other, other.loss, found.train, found.held_out, worse, seed=3 + 1)
-    assert validate(other.loss, windows, 3 + 1) > found.records[0]["validation"]  # it was worse indeed
+    assert (
+        validate(other.loss, windows, 3 + 1) > found.records[0]["validation"]
+    )  # it was worse indeed
 
 
-def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     fine_tune, seen = exploration.fine_tune, []
 
     def watched(part: Any, loss: Any, train: tsm.Trajectories, *given: Any, **named: Any) -> Any:
@@ -208,11 +232,20 @@ def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores(
     once = replace(options().model, past_len=model.past_len)
     small, found = (
         tsm.explore(
-            copy.deepcopy(model), None, train, train, swings, options(model=once, prior=None, rounds=1, rms=rms)
+            copy.deepcopy(model),
+            None,
+            train,
+            train,
+            swings,
+            options(model=once, prior=None, rounds=1, rms=rms),
         )
         for rms in (0.01, 0.6)
     )
-    sizes = [float(np.abs(each.episodes[0].actions).mean()) for each in (small, found) if each.episodes[0]]
+    sizes = [
+        float(np.abs(each.episodes[0].actions).mean())
+        for each in (small, found)
+        if each.episodes[0]
+    ]
     assert sizes[0] < 0.1 * sizes[1]
     assert found.train.states.shape == (10, HORIZON + 1, 3)
     assert "success" not in found.records[0]
@@ -233,7 +266,9 @@ def test_disagreement_is_worth_the_bonus_and_one_rollout_has_none() -> None:
 @pytest.mark.parametrize("changes", [{"noise": 1.0}, {"bonus": 1e4, "candidates": 16}])
 def test_noise_and_bonus_lead_elsewhere(changes: Mapping[str, float]) -> None:
     def executed(**changes: Any) -> float:
-        return explored(*learners(), options=options(rounds=1, **changes)).records[0]["executed_return"]
+        return explored(*learners(), options=options(rounds=1, **changes)).records[0][
+            "executed_return"
+        ]
 
     assert executed(**changes) != executed()
 
@@ -252,10 +287,14 @@ def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_unti
     monkeypatch.setattr(exploration, "mpc", unstable)
     found = explored(*learners(), options=options(rounds=1), folder=tmp_path)
     assert found.records[0]["lost"] == 1
-    assert found.records[0]["env_steps"] == EPISODES * 8 + (EPISODES - 1) * HORIZON  # step 7 is the eighth
+    assert (
+        found.records[0]["env_steps"] == EPISODES * 8 + (EPISODES - 1) * HORIZON
+    )  # step 7 is the eighth
     np.testing.assert_array_equal(asked[1], asked[0][[0, 2]])
     (tmp_path / "round-001" / "model.safetensors").unlink()  # as if killed before
-    assert explored(*learners(), options=options(rounds=1), folder=tmp_path).records == found.records
+    assert (
+        explored(*learners(), options=options(rounds=1), folder=tmp_path).records == found.records
+    )
     assert len(asked) == 2
 
 
@@ -272,14 +311,18 @@ def unstable_episode(episodes: set[int], env: str = ARM) -> Any:
     return run
 
 
-def test_a_round_whose_last_episode_is_stable_is_learned_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_round_whose_last_episode_is_stable_is_learned_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 2}))
     found = explored(*learners(), options=options(rounds=1))
     assert (found.records[0]["lost"], len(found.train), len(found.held_out)) == (2, 6 + 1, 2)
     assert found.records[0]["env_steps"] == 8 * EPISODES + 8 * (EPISODES - 1) + HORIZON
 
 
-def test_a_round_that_loses_all_its_episodes_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_round_that_loses_all_its_episodes_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 1, 2}))
     learned = learners()
     found = explored(*learned, folder=tmp_path)
@@ -301,7 +344,12 @@ def test_a_round_without_episodes_has_its_line_in_a_table_of_rounds(
     monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 1, 2}))
     table = tsm.CsvCallback(tmp_path / "rounds.csv")
     for _ in range(2):  # the second time from the folder
-        found = explored(*learners(), options=options(rounds=2, bonus=bonus), folder=tmp_path / "loop", callback=table)
+        found = explored(
+            *learners(),
+            options=options(rounds=2, bonus=bonus),
+            folder=tmp_path / "loop",
+            callback=table,
+        )
         assert [list(each) for each in found.records] == [list(found.records[0])] * 2
         lines = (tmp_path / "rounds.csv").read_text().splitlines()
         assert lines[0].split(",")[2:] == list(found.records[0])
@@ -320,23 +368,39 @@ def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     return seen
 
 
-@pytest.mark.parametrize(("changes", "judge", "samples", "screened"), [
-    ({}, tsm.expected_predictor, 8, 0.25), ({"judging": 2, "screened": 0.5}, tsm.expected_predictor, 2, 0.5),
-    ({"bonus": 1.0}, tsm.model_predictor, 4, 1.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "judge", "samples", "screened"),
+    [
+        ({}, tsm.expected_predictor, 8, 0.25),
+        ({"judging": 2, "screened": 0.5}, tsm.expected_predictor, 2, 0.5),
+        ({"bonus": 1.0}, tsm.model_predictor, 4, 1.0),
+    ],
+)
 def test_candidates_are_judged_by_the_mode_and_samples_and_with_a_bonus_by_its_samples_alone(
-    changes: Mapping[str, Any], judge: Any, samples: int, screened: float, monkeypatch: pytest.MonkeyPatch
+    changes: Mapping[str, Any],
+    judge: Any,
+    samples: int,
+    screened: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen = judged_by(monkeypatch)
     explored(*learners(), options=options(rounds=1, **changes))
     ((found, planner),) = seen
-    assert (found.func, found.keywords, planner.keywords["screened"]) == (judge, {"samples": samples}, screened)
+    assert (found.func, found.keywords, planner.keywords["screened"]) == (
+        judge,
+        {"samples": samples},
+        screened,
+    )
 
 
-def test_a_folder_of_plans_by_the_mode_goes_on_as_such_and_is_refused_by_an_expectation(tmp_path: Path) -> None:
+def test_a_folder_of_plans_by_the_mode_goes_on_as_such_and_is_refused_by_an_expectation(
+    tmp_path: Path,
+) -> None:
     by_mode = options(rounds=1, judging=0, screened=1.0)
     found = explored(*learners(), options=by_mode, folder=tmp_path)
-    for path in (tmp_path / "round-001").glob("*.safetensors"):  # as of a version that had no choice
+    for path in (tmp_path / "round-001").glob(
+        "*.safetensors"
+    ):  # as of a version that had no choice
         forget(path, "judging", "screened")
     assert explored(*learners(), options=by_mode, folder=tmp_path).records == found.records
     with pytest.raises(StoreError, match="is of another exploration: options"):
@@ -348,11 +412,15 @@ def forget(path: Path, *names: str) -> None:
     kind = "trajectories" if path.stem == "episodes" else "model"
     tensors, header = artifacts.load(path, kind=kind)
     identity: Any = header["identity"]
-    identity["options"] = {name: value for name, value in identity["options"].items() if name not in names}
+    identity["options"] = {
+        name: value for name, value in identity["options"].items() if name not in names
+    }
     artifacts.save(path, tensors, kind=kind, header=header)
 
 
-def test_a_model_without_samples_is_judged_by_its_rollout_whatever_the_options(tmp_path: Path) -> None:
+def test_a_model_without_samples_is_judged_by_its_rollout_whatever_the_options(
+    tmp_path: Path,
+) -> None:
     def found(**changes: Any) -> list[dict[str, float]]:
         model = tsm.OneStep.for_data(data(), hidden=8)
         once = options(rounds=1, model=replace(options().model, past_len=1), **changes)
@@ -369,7 +437,9 @@ def test_the_seconds_of_a_round_are_kept_with_it(tmp_path: Path) -> None:
     assert explored(*learners(), folder=tmp_path).seconds == found.seconds
 
 
-def test_what_disturbs_a_plan_is_no_candidate_of_its_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made: list[tuple[Any, float, torch.Generator]] = []
 
     def perturbed(planner: Any, deviation: float, generator: torch.Generator) -> Any:
@@ -383,9 +453,14 @@ def test_what_disturbs_a_plan_is_no_candidate_of_its_search(monkeypatch: pytest.
     assert not torch.equal(torch.randn(8, generator=generator), torch.randn(8, generator=searched))
 
 
-def test_a_limit_of_time_ends_an_episode_without_terminating_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(registry, "tests/Limited-v0", replace(spec("Pendulum-v1"), id="tests/Limited-v0",
-                                                              max_episode_steps=12))  # fmt: skip
+def test_a_limit_of_time_ends_an_episode_without_terminating_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(
+        registry,
+        "tests/Limited-v0",
+        replace(spec("Pendulum-v1"), id="tests/Limited-v0", max_episode_steps=12),
+    )
     train = tsm.collect_random("tests/Limited-v0", 6, horizon=HORIZON)
 
     def swings(k: int) -> tsm.Task:
@@ -395,7 +470,9 @@ def test_a_limit_of_time_ends_an_episode_without_terminating_it(monkeypatch: pyt
         return tsm.Task.from_env("tests/Limited-v0", n=3, horizon=12, reward=reward, seed=k)
 
     model, once = tsm.OneStep.for_data(train, hidden=8), replace(options().model, past_len=1)
-    found = tsm.explore(model, None, train, train, swings, options(model=once, prior=None, rounds=1))
+    found = tsm.explore(
+        model, None, train, train, swings, options(model=once, prior=None, rounds=1)
+    )
     assert set(found.train.steps) == {12}
     assert found.train.terminated == ()
 
@@ -411,38 +488,89 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
     assert (len(found.train), len(found.held_out)) == (6 + 1, 2 + EPISODES - 1)
 
 
-@pytest.mark.parametrize(("given", "said"), [
-    (dict(options=one_step(bonus=1.0)), "OneStep is deterministic: its samples do not disagree. Take bonus=0"),
-    (dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)), "are of tsm/ReacherObstacle-v0, the data"),
-    (dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)), "states have 10 dimensions .* tsm/Reacher-v0 6"),
-    (dict(prior=None, model=tsm.LSTM(6, 2, angles=(0,), hidden=8)), r"angles \[0\], .*angles \[0, 1\]; expected"),
-    (dict(prior=None, model=tsm.LSTM(6, 3, angles=(0, 1), hidden=8)), "actions have 3 dimensions, .*Reacher-v0 2"),
-    (dict(prior=tsm.ActionPrior.for_data(data("Pendulum-v1"))), "prior's actions have 1 dimensions, .*Reacher-v0 2"),
-    (dict(options=one_step(model=replace(options().model, past_len=7))), "past_len is 7, but OneStep is given"),
-    (dict(options=one_step(prior=replace(options().model, past_len=7))), "past_len is 7, but ActionPrior is given 10"),
-    (dict(tasks=lambda k: tasks(k, n=1)), "round 1 has 1 task; expected at least 2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            dict(options=one_step(bonus=1.0)),
+            "OneStep is deterministic: its samples do not disagree. Take bonus=0",
+        ),
+        (
+            dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)),
+            "are of tsm/ReacherObstacle-v0, the data",
+        ),
+        (
+            dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)),
+            "states have 10 dimensions .* tsm/Reacher-v0 6",
+        ),
+        (
+            dict(prior=None, model=tsm.LSTM(6, 2, angles=(0,), hidden=8)),
+            r"angles \[0\], .*angles \[0, 1\]; expected",
+        ),
+        (
+            dict(prior=None, model=tsm.LSTM(6, 3, angles=(0, 1), hidden=8)),
+            "actions have 3 dimensions, .*Reacher-v0 2",
+        ),
+        (
+            dict(prior=tsm.ActionPrior.for_data(data("Pendulum-v1"))),
+            "prior's actions have 1 dimensions, .*Reacher-v0 2",
+        ),
+        (
+            dict(options=one_step(model=replace(options().model, past_len=7))),
+            "past_len is 7, but OneStep is given",
+        ),
+        (
+            dict(options=one_step(prior=replace(options().model, past_len=7))),
+            "past_len is 7, but ActionPrior is given 10",
+        ),
+        (dict(tasks=lambda k: tasks(k, n=1)), "round 1 has 1 task; expected at least 2"),
+    ],
+)
 def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> None:
-    usual = {"model": tsm.OneStep.for_data(data(), hidden=8), "prior": learners()[1], "options": one_step()}
+    usual = {
+        "model": tsm.OneStep.for_data(data(), hidden=8),
+        "prior": learners()[1],
+        "options": one_step(),
+    }
     with pytest.raises(ValueError, match=said):
         explored(**(usual | given))
 
 
 def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned() -> None:
     model, prior = learners()
-    with pytest.raises(TrajectoryError, match=r"with env tsm/Reacher-v0 and Pendulum-v1 .*; expected one robot"):
-        tsm.explore(model, prior, data(), data("Pendulum-v1"), lambda k: pytest.fail("asked for tasks"), options())
+    with pytest.raises(
+        TrajectoryError, match=r"with env tsm/Reacher-v0 and Pendulum-v1 .*; expected one robot"
+    ):
+        tsm.explore(
+            model,
+            prior,
+            data(),
+            data("Pendulum-v1"),
+            lambda k: pytest.fail("asked for tasks"),
+            options(),
+        )
 
 
-@pytest.mark.parametrize(("changes", "said"), [
-    ({"rounds": 0}, "rounds is 0; expected a whole number of at least 1"), ({"rounds": 1.5}, "rounds is 1.5"),
-    ({"rounds": True}, "rounds is True"), ({"every": 0}, "every is 0; .*at least 1"), ({"iterations": 2.5}, "is 2.5"),
-    ({"candidates": 1}, "at least 2"), ({"elites": 5}, "elites is 5, of 4 candidates"), ({"judging": 1.5}, "is 1.5"),
-    ({"samples": 1}, "samples is 1; .*at least 2"), ({"samples": 2.5}, "is 2.5"), ({"noise": -1}, "zero or above"),
-    ({"bonus": math.nan}, "bonus is nan; expected a finite number, zero or above"),
-    ({"held_out": 1.0}, "held_out is 1.0; expected a share between 0 and 1"),
-    ({"judging": -1}, "judging is -1; .*at least 0"), ({"screened": 2.0}, "from 0 to 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rounds": 0}, "rounds is 0; expected a whole number of at least 1"),
+        ({"rounds": 1.5}, "rounds is 1.5"),
+        ({"rounds": True}, "rounds is True"),
+        ({"every": 0}, "every is 0; .*at least 1"),
+        ({"iterations": 2.5}, "is 2.5"),
+        ({"candidates": 1}, "at least 2"),
+        ({"elites": 5}, "elites is 5, of 4 candidates"),
+        ({"judging": 1.5}, "is 1.5"),
+        ({"samples": 1}, "samples is 1; .*at least 2"),
+        ({"samples": 2.5}, "is 2.5"),
+        ({"noise": -1}, "zero or above"),
+        ({"bonus": math.nan}, "bonus is nan; expected a finite number, zero or above"),
+        ({"held_out": 1.0}, "held_out is 1.0; expected a share between 0 and 1"),
+        ({"judging": -1}, "judging is -1; .*at least 0"),
+        ({"screened": 2.0}, "from 0 to 1"),
+    ],
+)
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         options(**changes)
@@ -457,7 +585,9 @@ def test_episodes_are_joined_whatever_their_lengths_and_never_those_of_two_robot
     both = short.joined(long)
     assert both.steps.tolist() == [5] * 3 + [HORIZON] * 2
     np.testing.assert_array_equal(both.states[3:], long.states)
-    np.testing.assert_array_equal(both.states[0, 5:], np.repeat(short.states[0, -1:], HORIZON - 4, 0))
+    np.testing.assert_array_equal(
+        both.states[0, 5:], np.repeat(short.states[0, -1:], HORIZON - 4, 0)
+    )
     assert long.joined(long).lengths == ()
     with pytest.raises(TrajectoryError, match="cannot be joined; expected one robot"):
         long.joined(data("Pendulum-v1"))

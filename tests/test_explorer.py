@@ -34,29 +34,39 @@ from tsmlib.planning.planners import cem, evaluate
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.study import explorer
-from tsmlib.study.models import load_pretrained
-from tsmlib.study.runs import ROOT, RunError
-from tsmlib.study.tasks import load_task
+from reproduction import explorer
+from reproduction.models import load_pretrained
+from reproduction.runs import ROOT, RunError
+from reproduction.tasks import load_task
 from tsmlib.trajectory import Segment
 
 NODE, BROWSER = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
 FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
 PAGE = ROOT / "explorer" / "dist"
-ENVS = {"push": "tsm/ReacherPush-v1", "obstacle": "tsm/ReacherObstacle-v0", "reach": "tsm/Reacher-v0"}
+ENVS = {
+    "push": "tsm/ReacherPush-v1",
+    "obstacle": "tsm/ReacherObstacle-v0",
+    "reach": "tsm/Reacher-v0",
+}
 MODELS = ("rtsm", "tsm", "lstm", "onestep")
-STEPS = 50  # further on, contacts and the one-step model amplify the rounding of float32, also in torch
+STEPS = (
+    50  # further on, contacts and the one-step model amplify the rounding of float32, also in torch
+)
 
 pytestmark = [
     pytest.mark.skipif(NODE is None, reason="node is not installed"),
-    pytest.mark.skipif(not (PAGE / "kernel.wasm").exists(), reason="the page is not built: make explorer"),
+    pytest.mark.skipif(
+        not (PAGE / "kernel.wasm").exists(), reason="the page is not built: make explorer"
+    ),
 ]
 
 
 def ask(*questions: dict[str, Any]) -> list[Any]:
     """The answers of explorer/test/engine.mjs."""
     command = [str(NODE), str(ROOT / "explorer" / "test" / "engine.mjs")]
-    done = subprocess.run(command, input=json.dumps(questions), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, input=json.dumps(questions), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -81,7 +91,9 @@ def as_pasts(past: Segment) -> list[dict[str, list[float]]]:
 def assert_near(found: Any, states: np.ndarray | torch.Tensor, tolerance: float) -> None:
     """Angles and positions within ``tolerance`` rad and m, velocities within as much of their range."""
     unit = np.maximum(1.0, np.insert(HALF_RANGE[2:], 0, (1.0, 1.0)))[: states.shape[-1]]
-    np.testing.assert_allclose(np.array(found).reshape(states.shape) / unit, np.asarray(states) / unit, 0, tolerance)
+    np.testing.assert_allclose(
+        np.array(found).reshape(states.shape) / unit, np.asarray(states) / unit, 0, tolerance
+    )
 
 
 @pytest.mark.parametrize("task", ENVS)
@@ -89,9 +101,13 @@ def test_the_arm_in_the_page_moves_as_in_python(task: str) -> None:
     frozen = load_task(ENVS[task])
     actions, states = driven(frozen, 100)
     starts = frozen.start.astype(float).tolist()
-    (found,) = ask({"what": "physics", "task": task, "starts": starts, "actions": actions.flatten(1).tolist()})
+    (found,) = ask(
+        {"what": "physics", "task": task, "starts": starts, "actions": actions.flatten(1).tolist()}
+    )
     if task == "push":
-        assert (np.abs(states[:, -1, 6:8] - frozen.start[:, 6:8]).max(1) > 1e-3).sum() >= 30  # objects that were met
+        assert (
+            np.abs(states[:, -1, 6:8] - frozen.start[:, 6:8]).max(1) > 1e-3
+        ).sum() >= 30  # objects that were met
     assert_near(found, states, 1e-9)
 
 
@@ -123,7 +139,12 @@ def test_codes_and_a_past_in_motion_are_read_as_in_torch() -> None:
     actions, states = driven(load_task(ENVS["push"]).take(8), 60)
     past = Segment(torch.from_numpy(states[:, 20:30]).float(), actions[:, 20:30])
     codes = torch.randn(8, 3, 8, generator=torch.Generator().manual_seed(1))
-    asked = {"what": "rollout", "task": "push", "pasts": as_pasts(past), "codes": codes.flatten(1).tolist()}
+    asked = {
+        "what": "rollout",
+        "task": "push",
+        "pasts": as_pasts(past),
+        "codes": codes.flatten(1).tolist(),
+    }
     asked["actions"] = actions[:, 30:].flatten(1).tolist()
     recurrent, tsm = (load_pretrained(word, env=ENVS["push"]) for word in ("rtsm", "tsm"))
     assert isinstance(recurrent, RecurrentTSM)
@@ -152,8 +173,16 @@ def test_a_candidate_is_worth_what_its_mode_returns() -> None:
 def test_candidates_are_judged_alike_by_any_number_of_workers() -> None:
     task = load_task(ENVS["push"]).take(1)
     codes = torch.randn(64, 80, generator=torch.Generator().manual_seed(4)).tolist()
-    asked = {"what": "shared", "task": "push", "model": "rtsm", "past": as_pasts(task.past(10))[0], "codes": codes}
-    alone, *others = ask(*(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4)))
+    asked = {
+        "what": "shared",
+        "task": "push",
+        "model": "rtsm",
+        "past": as_pasts(task.past(10))[0],
+        "codes": codes,
+    }
+    alone, *others = ask(
+        *(asked | {"target": task.target[0].tolist(), "workers": k} for k in (1, 2, 3, 4))
+    )
     assert len(alone) == 64
     assert all(value is not None for value in alone)
     assert all(found == alone for found in others)
@@ -167,7 +196,9 @@ def test_codes_of_the_prior_are_the_same_torques_as_in_torch(task: str) -> None:
     wanted = LatentActions(prior, 100, past=before.expand(20, -1, -1)).decode(codes)[0]  # type: ignore[arg-type]
     asked = {"what": "decode", "task": task, "past": before.flatten().tolist()}
     (found,) = ask(asked | {"codes": codes[0].flatten(1).tolist()})
-    np.testing.assert_allclose(np.array(found).reshape(wanted.shape), wanted.numpy(), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        np.array(found).reshape(wanted.shape), wanted.numpy(), rtol=0, atol=1e-5
+    )
 
 
 @torch.no_grad()
@@ -178,14 +209,23 @@ def test_a_plan_of_the_page_is_worth_what_it_is_in_python() -> None:
         {"candidates": 32, "iterations": 4},
         {"what": "plan", "task": "reach", "model": word, "space": "latent"},
     )
-    asked |= {"starts": frozen.start.astype(float).tolist(), "targets": frozen.target.tolist(), "seed": 1}
+    asked |= {
+        "starts": frozen.start.astype(float).tolist(),
+        "targets": frozen.target.tolist(),
+        "seed": 1,
+    }
     (found,) = ask(asked | {"first": search})
     model, prior = load_pretrained(word, env=frozen.env), load_pretrained("prior", env=frozen.env)
     space, predict = LatentActions(prior, frozen.horizon), model_predictor(model, frozen.past(10))  # type: ignore[arg-type]
-    executed = torch.stack([
-        execute(frozen, cem(predict, frozen.reward, space, len(frozen), elites=3, seed=seed, **search)).executed_return
-        for seed in range(4)
-    ])  # fmt: skip
+    executed = torch.stack(
+        [
+            execute(
+                frozen,
+                cem(predict, frozen.reward, space, len(frozen), elites=3, seed=seed, **search),
+            ).executed_return
+            for seed in range(4)
+        ]
+    )
     mean, spread = float(executed.mean()), float(executed.mean(1).std())
     assert abs(np.mean([one["executed"] for one in found]) - mean) < 4 * spread
     assert all(one["success"] == (one["distance"] < frozen.tolerance) for one in found)
@@ -211,10 +251,17 @@ def test_a_link_that_was_edited_by_hand_is_refused_in_one_sentence() -> None:
     assert found[2:] == [said.format(what) for what in wrong.values()]
 
 
-def test_what_is_said_to_lie_outside_the_training_data_does_so_in_the_numbers_that_are_said() -> None:
-    places = [f"{0.16955 + 0.0001 * k:.5f}" for k in range(20)]  # metres from the shoulder; 17.0 cm in the data
+def test_what_is_said_to_lie_outside_the_training_data_does_so_in_the_numbers_that_are_said() -> (
+    None
+):
+    places = [
+        f"{0.16955 + 0.0001 * k:.5f}" for k in range(20)
+    ]  # metres from the shoulder; 17.0 cm in the data
     (found,) = ask({"what": "marks", "links": [f"#arm=0,-2&block=0,{y}" for y in places]})
-    said = [re.findall(r"object is (.*) cm .* \((.*) to (.*) in the data", "".join(marks)) for marks in found]
+    said = [
+        re.findall(r"object is (.*) cm .* \((.*) to (.*) in the data", "".join(marks))
+        for marks in found
+    ]
     assert [bool(one) for one in said] == [float(y) > 0.1705 for y in places]
     assert all(float(far) > float(high) for one in said for far, _, high in one)
 
@@ -231,7 +278,11 @@ def address() -> Iterator[str]:
 
 
 def test_files_are_served_with_their_types_to_this_machine_alone(address: str) -> None:
-    types = {"": "text/html", "src/app.js": "text/javascript", "vendor/mujoco.wasm": "application/wasm"}
+    types = {
+        "": "text/html",
+        "src/app.js": "text/javascript",
+        "vendor/mujoco.wasm": "application/wasm",
+    }
     for path, kind in types.items():
         with urllib.request.urlopen(address + path) as answer:
             assert answer.headers["Content-Type"].partition(";")[0] == kind
@@ -245,7 +296,9 @@ def test_nothing_of_the_page_comes_from_elsewhere() -> None:
         assert "http://" not in path.read_text().replace("http://www.w3.org/", ""), path
         assert "https://" not in path.read_text(), path
     locked = json.loads((ROOT / "explorer" / "package-lock.json").read_text())["packages"].values()
-    assert {urlparse(one["resolved"]).netloc for one in locked if "resolved" in one} <= {"registry.npmjs.org"}
+    assert {urlparse(one["resolved"]).netloc for one in locked if "resolved" in one} <= {
+        "registry.npmjs.org"
+    }
 
 
 def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
@@ -253,7 +306,9 @@ def test_a_page_that_is_not_built_says_how(tmp_path: Path) -> None:
         explorer.server(tmp_path)
 
 
-def test_a_notebook_shows_the_page_where_it_is_served_and_else_how_to_serve_it(address: str) -> None:
+def test_a_notebook_shows_the_page_where_it_is_served_and_else_how_to_serve_it(
+    address: str,
+) -> None:
     assert explorer.frame(port=int(address.rpartition(":")[2].strip("/"))).src == address  # type: ignore[union-attr]
     assert "make explorer" in str(explorer.frame(port=1).data)  # type: ignore[union-attr]
 
@@ -322,8 +377,17 @@ def firefox(folder: Path) -> Iterator[Firefox]:
         port = found.getsockname()[1]
     folder.mkdir()
     settings = {"marionette.port": port, "ui.prefersReducedMotion": 1}
-    (folder / "user.js").write_text("".join(f'user_pref("{name}", {value});\n' for name, value in settings.items()))
-    command = [str(FIREFOX), "--headless", "--marionette", "-remote-allow-system-access", "--profile", str(folder)]
+    (folder / "user.js").write_text(
+        "".join(f'user_pref("{name}", {value});\n' for name, value in settings.items())
+    )
+    command = [
+        str(FIREFOX),
+        "--headless",
+        "--marionette",
+        "-remote-allow-system-access",
+        "--profile",
+        str(folder),
+    ]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield Firefox(port)
@@ -345,7 +409,10 @@ def test_the_page_plans_in_firefox(address: str, tmp_path: Path) -> None:
             raise AssertionError(page.script("return document.body.innerText"))
 
         wait_for("document.body.dataset.ready === 'yes'")
-        for change in ("", "document.getElementById('replan').click()"):  # it plans by itself, once and at each change
+        for change in (
+            "",
+            "document.getElementById('replan').click()",
+        ):  # it plans by itself, once and at each change
             page.script(change)
             wait_for("!document.getElementById('numbers').hidden")
             assert page.script("return document.getElementById('clock').textContent") == "2.00 s"

@@ -15,10 +15,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tsmlib import figures, statistics
-from tsmlib.figures import style
-from tsmlib.study import zoo
-from tsmlib.study.zoo import method
+from tsmlib import plots as figures, statistics
+from tsmlib.plots import style
+from tsmlib import zoo
+from tsmlib.zoo import method
 
 NAMES = ("joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y")
 UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m")
@@ -71,14 +71,18 @@ EVERY = {
     "figure1": lambda: figures.figure1(),
     "figure2": lambda: figures.figure2(),
     "figure3": lambda: figures.figure3(),
-    "figure4": lambda: figures.figure4(dict.fromkeys(("MuJoCo", "pymunk"), dict.fromkeys(("Reach", "Push"), PICTURE))),
+    "figure4": lambda: figures.figure4(
+        dict.fromkeys(("MuJoCo", "pymunk"), dict.fromkeys(("Reach", "Push"), PICTURE))
+    ),
     "figure6": lambda: figures.figure6(returns()),
     "predicted_vs_true": lambda: figures.predicted_vs_true(returns()),
     "loss_curves": lambda: figures.loss_curves({TSM: curve(), method("prior"): curve()}),
     "torque_gallery": lambda: figures.torque_gallery(noise(3, 20, 2), 0.02),
     "state_histograms": lambda: figures.state_histograms(noise(4, 20, 6), NAMES, UNITS),
     "workspace_coverage": lambda: figures.workspace_coverage(0.2 * noise(500, 2), 0.21),
-    "rollout_panels": lambda: figures.rollout_panels(noise(15, 6), noise(4, 15, 6), NAMES, UNITS, TSM),
+    "rollout_panels": lambda: figures.rollout_panels(
+        noise(15, 6), noise(4, 15, 6), NAMES, UNITS, TSM
+    ),
     "plan_strip": lambda: figures.plan_strip(
         draw,
         {TSM: (noise(10, 6), noise(10, 6)), PLANNED: (noise(10, 6), noise(10, 6))},
@@ -86,9 +90,13 @@ EVERY = {
         [0, 4, 9],
         notes={TSM: "ends 3 mm off"},
     ),
-    "plan_actions": lambda: figures.plan_actions(noise(20, 2), noise(20, 2), noise(20, 2), TSM, dt=0.02),
+    "plan_actions": lambda: figures.plan_actions(
+        noise(20, 2), noise(20, 2), noise(20, 2), TSM, dt=0.02
+    ),
     "along_the_way": lambda: figures.along_the_way(steps()),
-    "final_distances": lambda: figures.final_distances({"push": {PLANNED: {"open": np.abs(noise(9))}}}, 0.03),
+    "final_distances": lambda: figures.final_distances(
+        {"push": {PLANNED: {"open": np.abs(noise(9))}}}, 0.03
+    ),
     "plan_paths": lambda: figures.plan_paths(
         noise(2, 9, 2), noise(2, 10, 2), TSM, wanted=noise(5, 2), zone=(0.1, 0, 0.05)
     ),
@@ -102,9 +110,13 @@ def test_every_figure_is_returned_and_none_is_left_open(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_every_figure_finds_its_fonts_and_glyphs(name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_every_figure_finds_its_fonts_and_glyphs(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
     for family in ("DejaVu Sans", "STIXGeneral", "STIXNonUnicode"):
-        font_manager.findfont(family, fallback_to_default=False)  # refused where matplotlib's list of fonts is stale
+        font_manager.findfont(
+            family, fallback_to_default=False
+        )  # refused where matplotlib's list of fonts is stale
     figure = EVERY[name]()
     figure.set_dpi(97)  # formulas are kept by resolution, and a missing glyph is only told of once
     with caplog.at_level("WARNING", logger="matplotlib"), warnings.catch_warnings():
@@ -118,7 +130,12 @@ def test_the_same_figure_gives_the_same_bytes(name: str, tmp_path) -> None:
     first = [path.read_bytes() for path in figures.save(EVERY[name](), tmp_path / "a" / "one")]
     second = [path.read_bytes() for path in figures.save(EVERY[name](), tmp_path / "two")]
     assert first == second
-    assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["one.pdf", "one.png", "two.pdf", "two.png"]
+    assert sorted(path.name for path in tmp_path.rglob("*.*")) == [
+        "one.pdf",
+        "one.png",
+        "two.pdf",
+        "two.png",
+    ]
 
 
 def test_a_method_keeps_its_colour_in_every_figure() -> None:
@@ -136,8 +153,12 @@ def test_figure6_shows_costs_beside_the_latent_oracle_s_and_gaps() -> None:
     cost, gap = figures.figure6({"reach": rows}).axes
     points = {round(float(bar.lines[0].get_xdata()[0]), 6) for bar in cost.containers}
     methods = (PLANNED, FREE, ONE_STEP, ORACLES[1])
-    assert points == {round(rows[m]["true"].mean() / rows[ORACLES[0]]["true"].mean(), 6) for m in methods}
-    assert [float(bar.lines[0].get_xdata()[0]) for bar in gap.containers] == pytest.approx([0.1, 1.5, 3.5])
+    assert points == {
+        round(rows[m]["true"].mean() / rows[ORACLES[0]]["true"].mean(), 6) for m in methods
+    }
+    assert [float(bar.lines[0].get_xdata()[0]) for bar in gap.containers] == pytest.approx(
+        [0.1, 1.5, 3.5]
+    )
     assert float(cost.lines[0].get_xdata()[0]) == 1
 
 
@@ -155,10 +176,16 @@ def test_lengths_are_drawn_in_centimetres_and_say_so() -> None:
     assert [ax.get_xlabel()[-4:] for ax in states[-2:]] == ["(cm)", "(cm)"]
     edges = [patch.get_x() for patch in states[4].patches]
     assert min(edges) == pytest.approx(100 * noise(4, 20, 6)[..., 4].min())
-    (way, *_), path = figures.plan_paths(noise(1, 9, 2), noise(1, 10, 2), TSM).axes, noise(1, 9, 2)[0]
+    (way, *_), path = (
+        figures.plan_paths(noise(1, 9, 2), noise(1, 10, 2), TSM).axes,
+        noise(1, 9, 2)[0],
+    )
     np.testing.assert_allclose(way.lines[0].get_xydata(), 100 * path)
     places = figures.workspace_coverage(0.2 * noise(500, 2), 0.21).axes[0]
-    assert (places.get_xlabel(), places.get_xlim()[1]) == ("fingertip x (cm)", pytest.approx(1.08 * 21))
+    assert (places.get_xlabel(), places.get_xlim()[1]) == (
+        "fingertip x (cm)",
+        pytest.approx(1.08 * 21),
+    )
 
 
 def test_time_stands_below_the_lowest_panels_of_torques_and_not_beside_the_stamp() -> None:
@@ -171,7 +198,14 @@ def test_a_state_that_hardly_varies_has_logarithmic_heights_and_says_so() -> Non
     states = noise(50, 20, 6)
     states[:45, :, 2] = 0
     axes = figures.state_histograms(states, NAMES, UNITS).axes
-    assert [ax.get_yscale() for ax in axes] == ["linear", "linear", "log", "linear", "linear", "linear"]
+    assert [ax.get_yscale() for ax in axes] == [
+        "linear",
+        "linear",
+        "log",
+        "linear",
+        "linear",
+        "linear",
+    ]
     assert axes[2].get_xlabel() == "shoulder velocity (rad/s)\nheights logarithmic"
 
 
@@ -186,27 +220,43 @@ def test_a_legend_has_no_column_that_its_rows_leave_almost_empty() -> None:
 def test_a_dot_of_predicted_and_executed_returns_is_named() -> None:
     legend = figures.predicted_vs_true(returns()).legends[0]
     assert [text.get_text() for text in legend.get_texts()] == [
-        "one target of one training seed", "executed as predicted", "gap",
-    ]  # fmt: skip
+        "one target of one training seed",
+        "executed as predicted",
+        "gap",
+    ]
 
 
 def test_figure6_names_the_marks_it_draws() -> None:
     figure = figures.figure6({"reach": {PLANNED: returns()["reach"][PLANNED]}})
-    marks = {text.get_text(): handle.get_marker() for text, handle in
-             zip(figure.legends[0].get_texts(), figure.legends[0].legend_handles, strict=True)}  # fmt: skip
+    marks = {
+        text.get_text(): handle.get_marker()
+        for text, handle in zip(
+            figure.legends[0].get_texts(), figure.legends[0].legend_handles, strict=True
+        )
+    }
     drawn = {bar.lines[0].get_marker() for bar in figure.axes[0].containers}
     assert {marks["search space: latent"], marks["search space: direct"]} == drawn
 
 
 def test_figure6_pairs_targets_with_the_oracle_and_says_what_lies_far_off() -> None:
     hard = 3 * noise(12) - 5
-    rows = {ORACLES[0]: hard, PLANNED: hard - 0.5, method("lstm", "latent", "cem"): hard - 0.6, ZERO: hard - 20}
-    cost, _ = figures.figure6({"push": {one: {"true": true, "predicted": true} for one, true in rows.items()}}).axes
+    rows = {
+        ORACLES[0]: hard,
+        PLANNED: hard - 0.5,
+        method("lstm", "latent", "cem"): hard - 0.6,
+        ZERO: hard - 20,
+    }
+    cost, _ = figures.figure6(
+        {"push": {one: {"true": true, "predicted": true} for one, true in rows.items()}}
+    ).axes
     for bar in cost.containers:  # all targets are missed by the same, however different they are
         assert np.ptp(bar.lines[2][0].get_segments()[0][:, 0]) == pytest.approx(0, abs=1e-9)
     assert "outside: zero torque" in cost.get_xlabel()
     assert cost.get_xlim()[1] < 10
-    assert [label.get_text() for label in cost.get_yticklabels()] == ["", ""]  # latent, by CEM, all of them
+    assert [label.get_text() for label in cost.get_yticklabels()] == [
+        "",
+        "",
+    ]  # latent, by CEM, all of them
 
 
 def test_the_gap_along_the_way_is_the_last_one() -> None:
@@ -216,7 +266,9 @@ def test_the_gap_along_the_way_is_the_last_one() -> None:
 
 
 def test_a_share_of_targets_reached_is_a_count() -> None:
-    (ax,) = figures.final_distances({"push": {TSM: {"closed": np.array([0.02, 0.01, 0.2, 0.04])}}}, 0.03).axes
+    (ax,) = figures.final_distances(
+        {"push": {TSM: {"closed": np.array([0.02, 0.01, 0.2, 0.04])}}}, 0.03
+    ).axes
     line = ax.lines[0]
     np.testing.assert_allclose(line.get_xdata(), [0, 1, 2, 4, 20])  # cm
     np.testing.assert_allclose(line.get_ydata(), [0, 25, 50, 75, 100])
@@ -248,23 +300,53 @@ def test_a_rollout_is_drawn_over_the_truth() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: figures.torque_gallery(noise(3, 20), 0.02), r"actions has shape \(3, 20\), expected \(n, T, 2\)"),
-        (lambda: figures.rollout_panels(noise(15, 6), noise(4, 14, 6), NAMES, UNITS, TSM), r"expected \(S, 15, 6\)"),
+        (
+            lambda: figures.torque_gallery(noise(3, 20), 0.02),
+            r"actions has shape \(3, 20\), expected \(n, T, 2\)",
+        ),
+        (
+            lambda: figures.rollout_panels(noise(15, 6), noise(4, 14, 6), NAMES, UNITS, TSM),
+            r"expected \(S, 15, 6\)",
+        ),
         (lambda: figures.state_histograms(noise(5, 4), NAMES, UNITS), r"expected \(n, 6\)"),
         (lambda: figures.figure4({}), "equally many environments of each simulator, got none"),
-        (lambda: figures.figure4({"MuJoCo": {"Push": PICTURE}, "pymunk": {}}), "got 1 of MuJoCo, 0 of pymunk"),
+        (
+            lambda: figures.figure4({"MuJoCo": {"Push": PICTURE}, "pymunk": {}}),
+            "got 1 of MuJoCo, 0 of pymunk",
+        ),
         (lambda: figures.figure4({"MuJoCo": {"Push": PICTURE / 255}}), "MuJoCo, Push is float64"),
-        (lambda: figures.figure6({"reach": {TSM: {"true": np.array([1, np.nan])}}}), "TSM: executed returns: 1 of 2"),
-        (lambda: figures.figure6({"reach": {TSM: {"true": noise(3), "predicted": noise(2)}}}), r"\(2,\), expected \(3"),
+        (
+            lambda: figures.figure6({"reach": {TSM: {"true": np.array([1, np.nan])}}}),
+            "TSM: executed returns: 1 of 2",
+        ),
+        (
+            lambda: figures.figure6({"reach": {TSM: {"true": noise(3), "predicted": noise(2)}}}),
+            r"\(2,\), expected \(3",
+        ),
         (lambda: figures.figure6({}), "nothing to draw"),
-        (lambda: figures.predicted_vs_true({"reach": {ZERO: {"true": noise(3)}}}), "no method has predicted"),
+        (
+            lambda: figures.predicted_vs_true({"reach": {ZERO: {"true": noise(3)}}}),
+            "no method has predicted",
+        ),
         (lambda: figures.along_the_way({}), "nothing to draw"),
-        (lambda: figures.along_the_way({TSM: {**steps()[PLANNED], "true": noise(2)}}), r"expected \(3\)"),
+        (
+            lambda: figures.along_the_way({TSM: {**steps()[PLANNED], "true": noise(2)}}),
+            r"expected \(3\)",
+        ),
         (lambda: figures.final_distances({}, 0.03), "nothing to draw"),
-        (lambda: figures.final_distances({"push": {TSM: {"shut": noise(3)}}}, 0.03), "'shut', expected open or"),
-        (lambda: figures.plan_paths(noise(2, 9, 2), noise(3, 9, 2), TSM), "predicted holds 2 paths and executed 3"),
+        (
+            lambda: figures.final_distances({"push": {TSM: {"shut": noise(3)}}}, 0.03),
+            "'shut', expected open or",
+        ),
+        (
+            lambda: figures.plan_paths(noise(2, 9, 2), noise(3, 9, 2), TSM),
+            "predicted holds 2 paths and executed 3",
+        ),
         (lambda: figures.loss_curves({TSM: {"train": noise(3)}}), "expected 'seconds' or 'step'"),
-        (lambda: figures.plan_strip(draw, {TSM: (noise(9, 6), noise(9, 6))}, np.zeros(2), [9]), "between 0 and 8"),
+        (
+            lambda: figures.plan_strip(draw, {TSM: (noise(9, 6), noise(9, 6))}, np.zeros(2), [9]),
+            "between 0 and 8",
+        ),
         (
             lambda: figures.plan_strip(draw, {TSM: (noise(9, 6), noise(8, 6))}, np.zeros(2), [0]),
             "executed states of TSM",
@@ -296,7 +378,10 @@ def test_a_film_has_even_sides_and_waits_for_the_longer_half(tmp_path) -> None:
     np.testing.assert_array_equal(both[4, -65:, :63], left[2])
     tall = figures.stacked(both[:2], both)
     np.testing.assert_array_equal(tall[4], np.concatenate([both[1], both[4]]))
-    first, second = figures.save_video(both, tmp_path / "a.mp4"), figures.save_video(both, tmp_path / "b.mp4")
+    first, second = (
+        figures.save_video(both, tmp_path / "a.mp4"),
+        figures.save_video(both, tmp_path / "b.mp4"),
+    )
     assert first.read_bytes() == second.read_bytes()
     frames = np.stack(imageio.mimread(first))
     assert frames.shape == (5, both.shape[1] + both.shape[1] % 2, 128, 3)
@@ -336,7 +421,9 @@ def test_a_film_takes_kilobytes_of_a_notebook_for_each_of_its_frames() -> None:
     for step in range(20):  # two balls with soft shades, as a renderer draws them
         for x0 in (200, 700):
             off = np.hypot(x - x0 - step, y - 250 - 2 * step)
-            frames[step][off < 60] = (255 * (1 - 0.5 * off[off < 60, None] / 60) * (0.9, 0.6, 0)).astype(np.uint8)
+            frames[step][off < 60] = (
+                255 * (1 - 0.5 * off[off < 60, None] / 60) * (0.9, 0.6, 0)
+            ).astype(np.uint8)
     assert len(figures.embed(frames).data) < 20 * 15_000
 
 
@@ -349,7 +436,9 @@ def test_a_film_that_is_not_there_says_how_to_make_it(tmp_path) -> None:
 def test_a_legend_is_never_wider_than_its_figure(words: int) -> None:
     with plt.style.context(style.STYLE):
         figure = plt.figure(figsize=(5, 3), layout="constrained")
-        handles = [style.entry(" ".join(["label"] * (words if i == 7 else 1)), color="k") for i in range(8)]
+        handles = [
+            style.entry(" ".join(["label"] * (words if i == 7 else 1)), color="k") for i in range(8)
+        ]
         rows = style.legend(figure, handles, columns=4)
         figure.canvas.draw()
     plt.close(figure)

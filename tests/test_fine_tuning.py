@@ -22,11 +22,16 @@ from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment, initial_past
 
 ARM, WEAK = "tsm/Reacher-v0", "tsm/Reacher-gain0.7-v0"
-OPTIONS = tsm.TrainingOptions(past_len=10, future_len=10, steps=8, batch_size=32, validate_every=2, lr=3e-3, warmup=1)
+OPTIONS = tsm.TrainingOptions(
+    past_len=10, future_len=10, steps=8, batch_size=32, validate_every=2, lr=3e-3, warmup=1
+)
 HEADS = {
-    "rtsm": ("decoder.head",), "tsm": ("decoder.head",), "lstm": ("out",), "onestep": ("net.4",),
+    "rtsm": ("decoder.head",),
+    "tsm": ("decoder.head",),
+    "lstm": ("out",),
+    "onestep": ("net.4",),
     "ensemble": ("weights.2", "biases.2"),
-}  # fmt: skip
+}
 
 
 @cache
@@ -47,12 +52,16 @@ def model(word: str) -> Any:
 
 def tuned(net: Any, part: Any, **given: Any) -> tsm.Trajectories:
     weak, options = data(WEAK), replace(OPTIONS, past_len=net.past_len)
-    tsm.fine_tune(net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), options, part=part, **given)
+    tsm.fine_tune(
+        net, net.loss, weak.take(slice(2, None)), weak.take(slice(2)), options, part=part, **given
+    )
     return weak
 
 
 def changed(net: nn.Module, before: dict[str, torch.Tensor]) -> set[str]:
-    return {name for name, weight in net.state_dict().items() if not torch.equal(weight, before[name])}
+    return {
+        name for name, weight in net.state_dict().items() if not torch.equal(weight, before[name])
+    }
 
 
 def copied(net: nn.Module) -> dict[str, torch.Tensor]:
@@ -74,16 +83,25 @@ def test_the_head_is_trained_and_nothing_before_it(word: str) -> None:
 
 
 @pytest.mark.parametrize("word", ["rtsm", "tsm"])
-def test_codes_are_all_that_is_fitted_and_the_model_stays_one_of_its_class(word: str, tmp_path: Path) -> None:
+def test_codes_are_all_that_is_fitted_and_the_model_stays_one_of_its_class(
+    word: str, tmp_path: Path
+) -> None:
     net = model(word)
     before = copied(net)
     tuned(net, "codes")
     moved = changed(net, before)
-    assert {name.rpartition(".")[0].rpartition(".")[2] for name in moved} <= {"codes", "cell", "taps", "project"}
+    assert {name.rpartition(".")[0].rpartition(".")[2] for name in moved} <= {
+        "codes",
+        "cell",
+        "taps",
+        "project",
+    }
     assert any(name.endswith("codes.weight") for name in moved)
     for name in (name for name in moved if name.endswith("codes.weight")):
         ratio = net.state_dict()[name] / before[name]
-        torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), rtol=1e-4, atol=1e-4)  # one number a dimension
+        torch.testing.assert_close(
+            ratio, ratio[:1].expand_as(ratio), rtol=1e-4, atol=1e-4
+        )  # one number a dimension
     tsm.save_model(tmp_path / "tuned.safetensors", net)
     again = tsm.load_model(tmp_path / "tuned.safetensors", type(net))
     assert digest(again.state_dict()) == digest(net.state_dict())
@@ -91,7 +109,9 @@ def test_codes_are_all_that_is_fitted_and_the_model_stays_one_of_its_class(word:
 
 def test_a_learned_distribution_is_another_code_of_the_same_decoder() -> None:
     net, window = model("tsm"), data(ARM)
-    past = Segment(torch.from_numpy(window.states[:, :10]), torch.from_numpy(window.actions[:, :10]))
+    past = Segment(
+        torch.from_numpy(window.states[:, :10]), torch.from_numpy(window.actions[:, :10])
+    )
     actions, z = torch.from_numpy(window.actions[:, 10:20]), torch.randn(8, net.latent_dim)
     mean, deviation = torch.randn(net.latent_dim), torch.rand(net.latent_dim) + 0.5
     future = torch.from_numpy(window.states[:, 10:20])
@@ -104,7 +124,9 @@ def test_a_learned_distribution_is_another_code_of_the_same_decoder() -> None:
     against = torch.distributions.kl_divergence(
         torch.distributions.Normal(m, (v / 2).exp()), torch.distributions.Normal(mean, deviation)
     ).sum(1)
-    torch.testing.assert_close(kl_from_standard_normal(*net.encode(future)), against, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        kl_from_standard_normal(*net.encode(future)), against, rtol=1e-3, atol=1e-3
+    )
 
 
 def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself() -> None:
@@ -123,7 +145,9 @@ def test_codes_that_were_shifted_are_brought_back_by_data_of_the_decoder_itself(
     with torch.no_grad(), learned_codes(net) as codes:
         codes.mean.fill_(1.0)
     before = (mode() - expected).norm()
-    options = tsm.TrainingOptions(10, 20, steps=80, batch_size=32, lr=0.1, warmup=1, validate_every=10)
+    options = tsm.TrainingOptions(
+        10, 20, steps=80, batch_size=32, lr=0.1, warmup=1, validate_every=10
+    )
     tsm.fine_tune(net, net.point_loss, drawn, drawn, options, part="codes")
     assert (mode() - expected).norm() < 0.2 * before
 
@@ -152,7 +176,9 @@ def test_a_fine_tuning_that_breaks_off_leaves_no_weights_worse_than_the_first() 
     assert "the weights that it began with" in stopped.value.__notes__[0]
 
 
-def test_a_stopped_fine_tuning_goes_on_with_the_same_bits_and_not_as_another(tmp_path: Path) -> None:
+def test_a_stopped_fine_tuning_goes_on_with_the_same_bits_and_not_as_another(
+    tmp_path: Path,
+) -> None:
     class Stopped(Exception):
         pass
 
@@ -178,7 +204,9 @@ def test_what_cannot_be_fine_tuned_is_refused() -> None:
     with pytest.raises(ValueError, match="never trained.*tsmlib.fit"):
         tuned(tsm.OneStep(6, 2, angles=(0, 1)), "all")
     push, net = data("tsm/ReacherPush-v1"), model("onestep")
-    with pytest.raises(ValueError, match=r"states have 6 dimensions .* those of tsm/ReacherPush-v1 10 .*same robot"):
+    with pytest.raises(
+        ValueError, match=r"states have 6 dimensions .* those of tsm/ReacherPush-v1 10 .*same robot"
+    ):
         tsm.fine_tune(net, net.loss, push, push, OPTIONS)
 
 

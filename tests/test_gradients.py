@@ -38,7 +38,9 @@ def test_a_true_gradient_is_confirmed_and_a_wrong_one_is_measured() -> None:
     x = torch.tensor([1.0, -2.0, 3.0], dtype=torch.double, requires_grad=True)
     before = x.detach().clone()
     assert gradients.relative_errors(lambda: x.square().sum(), [x])[0] < 1e-8
-    assert gradients.relative_errors(lambda: Lying.apply(x).sum(), [x])[0] == pytest.approx(0.1 / 2.1, rel=1e-4)
+    assert gradients.relative_errors(lambda: Lying.apply(x).sum(), [x])[0] == pytest.approx(
+        0.1 / 2.1, rel=1e-4
+    )
     torch.testing.assert_close(x.detach(), before, rtol=0, atol=1e-15)
 
 
@@ -57,12 +59,16 @@ def prior() -> ActionPrior:
     return ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(50, 30, 2))
 
 
-def test_a_return_through_model_prior_and_reward_is_differentiable_in_codes_torques_and_weights() -> None:
+def test_a_return_through_model_prior_and_reward_is_differentiable_in_codes_torques_and_weights() -> (
+    None
+):
     torch.manual_seed(0)
     model = TSM(6, 2, channels=8)
     model.features.fit(torch.randn(20, 30, 6).cumsum(1) * 0.01)
     net = prior()
-    before = {name: p.detach().clone() for name, p in [*model.named_parameters(), *net.named_parameters()]}
+    before = {
+        name: p.detach().clone() for name, p in [*model.named_parameters(), *net.named_parameters()]
+    }
     found = gradients.of_return(some_task(), model, net)
     assert set(found) == {"codes", "torques", "model", "prior"}
     assert 0 < max(found.values()) <= 1e-5
@@ -78,7 +84,9 @@ class Pushed:
     def __init__(self, wind: float) -> None:
         self.wind = wind
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         assert generator is not None
         strength = 1 + self.wind * standard_normal((len(actions), 1, 1), generator, actions)
         tip = past.states[:, -1:, 4:6] + 0.01 * (strength * actions).cumsum(1)
@@ -121,7 +129,9 @@ def test_the_signal_of_a_gradient_is_its_mean_over_its_deviation() -> None:
 
 def test_a_signal_can_be_had_for_codes_and_is_a_function_of_its_seed() -> None:
     task, space = some_task(), LatentActions(prior(), 20)
-    one, again, other = (gradients.signal(task, Pushed(0.5), space, samples=3, seed=seed) for seed in (0, 0, 1))
+    one, again, other = (
+        gradients.signal(task, Pushed(0.5), space, samples=3, seed=seed) for seed in (0, 0, 1)
+    )
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert all(math.isfinite(value) for value in one)

@@ -25,7 +25,9 @@ REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_a_name_says_what_is_imperfect_and_nothing_else(env_id: str) -> None:
     names = set()
-    for noise, delay in itertools.product([0.0, 0.0001, 0.1, NOISE, 1.0, 9.8765, 10.0], [0, 1, DELAY, 100]):
+    for noise, delay in itertools.product(
+        [0.0, 0.0001, 0.1, NOISE, 1.0, 9.8765, 10.0], [0, 1, DELAY, 100]
+    ):
         name = imperfect(env_id, noise=noise, delay=delay)
         found = EnvSpec.parse(name)
         assert (found.id, found.arm.id, found.noise, found.delay) == (name, env_id, noise, delay)
@@ -50,14 +52,19 @@ def test_one_arm_and_many_are_made_by_name(env_id: str) -> None:
     assert one.spec is not None
     assert many.unwrapped.spec is not None
     assert one.spec.id == many.unwrapped.spec.id == name
-    for env, state, push in ((one, ..., np.ones(2, np.float32)), (many, 0, np.ones((2, 2), np.float32))):
+    for env, state, push in (
+        (one, ..., np.ones(2, np.float32)),
+        (many, 0, np.ones((2, 2), np.float32)),
+    ):
         env.reset(seed=1)
         moved: list[Any] = []
         for _ in range(4):
             seen, _, _, _, info = env.step(push)
             assert (seen != info["state"])[..., :8].all()
             moved.append(info["state"][state][2:4])
-        assert abs(moved[0]).max() < 1 < abs(moved[3]).max()  # rad/s: full torque arrives with the third step
+        assert (
+            abs(moved[0]).max() < 1 < abs(moved[3]).max()
+        )  # rad/s: full torque arrives with the third step
     for _ in range(96):
         _, _, _, late, _ = one.step(np.zeros(2, np.float32))
     assert late
@@ -75,45 +82,73 @@ def test_an_imperfect_arm_starts_where_the_plain_one_does() -> None:
 
 @pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf"), 10.5, 0.00001])
 def test_a_noise_that_makes_no_sense_is_refused(noise: float) -> None:
-    with pytest.raises(ValueError, match=rf"noise is {noise}.*expected a sigma from 0 to 10 with at most four"):
+    with pytest.raises(
+        ValueError, match=rf"noise is {noise}.*expected a sigma from 0 to 10 with at most four"
+    ):
         imperfect(REACHER, noise=noise)
 
 
 @pytest.mark.parametrize("delay", [-1, 1.5, 101, True, "5"])
 def test_a_delay_that_makes_no_sense_is_refused(delay: Any) -> None:
-    with pytest.raises(ValueError, match=rf"delay is {delay}; expected .*whole number of steps from 0 to 100"):
+    with pytest.raises(
+        ValueError, match=rf"delay is {delay}; expected .*whole number of steps from 0 to 100"
+    ):
         imperfect(REACHER, delay=delay)
 
 
 def test_only_a_plain_arm_is_made_imperfect() -> None:
     for env_id in ("tsm/Nothing-v0", imperfect(REACHER, noise=NOISE), ""):
-        with pytest.raises(ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*added to one of these"):
+        with pytest.raises(
+            ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*added to one of these"
+        ):
             imperfect(env_id, delay=DELAY)
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "tsm/Nothing-noise0.25-v0", "tsm/Reacher-noise-v0",
-                                    "tsm/Reacher-delay5-noise0.25-v0", ""])  # fmt: skip
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        "CartPole-v1",
+        "tsm/Nothing-noise0.25-v0",
+        "tsm/Reacher-noise-v0",
+        "tsm/Reacher-delay5-noise0.25-v0",
+        "",
+    ],
+)
 def test_another_name_is_refused(env_id: str) -> None:
-    with pytest.raises(ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*nor what imperfect\(\) calls"):
+    with pytest.raises(
+        ValueError, match=rf"'{env_id}' is none of tsm/Reacher-v0.*nor what imperfect\(\) calls"
+    ):
         EnvSpec.parse(env_id)
 
 
 @pytest.mark.parametrize("arm", ["ReacherPush", "PymunkPush"])
 @pytest.mark.parametrize("how", ["", "-noise0.25", "-delay5", "-noise0.1-delay3"])
-def test_version_0_of_pushing_is_refused_with_the_reason_and_what_took_its_place(arm: str, how: str) -> None:
+def test_version_0_of_pushing_is_refused_with_the_reason_and_what_took_its_place(
+    arm: str, how: str
+) -> None:
     with pytest.raises(ValueError) as caught:
         EnvSpec.parse(f"tsm/{arm}{how}-v0")
     message = str(caught.value)
     assert message.startswith(f"tsm/{arm}{how}-v0 is gone: the physics of pushing changed")
     assert message.endswith(f"tsm/{arm}{how}-v1 took its place")
-    for changed in ("0.05 s, before in 0.2 s", "0.24 m", "first poses in every direction", "T = 100 steps"):
+    for changed in (
+        "0.05 s, before in 0.2 s",
+        "0.24 m",
+        "first poses in every direction",
+        "T = 100 steps",
+    ):
         assert changed in message
-    with pytest.raises(gymnasium.error.Error, match=f"(deprecated.*tsm/{arm}{how}-v1)|(doesn't exist)"):
+    with pytest.raises(
+        gymnasium.error.Error, match=f"(deprecated.*tsm/{arm}{how}-v1)|(doesn't exist)"
+    ):
         gymnasium.make(f"tsm/{arm}{how}-v0")
 
 
 def test_only_pushing_has_another_version() -> None:
-    assert [env_id for env_id in ENV_IDS if not env_id.endswith("-v0")] == ["tsm/ReacherPush-v1", "tsm/PymunkPush-v1"]
+    assert [env_id for env_id in ENV_IDS if not env_id.endswith("-v0")] == [
+        "tsm/ReacherPush-v1",
+        "tsm/PymunkPush-v1",
+    ]
     for env_id in ("tsm/Reacher-v1", "tsm/ReacherPush-v2", "tsm/ReacherPush"):
         assert not gone(env_id)
         with pytest.raises(ValueError, match="is none of"):
@@ -121,8 +156,13 @@ def test_only_pushing_has_another_version() -> None:
 
 
 def test_data_of_other_imperfections_are_other_data() -> None:
-    ids = [REACHER, *(imperfect(REACHER, noise=noise, delay=delay) for noise, delay in
-                      [(NOISE, 0), (0.1, 0), (0.0, DELAY), (0.0, 4), (NOISE, DELAY)])]  # fmt: skip
+    ids = [
+        REACHER,
+        *(
+            imperfect(REACHER, noise=noise, delay=delay)
+            for noise, delay in [(NOISE, 0), (0.1, 0), (0.0, DELAY), (0.0, 4), (NOISE, DELAY)]
+        ),
+    ]
     prints = [fingerprint(env) for env in ids]
     without_names = [{key: value for key, value in one.items() if key != "env"} for one in prints]
     for one, other in itertools.combinations(without_names, 2):
@@ -135,9 +175,13 @@ def test_data_of_other_imperfections_are_other_data() -> None:
 @pytest.mark.parametrize("env_id", [REACHER, PUSH])
 def test_half_ranges_are_those_of_random_data(env_id: str) -> None:
     states = study.random_data(env_id, 500, seed=4).states
-    share = (states.max((0, 1)) - states.min((0, 1)))[2:] / (2 * np.array(HALF_RANGE[2 : states.shape[-1]]))
+    share = (states.max((0, 1)) - states.min((0, 1)))[2:] / (
+        2 * np.array(HALF_RANGE[2 : states.shape[-1]])
+    )
     assert np.abs(share[:6] - 1).max() < 0.25
-    assert ((share[6:] > 0.5) & (share[6:] < 1.25)).all()  # an object is rarely hit hard, in 5,000 episodes once
+    assert (
+        (share[6:] > 0.5) & (share[6:] < 1.25)
+    ).all()  # an object is rarely hit hard, in 5,000 episodes once
 
 
 def test_an_obstacle_is_not_seen_to_move() -> None:
@@ -152,7 +196,9 @@ def test_noise_is_in_half_ranges() -> None:
     env: Any = gymnasium.make_vec(imperfect(PUSH, noise=0.5), num_envs=20)
     env.reset(seed=0)
     off = env.rollout(np.zeros((20, 50, 2))) - env.truth[:, 1:]
-    np.testing.assert_allclose(off.std((0, 1)), 0.5 * np.array(HALF_RANGE), rtol=0.08)  # 3 standard errors are 0.067
+    np.testing.assert_allclose(
+        off.std((0, 1)), 0.5 * np.array(HALF_RANGE), rtol=0.08
+    )  # 3 standard errors are 0.067
 
 
 def test_gymnasium_finds_the_arms_by_themselves_and_imports_a_simulator_when_one_is_made() -> None:
@@ -160,12 +206,21 @@ def test_gymnasium_finds_the_arms_by_themselves_and_imports_a_simulator_when_one
 assert not {"mujoco", "pymunk", "torch", "matplotlib"} & set(sys.modules)
 gymnasium.make("tsm/PymunkPush-v1").reset()
 assert "mujoco" not in sys.modules"""
-    for text in ('import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v1").reset()', program):
-        done = subprocess.run([sys.executable, "-W", "error", "-c", text], capture_output=True, text=True, check=False)
+    for text in (
+        'import gymnasium; gymnasium.make("tsmlib.envs:tsm/ReacherPush-delay5-v1").reset()',
+        program,
+    ):
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", text], capture_output=True, text=True, check=False
+        )
         assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("hidden", [{"noise": 0.25}, {"delay": 2}])
-def test_the_true_simulator_of_an_arm_that_hides_its_state_is_no_predictor(hidden: dict[str, Any]) -> None:
-    with pytest.raises(UnsupportedEnvironment, match="the true simulator of tsm/Reacher-v0 can be asked"):
+def test_the_true_simulator_of_an_arm_that_hides_its_state_is_no_predictor(
+    hidden: dict[str, Any],
+) -> None:
+    with pytest.raises(
+        UnsupportedEnvironment, match="the true simulator of tsm/Reacher-v0 can be asked"
+    ):
         simulator_predictor(imperfect("tsm/Reacher-v0", **hidden))

@@ -30,7 +30,9 @@ def still(n: int = 1, steps: int = 50, *, block: tuple[float, float] = (0.0, 0.1
     return np.tile(state, (n, steps + 1, 1))
 
 
-@pytest.mark.parametrize(("env_id", "rms"), [(PUSH, 0.1), (PUSH, 0.3), (PYMUNK, 0.1), (PYMUNK, 0.3)])
+@pytest.mark.parametrize(
+    ("env_id", "rms"), [(PUSH, 0.1), (PUSH, 0.3), (PYMUNK, 0.1), (PYMUNK, 0.3)]
+)
 def test_the_true_world_breaks_nearly_none(env_id: str, rms: float) -> None:
     states = world(env_id, rms=rms)
     found = violations(states, env_id)
@@ -114,7 +116,10 @@ def test_every_made_up_violation_is_found() -> None:
 def test_shares_are_of_the_steps_of_each_plan() -> None:
     predicted = still(20)
     predicted[3, 26:, 6] += 0.1  # 25 of its 50 steps
-    predicted[7, :, 0], predicted[7, 0, 0] = np.pi / 2, 0.0  # the arm lies inside the object, but for the start
+    predicted[7, :, 0], predicted[7, 0, 0] = (
+        np.pi / 2,
+        0.0,
+    )  # the arm lies inside the object, but for the start
     found = shares(
         predicted[:, 0], np.stack([predicted[:, 1:], still(20)[:, 1:]]), PUSH
     )  # every other rollout is sound
@@ -153,11 +158,15 @@ def test_every_frequency_weighs_in_roughness_as_in_the_mean_square() -> None:
 
 
 @pytest.mark.parametrize("steps", [49, 50])
-def test_the_power_density_integrates_to_the_mean_square_without_the_constant_part(steps: int) -> None:
+def test_the_power_density_integrates_to_the_mean_square_without_the_constant_part(
+    steps: int,
+) -> None:
     torques = torch.randn(3, steps, 2, generator=torch.Generator().manual_seed(0)).double()
     frequency, density = spectrum(torques)
     varying = torques - torques.mean(1, keepdim=True)
-    assert density.sum() * (frequency[1] - frequency[0]) == pytest.approx(varying.square().mean().item())
+    assert density.sum() * (frequency[1] - frequency[0]) == pytest.approx(
+        varying.square().mean().item()
+    )
 
 
 def test_a_typical_plan_is_the_one_of_median_size() -> None:
@@ -170,7 +179,9 @@ def test_the_roughness_of_waves_is_known() -> None:
     time = 0.02 * torch.arange(100)
     slow, fast = (torch.sin(2 * torch.pi * hertz * time) for hertz in (2.0, 10.0))
     found = roughness(torch.stack([slow, fast, slow + fast], 0)[..., None].expand(-1, -1, 2))
-    torch.testing.assert_close(found["centroid"], torch.tensor([2.0, 10.0, 6.0]), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        found["centroid"], torch.tensor([2.0, 10.0, 6.0]), rtol=1e-4, atol=1e-4
+    )
     torch.testing.assert_close(found["fast"], torch.tensor([0.0, 1.0, 0.5]), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(found["change"][0], slow.diff().abs().mean())
     assert found["autocorrelation"][0] > 0.95
@@ -183,7 +194,10 @@ def test_torques_of_the_data_are_near_and_others_far() -> None:
     draw = torch.Generator().manual_seed(0)
     data = smooth_torques(300, 60, generator=draw)
     rough = 0.1 * torch.randn(20, 50, 2, generator=draw)
-    seen, unseen = novelty(data[:20, 7:57], data), novelty(smooth_torques(20, 50, generator=draw), data)
+    seen, unseen = (
+        novelty(data[:20, 7:57], data),
+        novelty(smooth_torques(20, 50, generator=draw), data),
+    )
     torch.testing.assert_close(seen, torch.zeros(20), rtol=0, atol=2e-3)
     assert (seen < unseen).all()
     assert unseen.max() < novelty(rough, data).min()
@@ -211,7 +225,9 @@ def test_the_nearest_segment_is_the_nearest() -> None:
 
 
 def test_the_range_of_the_data_holds_95_of_100_of_their_steps_and_none_of_what_is_larger() -> None:
-    data = smooth_torques(300, 60, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.2])
+    data = smooth_torques(300, 60, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [1.0, 0.2]
+    )
     assert within(data, data).mean() == pytest.approx(0.95, abs=1e-4)
     assert within(torch.zeros(2, 50, 2), data).tolist() == [1, 1]
     plan = torch.zeros(1, 4, 2)

@@ -22,8 +22,8 @@ from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
 from tsmlib.storage import tables
-from tsmlib.study import zoo
-from tsmlib.study.results import latent as latent_results
+from tsmlib import zoo
+from reproduction.results import latent as latent_results
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 PUSH = "tsm/ReacherPush-v1"
@@ -80,7 +80,8 @@ def scene(n: int, steps: int = 10, block: tuple[float, float] = (0.0, 0.15)) -> 
     state[4:6], state[6:8] = torch.from_numpy(fingertip(np.zeros(2))).float(), torch.tensor(block)
     states = state.expand(n, steps, -1).clone()
     window = Window(
-        Segment(state.expand(n, 10, -1).clone(), torch.zeros(n, 10, 2)), Segment(states, torch.zeros(n, steps, 2))
+        Segment(state.expand(n, 10, -1).clone(), torch.zeros(n, 10, 2)),
+        Segment(states, torch.zeros(n, steps, 2)),
     )
     return SampledFutures(PUSH, window, states.expand(2, -1, -1, -1).clone())
 
@@ -100,7 +101,9 @@ def test_units_count_as_active_from_a_variance_of_a_hundredth_on() -> None:
 def test_each_dimension_of_a_linear_decoder_matters_by_its_own_weight() -> None:
     shifts: Any = Shifts()
     found = latent.total_effects(shifts, still_window(20000), rng())
-    torch.testing.assert_close(found, shifts.reach / math.sqrt(3), rtol=0.03, atol=1e-6)  # one of three features moves
+    torch.testing.assert_close(
+        found, shifts.reach / math.sqrt(3), rtol=0.03, atol=1e-6
+    )  # one of three features moves
 
 
 def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder_listens(
@@ -117,18 +120,24 @@ def test_a_code_that_knows_the_future_reconstructs_it_better_only_if_the_decoder
     assert torch.equal(errors["posterior"], errors["zero"])
 
 
-def test_windows_hold_the_states_that_scores_are_taken_from(model: TSM, test_data: Trajectories) -> None:
+def test_windows_hold_the_states_that_scores_are_taken_from(
+    model: TSM, test_data: Trajectories
+) -> None:
     seen = futures.sample_futures(model, test_data, samples=2, horizon=30)
     whole = test_data.padded(0)
     assert torch.equal(seen.window.future.states, prediction.cut(whole.states, futures.STARTS, 30))
-    assert torch.equal(seen.window.past.states[1], whole.states[0, 30:40])  # the second window of the first episode
+    assert torch.equal(
+        seen.window.past.states[1], whole.states[0, 30:40]
+    )  # the second window of the first episode
     assert seen.samples.shape == (2, 120, 30, 10)
     touched = prediction.cut(contacts.contact_steps(test_data.states, PUSH), futures.STARTS, 30)
     assert torch.equal(contacts.touched(seen), touched)
     assert touched.any()
 
 
-def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(model: TSM, test_data: Trajectories) -> None:
+def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(
+    model: TSM, test_data: Trajectories
+) -> None:
     seen, episodes = contacts.windows_before_contact(model, test_data, samples=2, horizon=20)
     assert 3 <= len(episodes) < len(test_data)
     near = closest_gap(seen.window.future.states.numpy(), PUSH) < exploitation.NEAR
@@ -155,7 +164,9 @@ def test_codes_of_a_recurrent_model_are_looked_at_in_the_same_way(
     first = recurrent.decode(past, future.actions[:, :10], codes)
     torch.testing.assert_close(ways[:, :10], first)  # then the mode goes on
     spread = float((ways[:, -1, BLOCK] - ways[0, -1, BLOCK]).norm(dim=1).max())
-    for i in range(len(seen.window.past.states)):  # no other window has the object end further apart
+    for i in range(
+        len(seen.window.past.states)
+    ):  # no other window has the object end further apart
         other = Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
         ends = latent.decode_codes(recurrent, other, codes, 30)[:, -1, BLOCK]
         assert float((ends - ends[0]).norm(dim=1).max()) <= spread
@@ -180,7 +191,9 @@ def test_groups_are_sorted_by_spread() -> None:
 
 def test_a_planted_spread_after_contact_is_found() -> None:
     seen = scene(50)
-    seen.window.future.states[:25, 6:, 6:8] = torch.tensor([0.15, 0.02])  # the object lies at the arm from step 6 on
+    seen.window.future.states[:25, 6:, 6:8] = torch.tensor(
+        [0.15, 0.02]
+    )  # the object lies at the arm from step 6 on
     noise = torch.randn(64, 50, 10, 10, generator=rng())
     size = torch.full((50, 10), 0.02)
     size[:25, 6:] = 0.1
@@ -196,7 +209,9 @@ def test_a_planted_spread_after_contact_is_found() -> None:
     assert value["spread_ratio", ""] == pytest.approx(5, rel=0.05)
     assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
     assert value["importance", ""] == 0
-    assert not any(metric.startswith(("kl", "error_")) for metric, _ in value)  # of no encoder that was trained for it
+    assert not any(
+        metric.startswith(("kl", "error_")) for metric, _ in value
+    )  # of no encoder that was trained for it
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
@@ -204,9 +219,14 @@ def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> N
     seen, draw = scene(8), rng()
     still = torch.zeros(8, 1)
     net: Any = SimpleNamespace(
-        code_len=10, latent_dim=1, features=moving(), encode=lambda states: (still, still),
-        decode=lambda past, u, z: past.states + noise * torch.randn(past.states.shape, generator=draw),
-    )  # fmt: skip
+        code_len=10,
+        latent_dim=1,
+        features=moving(),
+        encode=lambda states: (still, still),
+        decode=lambda past, u, z: (
+            past.states + noise * torch.randn(past.states.shape, generator=draw)
+        ),
+    )
     rows = latent_results.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
     [variance] = [row["value"] for row in rows if row["metric"] == "fixed_code_variance"]
     assert variance == pytest.approx(noise**2 / 2, rel=0.2)  # of two, about their mean
@@ -218,18 +238,24 @@ def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> N
     future[0, 4:7, 6:8] = torch.tensor([0.15, 0.02])  # at the arm for three steps
     limit = WALL - BLOCK_RADIUS
     future[0, 7, 6:10] = torch.tensor([limit - 0.02, 0.2, 1.5, 0.0])  # 2 cm from the wall, fast
-    future[0, 8:, 6:10] = torch.tensor([limit - 0.015, 0.2, -0.6, 0.0])  # and already on its way back
+    future[0, 8:, 6:10] = torch.tensor(
+        [limit - 0.015, 0.2, -0.6, 0.0]
+    )  # and already on its way back
     true, samples = contacts.contacts(seen)["object"]
     assert true[0].nonzero().flatten().tolist() == [4]
     assert not samples.any()
     assert contacts.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
 
 
-def test_episodes_that_hit_a_wall_are_spaced_by_how_far_the_object_goes(model: TSM, test_data: Trajectories) -> None:
+def test_episodes_that_hit_a_wall_are_spaced_by_how_far_the_object_goes(
+    model: TSM, test_data: Trajectories
+) -> None:
     seen = scene(6, steps=10)
     reach, way = 0.21 - 0.15, torch.linspace(0, 1, 10)
     seen.window.future.states[:4, :, 7] = 0.15 + reach * way  # up to the wall
-    seen.window.future.states[:4, :, 6] += torch.tensor([0.03, 0.01, 0.02, 0.04])[:, None] * way  # and along it
+    seen.window.future.states[:4, :, 6] += (
+        torch.tensor([0.03, 0.01, 0.02, 0.04])[:, None] * way
+    )  # and along it
     assert contacts.into_a_wall(seen, n=4).tolist() == [1, 2, 0, 3]
     assert contacts.into_a_wall(seen, n=2).tolist() == [1, 3]
 
@@ -241,7 +267,9 @@ def test_the_first_episode_with_and_without_a_touch_are_told_apart(test_data: Tr
     assert not near[:11].any()
     assert closest_gap(found["free"].states, PUSH).min() >= 0.001
     assert [len(episode) for episode in found.values()] == [1, 1]
-    assert list(contacts.first_episodes(study.random_data("tsm/Reacher-v0", 2, seed=0), after=10)) == ["free"]
+    assert list(
+        contacts.first_episodes(study.random_data("tsm/Reacher-v0", 2, seed=0), after=10)
+    ) == ["free"]
 
 
 def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
@@ -298,21 +326,27 @@ def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -
         latent.interpolate(first, second, 1)
 
 
-def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(model: TSM, test_data: Trajectories) -> None:
+def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(
+    model: TSM, test_data: Trajectories
+) -> None:
     seen = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=30)
     window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
     z = torch.randn(1, 3, generator=rng())
     once = latent.decode_codes(model, window, z, 30)
     assert torch.equal(once, latent.decode_codes(model, window, z, 30))
     assert torch.equal(once[:, :10], latent.decode_codes(model, window, z, 10))
-    torch.testing.assert_close(latent.decode_codes(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1))
+    torch.testing.assert_close(
+        latent.decode_codes(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1)
+    )
     near = latent.decode_codes(model, window, z + 1e-3, 30)
     assert 0 < (near - once).abs().max() < 0.1
 
 
 def test_the_directions_that_move_an_outcome_are_found() -> None:
     codes = torch.randn(500, 6, generator=rng())
-    outcome = torch.stack([3 * codes[:, 2], codes[:, 4]], 1) + 0.01 * torch.randn(500, 2, generator=rng(1))
+    outcome = torch.stack([3 * codes[:, 2], codes[:, 4]], 1) + 0.01 * torch.randn(
+        500, 2, generator=rng(1)
+    )
     found, explained = latent.directions(codes, outcome)
     torch.testing.assert_close(found.abs(), torch.eye(6)[[2, 4]], atol=0.01, rtol=0)
     assert explained > 0.99
@@ -328,7 +362,9 @@ def test_codes_are_held_in_a_plane_and_keep_what_lies_beside_it() -> None:
     torch.testing.assert_close(held @ beside, codes @ beside)
 
 
-def test_a_map_of_codes_lies_in_the_plane_that_moves_the_object(model: TSM, test_data: Trajectories) -> None:
+def test_a_map_of_codes_lies_in_the_plane_that_moves_the_object(
+    model: TSM, test_data: Trajectories
+) -> None:
     past, future = futures.sample_futures(model, test_data.take(slice(1)), samples=1).window
     window = Window(*(Segment(*(part[:1] for part in side)) for side in (past, future)))
     found = latent.code_map(model, window, n=200)
@@ -348,13 +384,27 @@ def test_the_plane_of_largest_variance_is_found() -> None:
 
 def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() -> None:
     row = dict(env=PUSH, model="tsm", execution="open loop", subset="object")
-    rows = tables.frame(dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, steps_ahead=h)
-                        for k in (0, 1) for m in ("recall", "precision", "chance") for h in (10, 20, 30))  # fmt: skip
+    rows = tables.frame(
+        dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, steps_ahead=h)
+        for k in (0, 1)
+        for m in ("recall", "precision", "chance")
+        for h in (10, 20, 30)
+    )
     found = latent_results.recall_panels(rows, PUSH)
     assert list(found) == ["arm touches object"]
-    np.testing.assert_allclose(found["arm touches object"][zoo.method("tsm")]["recall"], [[0.5] * 3, [0.6] * 3])
+    np.testing.assert_allclose(
+        found["arm touches object"][zoo.method("tsm")]["recall"], [[0.5] * 3, [0.6] * 3]
+    )
     assert latent_results.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
-    kl = dict(env=PUSH, model="tsm", execution="segments", subset="contact", metric="kl", seed=0, value=2.0)
+    kl = dict(
+        env=PUSH,
+        model="tsm",
+        execution="segments",
+        subset="contact",
+        metric="kl",
+        seed=0,
+        value=2.0,
+    )
     panels = latent_results.use_panels(tables.frame([kl]), [PUSH])["KL per segment"]
     assert panels["ReacherPush, with a touch"][zoo.method("tsm")].tolist() == [2.0]
     assert list(panels) == ["ReacherPush, with a touch"]
@@ -362,16 +412,30 @@ def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() ->
 
 def test_thresholds_stand_beside_the_mean_over_seeds() -> None:
     row = dict(metric="kl", execution="segments", env="tsm/Reacher-v0", model="tsm", seed=0)
-    rows = [dict(row, value=0.02), dict(row, value=0.04, seed=1), dict(row, model="lstm", value=9.0)]
+    rows = [
+        dict(row, value=0.02),
+        dict(row, value=0.04, seed=1),
+        dict(row, model="lstm", value=9.0),
+    ]
     table = latent_results.thresholds_table(tables.frame(rows), ["tsm"])
     (line,) = table.splitlines()[2:]  # what was not measured is left out
-    assert [cell.strip() for cell in line.split("|")[1:-1]] == ["Reacher: KL (nats)", "at most 0.1", "0.03"]
+    assert [cell.strip() for cell in line.split("|")[1:-1]] == [
+        "Reacher: KL (nats)",
+        "at most 0.1",
+        "0.03",
+    ]
     assert "9" not in table.replace("0.9", "")
 
 
-def test_a_past_longer_than_what_was_observed_begins_with_the_first_state(test_data: Trajectories) -> None:
-    model = in_units(TSM(test_data.states.shape[2], 2, segment_len=20, dilations=(1, 2, 4, 8), channels=8))
-    past = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=10).window.past
+def test_a_past_longer_than_what_was_observed_begins_with_the_first_state(
+    test_data: Trajectories,
+) -> None:
+    model = in_units(
+        TSM(test_data.states.shape[2], 2, segment_len=20, dilations=(1, 2, 4, 8), channels=8)
+    )
+    past = futures.sample_futures(
+        model, test_data.take(slice(1)), samples=1, horizon=10
+    ).window.past
     assert model.past_len > 10
     early = past.states[0, : model.past_len - 10].numpy()
     np.testing.assert_array_equal(early, np.broadcast_to(test_data.states[0, 0], early.shape))

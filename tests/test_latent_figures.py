@@ -15,10 +15,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tsmlib import figures
+from tsmlib import plots as figures
 from tsmlib.envs.render import draw_scene
-from tsmlib.figures import style
-from tsmlib.study.zoo import method
+from tsmlib.plots import style
+from tsmlib.zoo import method
 
 TSM, OURS = METHODS = method("tsm"), method("rtsm")
 DRAW = partial(draw_scene, env_id="tsm/ReacherPush-v1")
@@ -35,16 +35,23 @@ def fan(*shape: int) -> np.ndarray:
 
 
 def use() -> Figure:
-    values = {"Reacher": {TSM: np.array([0.001])}, "Push": {label: np.array([1.0, 2.0, 3.0]) for label in METHODS}}
+    values = {
+        "Reacher": {TSM: np.array([0.001])},
+        "Push": {label: np.array([1.0, 2.0, 3.0]) for label in METHODS},
+    }
     return figures.code_use(
-        {"KL": values, "spread": values}, {"KL": "nats", "spread": "share"}, {"KL": {"Reacher": 0.1}, "spread": {}}
+        {"KL": values, "spread": values},
+        {"KL": "nats", "spread": "share"},
+        {"KL": {"Reacher": 0.1}, "spread": {}},
     )
 
 
 def recall(**more: np.ndarray) -> Figure:
     shares = {word: np.full((2, 3), 0.5) for word in ("recall", "precision", "chance")} | more
     return figures.contact_recall(
-        {"arm": dict.fromkeys(METHODS, shares), "wall": {TSM: shares}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}
+        {"arm": dict.fromkeys(METHODS, shares), "wall": {TSM: shares}},
+        ("1–10", "11–20", "21–30"),
+        {"arm": 0.8},
     )
 
 
@@ -55,7 +62,12 @@ def wheel() -> Figure:
 
 
 def ten(changed: float = 0.5) -> Figure:
-    ways = method("data"), method("prior", variant="a sample"), method("tsm", "latent", "cem"), method("tsm", "direct")
+    ways = (
+        method("data"),
+        method("prior", variant="a sample"),
+        method("tsm", "latent", "cem"),
+        method("tsm", "direct"),
+    )
     plans = {way: noise(50, 2) for way in ways}
     return figures.figure10(plans, 0.02, dict.fromkeys(plans, changed))
 
@@ -63,9 +75,14 @@ def ten(changed: float = 0.5) -> Figure:
 SPECTRUM = (np.arange(1, 26.0), np.arange(1, 26.0) ** -2)
 EVERY: dict[str, Callable[[], Figure]] = {
     "code_use": use,
-    "around_touch": lambda: figures.around_touch({label: (abs(noise(30)), abs(noise(30))) for label in METHODS}, 4),
+    "around_touch": lambda: figures.around_touch(
+        {label: (abs(noise(30)), abs(noise(30))) for label in METHODS}, 4
+    ),
     "spread_against_error": lambda: figures.spread_against_error(
-        {env: {label: (np.arange(1, 9.0), np.arange(1, 9.0)) for label in METHODS} for env in ("Push", "Obstacle")}
+        {
+            env: {label: (np.arange(1, 9.0), np.arange(1, 9.0)) for label in METHODS}
+            for env in ("Push", "Obstacle")
+        }
     ),
     "figure9": lambda: figures.figure9(
         DRAW, np.stack([START] * 3), np.stack([PATH] * 3), dict.fromkeys(METHODS, fan(5, 3))
@@ -100,7 +117,11 @@ def test_every_figure_is_as_wide_as_a_page_at_most_and_leaves_none_open(word: st
 def marks(ax: Axes, method: figures.Method) -> list[tuple[float, float]]:
     """Where the marks of a model stand."""
     main = method.look.colour.lower()
-    lines = [line for line in ax.lines if to_hex(line.get_color()) == main and line.get_marker() not in ("None", "")]
+    lines = [
+        line
+        for line in ax.lines
+        if to_hex(line.get_color()) == main and line.get_marker() not in ("None", "")
+    ]
     return [(float(line.get_xdata()[0]), float(line.get_ydata()[0])) for line in lines]
 
 
@@ -121,9 +142,14 @@ def test_labels_of_spread_and_error_do_not_run_into_each_other() -> None:
 
 
 def test_a_panel_of_codes_names_the_models_without_values_in_it() -> None:
-    values = {"KL": {"Push": {TSM: np.array([1.0])}}, "spread": {"Push": dict.fromkeys(METHODS, np.array([1.0]))}}
+    values = {
+        "KL": {"Push": {TSM: np.array([1.0])}},
+        "spread": {"Push": dict.fromkeys(METHODS, np.array([1.0]))},
+    }
     left, right = figures.code_use(values, {"KL": "nats", "spread": "share"}, {}).axes
-    assert left.get_xlabel() == f"nats\nno values of {', '.join(m.label for m in METHODS if m != TSM)}"
+    assert (
+        left.get_xlabel() == f"nats\nno values of {', '.join(m.label for m in METHODS if m != TSM)}"
+    )
     assert right.get_xlabel() == "share"
 
 
@@ -137,8 +163,12 @@ def test_a_walk_shows_in_centimetres_how_far_the_ends_lie_from_the_first_one() -
 
 def diamonds(ax: Axes) -> list[tuple[float, float]]:
     """Where the reader's own hollow diamonds stand."""
-    return [(float(x), float(y)) for line in ax.lines if line.get_marker() == "D"
-            for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)]  # fmt: skip
+    return [
+        (float(x), float(y))
+        for line in ax.lines
+        if line.get_marker() == "D"
+        for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)
+    ]
 
 
 def test_yours_stand_below_the_published_use_of_codes_in_rows_of_their_own_too() -> None:
@@ -154,15 +184,25 @@ def test_yours_stand_below_the_published_use_of_codes_in_rows_of_their_own_too()
 
 def test_your_recall_and_precision_are_drawn_where_nothing_is_published_too() -> None:
     own = {
-        "arm": {OURS: {"recall": np.full((1, 3), 0.7), "precision": np.full((1, 3), 0.4), "chance": np.zeros((1, 3))}}
+        "arm": {
+            OURS: {
+                "recall": np.full((1, 3), 0.7),
+                "precision": np.full((1, 3), 0.4),
+                "chance": np.zeros((1, 3)),
+            }
+        }
     }
-    figure = figures.contact_recall({"arm": {}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}, yours=own)
+    figure = figures.contact_recall(
+        {"arm": {}}, ("1–10", "11–20", "21–30"), {"arm": 0.8}, yours=own
+    )
     assert sorted(y for _, y in diamonds(figure.axes[0])) == [0.4] * 3 + [0.7] * 3
 
 
 def test_every_sample_of_figure_9_is_drawn_from_where_the_object_was() -> None:
     figure = EVERY["figure9"]()
-    fans = [part for ax in figure.axes for part in ax.collections if isinstance(part, LineCollection)]
+    fans = [
+        part for ax in figure.axes for part in ax.collections if isinstance(part, LineCollection)
+    ]
     assert [len(part.get_segments()) for part in fans] == [5] * 6
     for part in fans:
         for way in part.get_segments():
@@ -180,7 +220,12 @@ def test_torques_of_the_data_and_of_the_prior_have_their_own_colours() -> None:
     figure = ten(0.25)
     mains = [to_hex(ax.lines[1].get_color()).upper() for ax in figure.axes]
     assert mains == [method(word).look.colour for word in ("data", "prior", "tsm", "tsm")]
-    assert [bool(ax.texts) for ax in figure.axes] == [False, True, True, True]  # the data need no comparison
+    assert [bool(ax.texts) for ax in figure.axes] == [
+        False,
+        True,
+        True,
+        True,
+    ]  # the data need no comparison
     assert "0.25" in figure.axes[1].texts[0].get_text()
 
 
@@ -223,11 +268,15 @@ def test_a_turned_knob_draws_the_picture_anew() -> None:
 
 def test_sliders_and_picture_fit_a_small_screen_together_and_are_not_stretched() -> None:
     picture_of = figures.code_fan(DRAW, START, fan(9), PATH, TSM)
-    panel = figures.slider_panel(lambda a, b: picture_of(fan(6)), {"a": (-3.0, 3.0, 0.25), "b": (-3.0, 3.0, 0.25)})
+    panel = figures.slider_panel(
+        lambda a, b: picture_of(fan(6)), {"a": (-3.0, 3.0, 0.25), "b": (-3.0, 3.0, 0.25)}
+    )
     first, _, picture = panel.children
     with Image.open(BytesIO(picture.value)) as shown:
         assert picture.width == str(shown.width)  # a pixel of it is a pixel of the screen
-        assert shown.height + 2 * 40 < 900 - 250  # what JupyterLab has above and below a notebook of 900 pixels
+        assert (
+            shown.height + 2 * 40 < 900 - 250
+        )  # what JupyterLab has above and below a notebook of 900 pixels
     assert panel.layout.align_items == "flex-start"
     assert first.layout.width == f"{shown.width}px"
 

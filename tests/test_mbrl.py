@@ -14,7 +14,14 @@ from torch import Tensor
 
 import tsmlib as tsm
 from tsmlib.models.base import rollout, stepper
-from tsmlib.planning.mbrl_lib import ForModelEnv, MbrlModel, model_env, never, reward_function, transition_batch
+from tsmlib.contrib.mbrl_lib import (
+    ForModelEnv,
+    MbrlModel,
+    model_env,
+    never,
+    reward_function,
+    transition_batch,
+)
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.rewards import reach
 from tsmlib.trajectory import Segment, initial_past
@@ -30,7 +37,9 @@ class Ensemble(torch.nn.Module):
     def __init__(self, deterministic: bool, outputs: int = DX) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
-        self.weight = torch.nn.Parameter(0.1 * torch.randn(MEMBERS, DX + DU, outputs, generator=generator))
+        self.weight = torch.nn.Parameter(
+            0.1 * torch.randn(MEMBERS, DX + DU, outputs, generator=generator)
+        )
         self.deterministic = deterministic
 
     def forward(self, x: Tensor, *, use_propagation: bool) -> tuple[Tensor, Tensor | None]:
@@ -50,9 +59,13 @@ class Halved:
 def stand_in(**changes: Any) -> Any:
     """A stand-in for ``OneDTransitionRewardModel``."""
     usual = dict(
-        model=Ensemble(deterministic=True), input_normalizer=None, obs_process_fn=None, target_is_delta=True,
-        no_delta_list=[], learned_rewards=False,
-    )  # fmt: skip
+        model=Ensemble(deterministic=True),
+        input_normalizer=None,
+        obs_process_fn=None,
+        target_is_delta=True,
+        no_delta_list=[],
+        learned_rewards=False,
+    )
     return SimpleNamespace(**(usual | changes))
 
 
@@ -60,11 +73,20 @@ def theirs(**changes: Any) -> Any:
     """mbrl-lib's own, with new weights."""
     models = pytest.importorskip("mbrl.models")
     torch.manual_seed(0)
-    deterministic, rewards = changes.pop("deterministic", True), changes.get("learned_rewards", False)
+    deterministic, rewards = (
+        changes.pop("deterministic", True),
+        changes.get("learned_rewards", False),
+    )
     inner = models.GaussianMLP(
-        DX + DU, DX + rewards, "cpu", num_layers=2, hid_size=16, ensemble_size=MEMBERS, deterministic=deterministic,
+        DX + DU,
+        DX + rewards,
+        "cpu",
+        num_layers=2,
+        hid_size=16,
+        ensemble_size=MEMBERS,
+        deterministic=deterministic,
         propagation_method="fixed_model",
-    )  # fmt: skip
+    )
     return models.OneDTransitionRewardModel(inner, **({"learned_rewards": False} | changes))
 
 
@@ -80,10 +102,18 @@ def some_actions(steps: int = 6, rows: int = B) -> Tensor:
 # Theirs behind ours --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("changes", [
-    {}, {"input_normalizer": Halved()}, {"obs_process_fn": torch.tanh}, {"target_is_delta": False},
-    {"no_delta_list": [1]}, {"model": Ensemble(True, DX + 1), "learned_rewards": True},
-], ids=["delta", "normalised", "processed", "absolute", "mixed", "rewards"])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"input_normalizer": Halved()},
+        {"obs_process_fn": torch.tanh},
+        {"target_is_delta": False},
+        {"no_delta_list": [1]},
+        {"model": Ensemble(True, DX + 1), "learned_rewards": True},
+    ],
+    ids=["delta", "normalised", "processed", "absolute", "mixed", "rewards"],
+)
 def test_its_mode_is_the_mean_of_the_members_at_every_step(changes: dict[str, Any]) -> None:
     model = stand_in(**changes)
     states = rollout(MbrlModel(model), some_past(), some_actions())
@@ -123,14 +153,18 @@ def test_a_sample_keeps_its_member_and_elites_alone_predict() -> None:
         model.model.elite_models = elite
         ours, seen = MbrlModel(model), set()
         for seed in range(30):
-            states = rollout(ours, some_past(), some_actions(), generator=torch.Generator().manual_seed(seed))
+            states = rollout(
+                ours, some_past(), some_actions(), generator=torch.Generator().manual_seed(seed)
+            )
             seen |= {m for m in range(MEMBERS) if torch.allclose(states[0], row(m), atol=1e-5)}
         assert seen == set(elite or range(MEMBERS))
 
 
 @pytest.mark.parametrize("make", [stand_in, theirs])
 @pytest.mark.parametrize("planner", [tsm.cem, tsm.adam])
-def test_our_planners_plan_through_it(make: Callable[..., Any], planner: Callable[..., tsm.Plan]) -> None:
+def test_our_planners_plan_through_it(
+    make: Callable[..., Any], planner: Callable[..., tsm.Plan]
+) -> None:
     def nearer(states: Tensor, actions: Tensor) -> Tensor:
         return -states[..., :2].square().sum(-1) - 0.01 * actions.square().sum(-1)
 
@@ -143,10 +177,19 @@ def test_our_planners_plan_through_it(make: Callable[..., Any], planner: Callabl
     assert (plan.predicted_return > nothing).all()
 
 
-@pytest.mark.parametrize("changes", [
-    {}, {"deterministic": False}, {"target_is_delta": False}, {"no_delta_list": [1]}, {"learned_rewards": True},
-    {"obs_process_fn": torch.tanh}, {"num_elites": 5},
-], ids=lambda changes: ",".join(changes) or "default")  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"deterministic": False},
+        {"target_is_delta": False},
+        {"no_delta_list": [1]},
+        {"learned_rewards": True},
+        {"obs_process_fn": torch.tanh},
+        {"num_elites": 5},
+    ],
+    ids=lambda changes: ",".join(changes) or "default",
+)
 def test_one_step_is_what_mbrl_libs_own_sample_gives(changes: dict[str, Any]) -> None:
     model = theirs(**changes)
     ours, x, u = MbrlModel(model), torch.randn(2 * MEMBERS, DX), some_actions(1, 2 * MEMBERS)[:, 0]
@@ -160,7 +203,8 @@ def test_one_step_is_what_mbrl_libs_own_sample_gives(changes: dict[str, Any]) ->
 
 def test_another_object_is_refused_by_what_it_lacks() -> None:
     with pytest.raises(
-        TypeError, match=r"SimpleNamespace has no input_normalizer, .*model.num_members; expected an mbrl"
+        TypeError,
+        match=r"SimpleNamespace has no input_normalizer, .*model.num_members; expected an mbrl",
     ):
         MbrlModel(SimpleNamespace(model=torch.nn.Linear(2, 2)))  # type: ignore[arg-type]
 
@@ -169,9 +213,14 @@ def test_transitions_know_where_episodes_end() -> None:
     pytest.importorskip("mbrl.types")
     episodes = [np.arange(3 * (n + 1), dtype=np.float32).reshape(-1, 3) for n in (2, 4)]
     data = tsm.Trajectories.ragged(
-        episodes, [np.zeros((len(x) - 1, 1), np.float32) for x in episodes], "cart", 0.1, ("a", "b", "c"), ("1",) * 3,
+        episodes,
+        [np.zeros((len(x) - 1, 1), np.float32) for x in episodes],
+        "cart",
+        0.1,
+        ("a", "b", "c"),
+        ("1",) * 3,
         terminated=(True, False),
-    )  # fmt: skip
+    )
     batch = transition_batch(data)
     np.testing.assert_array_equal(batch.obs, np.concatenate([x[:-1] for x in episodes]))
     np.testing.assert_array_equal(batch.next_obs, np.concatenate([x[1:] for x in episodes]))
@@ -190,10 +239,15 @@ class ModelEnv:
 
     def returns(self, actions: Tensor, start: np.ndarray, particles: int) -> Tensor:
         tiled = np.tile(start, (particles * len(actions), 1)).astype(np.float32)
-        state, total = self.dynamics_model.reset(tiled, rng=self.generator), torch.zeros(len(tiled), 1)
+        state, total = (
+            self.dynamics_model.reset(tiled, rng=self.generator),
+            torch.zeros(len(tiled), 1),
+        )
         for u in actions.unbind(1):
             u = u.repeat_interleave(particles, dim=0)
-            x, rewards, ends, state = self.dynamics_model.sample(u, state, deterministic=False, rng=self.generator)
+            x, rewards, ends, state = self.dynamics_model.sample(
+                u, state, deterministic=False, rng=self.generator
+            )
             assert rewards is None
             assert ends is None
             total += self.reward(u, x)
@@ -203,15 +257,30 @@ class ModelEnv:
 def an_arms(cls: Any, **arguments: Any) -> Any:
     """A model of the arm with new weights, made for a little data, and the data."""
     torques = tsm.smooth_torques(12, 40, generator=torch.Generator().manual_seed(0))
-    data = tsm.collect(gymnasium.make_vec("tsm/Reacher-v0", num_envs=12), tsm.open_loop(torques), horizon=40, seed=0)
+    data = tsm.collect(
+        gymnasium.make_vec("tsm/Reacher-v0", num_envs=12),
+        tsm.open_loop(torques),
+        horizon=40,
+        seed=0,
+    )
     return cls.for_data(data, seed=0, **arguments), data
 
 
-MODELS = [(tsm.OneStep, {}), (tsm.LSTM, {"hidden": 8}), (tsm.TSM, {}), (tsm.RecurrentTSM, {}), (tsm.Ensemble, {})]
+MODELS = [
+    (tsm.OneStep, {}),
+    (tsm.LSTM, {"hidden": 8}),
+    (tsm.TSM, {}),
+    (tsm.RecurrentTSM, {}),
+    (tsm.Ensemble, {}),
+]
 
 
-@pytest.mark.parametrize(("cls", "arguments"), MODELS, ids=lambda part: getattr(part, "__name__", ""))
-def test_stepped_by_mbrl_lib_a_model_predicts_its_rollout(cls: Any, arguments: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("cls", "arguments"), MODELS, ids=lambda part: getattr(part, "__name__", "")
+)
+def test_stepped_by_mbrl_lib_a_model_predicts_its_rollout(
+    cls: Any, arguments: dict[str, Any]
+) -> None:
     model, data = an_arms(cls, **arguments)
     start, actions = torch.from_numpy(data.states[:4, 0]), torch.from_numpy(data.actions[:4, :25])
     past = initial_past(start, model.past_len, 2)
@@ -222,13 +291,17 @@ def test_stepped_by_mbrl_lib_a_model_predicts_its_rollout(cls: Any, arguments: d
         for u in actions.unbind(1):
             x, _, _, state = adapted.sample(u, state, deterministic=deterministic, rng=rng)
             found.append(x)
-        generator = None if deterministic or not model.stochastic else torch.Generator().manual_seed(3)
+        generator = (
+            None if deterministic or not model.stochastic else torch.Generator().manual_seed(3)
+        )
         step = stepper(model, past, generator=generator)
         with torch.no_grad():
             expected = torch.stack([step(u) for u in actions.unbind(1)], 1)
             torch.testing.assert_close(torch.stack(found, 1), expected)
             if deterministic:
-                torch.testing.assert_close(expected, rollout(model, past, actions), atol=1e-4, rtol=1e-4)
+                torch.testing.assert_close(
+                    expected, rollout(model, past, actions), atol=1e-4, rtol=1e-4
+                )
 
 
 def test_what_happened_before_is_the_past_of_a_rollout() -> None:
@@ -255,7 +328,9 @@ def test_a_state_is_stepped_on_from_once() -> None:
     adapted, u = ForModelEnv(model, 2), torch.zeros(3, 2)
     first = adapted.reset(data.states[:3, 0])
     adapted.sample(u, first, deterministic=True)
-    with pytest.raises(ValueError, match="0 steps after its reset, was stepped on before, to step 1"):
+    with pytest.raises(
+        ValueError, match="0 steps after its reset, was stepped on before, to step 1"
+    ):
         adapted.sample(u, first, deterministic=True)
 
 
@@ -263,12 +338,14 @@ def test_returns_by_model_env_are_those_of_a_rollout() -> None:
     model, data = an_arms(tsm.OneStep)
     task = tsm.Task.standard("tsm/Reacher-v0", data.states[:1, 0], torch.tensor([[0.1, 0.1]]))
     actions = torch.from_numpy(data.actions[:6, :20])
-    found = ModelEnv(ForModelEnv(model, 2), reward_function(task.reward), torch.Generator()).returns(
-        actions, data.states[0, 0], particles=2
-    )
+    found = ModelEnv(
+        ForModelEnv(model, 2), reward_function(task.reward), torch.Generator()
+    ).returns(actions, data.states[0, 0], particles=2)
     with torch.no_grad():
         states = rollout(
-            model, initial_past(torch.from_numpy(data.states[:1, 0]).repeat(6, 1), model.past_len, 2), actions
+            model,
+            initial_past(torch.from_numpy(data.states[:1, 0]).repeat(6, 1), model.past_len, 2),
+            actions,
         )
     expected = reach(torch.tensor([[0.1, 0.1]]))(states[:, None], actions[:, None]).sum(-1)[:, 0]
     torch.testing.assert_close(found, expected)
@@ -290,19 +367,36 @@ def test_an_agent_of_mbrl_lib_plans_in_our_model() -> None:
     omegaconf = pytest.importorskip("omegaconf")
     start = np.zeros(6, np.float32)
     found = model_env(
-        Pushed(), gymnasium.make("tsm/Reacher-v0"), lambda states, actions: -(states[..., :2] - 1).square().sum(-1),
+        Pushed(),
+        gymnasium.make("tsm/Reacher-v0"),
+        lambda states, actions: -(states[..., :2] - 1).square().sum(-1),
         generator=torch.Generator().manual_seed(0),
-    )  # fmt: skip
+    )
     assert found.action_space.high.tolist() == [1.0, 1.0]
     optimizer = {
-        "_target_": "mbrl.planning.CEMOptimizer", "num_iterations": 5, "elite_ratio": 0.1, "population_size": 100,
-        "alpha": 0.1, "device": "cpu", "lower_bound": "???", "upper_bound": "???", "return_mean_elites": True,
-    }  # fmt: skip
+        "_target_": "mbrl.planning.CEMOptimizer",
+        "num_iterations": 5,
+        "elite_ratio": 0.1,
+        "population_size": 100,
+        "alpha": 0.1,
+        "device": "cpu",
+        "lower_bound": "???",
+        "upper_bound": "???",
+        "return_mean_elites": True,
+    }
     agent = {
-        "_target_": "mbrl.planning.TrajectoryOptimizerAgent", "_recursive_": False, "optimizer_cfg": optimizer,
-        "action_lb": "???", "action_ub": "???", "planning_horizon": 8, "replan_freq": 1, "verbose": False,
-    }  # fmt: skip
-    made = planning.create_trajectory_optim_agent_for_model(found, omegaconf.OmegaConf.create(agent), num_particles=1)
+        "_target_": "mbrl.planning.TrajectoryOptimizerAgent",
+        "_recursive_": False,
+        "optimizer_cfg": optimizer,
+        "action_lb": "???",
+        "action_ub": "???",
+        "planning_horizon": 8,
+        "replan_freq": 1,
+        "verbose": False,
+    }
+    made = planning.create_trajectory_optim_agent_for_model(
+        found, omegaconf.OmegaConf.create(agent), num_particles=1
+    )
     torch.manual_seed(0)
     planned = torch.as_tensor(made.plan(start), dtype=torch.float32)[None]
     both = torch.cat([planned, torch.zeros_like(planned)])
@@ -314,5 +408,7 @@ def test_an_agent_of_mbrl_lib_plans_in_our_model() -> None:
 def test_without_mbrl_lib_it_is_said_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mbrl.models", None)
     model, _ = an_arms(tsm.OneStep)
-    with pytest.raises(ImportError, match=r"pip install 'tsmlib\[mbrl\]', then pip install --no-deps mbrl"):
+    with pytest.raises(
+        ImportError, match=r"pip install 'tsmlib\[mbrl\]', then pip install --no-deps mbrl"
+    ):
         model_env(model, gymnasium.make("tsm/Reacher-v0"), lambda states, actions: states[..., 0])

@@ -16,7 +16,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Space
 
 import tsmlib as tsm
 from tsmlib.storage.files import StoreError
-from tsmlib.storage.minari import load_minari, save_minari
+from tsmlib.contrib.minari import load_minari, save_minari
 from tsmlib.trajectory import Trajectories
 
 minari = pytest.importorskip("minari")
@@ -32,10 +32,15 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(
-    lengths: tuple[int, ...] = (5, 5), *, ended: tuple[int, ...] = (), observations: Space | None = None,
-    actions: Space | None = None, dtype: Any = np.float32, change: Callable[[list[Any]], Any] = lambda episodes: None,
+    lengths: tuple[int, ...] = (5, 5),
+    *,
+    ended: tuple[int, ...] = (),
+    observations: Space | None = None,
+    actions: Space | None = None,
+    dtype: Any = np.float32,
+    change: Callable[[list[Any]], Any] = lambda episodes: None,
     **options: Any,
-) -> Path:  # fmt: skip
+) -> Path:
     """A data set that Minari itself wrote. Episode i has the states i + 0.01 t and draws its actions from the space."""
     observed = observations or Box(-np.inf, np.inf, (DX,), dtype)
     acted = actions or Box(-1, 1, (DU,), np.float32)
@@ -44,20 +49,30 @@ def written(
     for i, steps in enumerate(lengths):
         x = (i + 0.01 * np.arange(steps + 1, dtype=dtype))[:, None] + np.zeros(DX, dtype)
         last = np.arange(steps) == steps - 1
-        episodes.append(dict(
-            observations={"x": x} if isinstance(observed, Dict) else np.broadcast_to(
-                x.reshape(len(x), *[1] * (len(observed.shape or ()) - 1), DX), (len(x), *observed.shape)
-            ).astype(observed.dtype),
-            actions=np.stack([acted.sample() for _ in range(steps)]), rewards=np.zeros(steps),
-            terminations=last & (i in ended), truncations=last & (i not in ended),
-        ))  # fmt: skip
+        episodes.append(
+            dict(
+                observations={"x": x}
+                if isinstance(observed, Dict)
+                else np.broadcast_to(
+                    x.reshape(len(x), *[1] * (len(observed.shape or ()) - 1), DX),
+                    (len(x), *observed.shape),
+                ).astype(observed.dtype),
+                actions=np.stack([acted.sample() for _ in range(steps)]),
+                rewards=np.zeros(steps),
+                terminations=last & (i in ended),
+                truncations=last & (i not in ended),
+            )
+        )
     change(episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         made = minari.create_dataset_from_buffers(
-            "made/data-v0", [minari.data_collector.EpisodeBuffer(**episode) for episode in episodes],
-            observation_space=observed, action_space=acted, **options,
-        )  # fmt: skip
+            "made/data-v0",
+            [minari.data_collector.EpisodeBuffer(**episode) for episode in episodes],
+            observation_space=observed,
+            action_space=acted,
+            **options,
+        )
     return Path(made.spec.data_path).parent
 
 
@@ -74,7 +89,11 @@ SHAPES: dict[str, dict[str, Any]] = {
     "one episode": {"lengths": (6,)},
     "all terminated": {"lengths": (4, 4), "ended": (0, 1)},
     "float64": {"dtype": np.float64, "lengths": (5, 2)},
-    "with an environment": {"env": "Pendulum-v1", "lengths": (3, 2), "actions": Box(-2, 2, (1,), np.float32)},
+    "with an environment": {
+        "env": "Pendulum-v1",
+        "lengths": (3, 2),
+        "actions": Box(-2, 2, (1,), np.float32),
+    },
     "asymmetric bounds": {"actions": Box(LOW, HIGH, dtype=np.float32), "lengths": (5, 4)},
     "float64 actions": {"actions": Box(-0.4, 0.4, (DU,), np.float64)},
     "whole numbers": {"observations": Box(0, 9, (DX,), np.int64)},
@@ -86,7 +105,9 @@ SHAPES: dict[str, dict[str, Any]] = {
 def test_what_minari_wrote_is_read_as_it_is(shape: str) -> None:
     options = SHAPES[shape]
     folder, lengths = written(**options), options.get("lengths", (5, 5))
-    with pytest.warns(UserWarning, match="does not say how long a step is; one step counts as one second. Say dt="):
+    with pytest.warns(
+        UserWarning, match="does not say how long a step is; one step counts as one second. Say dt="
+    ):
         data = load_minari(folder)
     states, actions = oracle(folder)
     space = options.get("actions", Box(-1, 1, (DU,)))
@@ -100,12 +121,17 @@ def test_what_minari_wrote_is_read_as_it_is(shape: str) -> None:
     for i, steps in enumerate(lengths):
         np.testing.assert_array_equal(data.states[i, : steps + 1], states[i].astype(np.float32))
         for k in range(steps):
-            scaled = [2 * (u - a) / (b - a) - 1 for u, a, b in zip(actions[i][k], space.low, space.high, strict=True)]
+            scaled = [
+                2 * (u - a) / (b - a) - 1
+                for u, a, b in zip(actions[i][k], space.low, space.high, strict=True)
+            ]
             np.testing.assert_allclose(data.actions[i, k], scaled, atol=1e-6)
 
 
 def test_what_data_mean_can_be_said(recwarn: pytest.WarningsRecorder) -> None:
-    given: dict[str, Any] = dict(env="cart", dt=0.05, names=("a", "b", "c"), units=("m", "m/s", "rad"), angles=(2,))
+    given: dict[str, Any] = dict(
+        env="cart", dt=0.05, names=("a", "b", "c"), units=("m", "m/s", "rad"), angles=(2,)
+    )
     data = load_minari(written(), **given)
     assert {name: getattr(data, name) for name in given} == given
     assert not recwarn.list
@@ -137,19 +163,31 @@ def too_few_states(episodes: list[Any]) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"observations": Dict({"x": Box(-1, 1, (DX,))})}, "observations are a dictionary, .*supported are"),
+        (
+            {"observations": Dict({"x": Box(-1, 1, (DX,))})},
+            "observations are a dictionary, .*supported are",
+        ),
         ({"actions": Discrete(3)}, "actions are discrete, .*Discrete.*supported are"),
-        ({"observations": Box(0, 255, (4, DX), np.uint8)}, "observations are images, .*supported are"),
-        ({"actions": Box(-np.inf, np.inf, (DU,), np.float32)}, "actions have no bounds, .*Trajectories.ragged"),
+        (
+            {"observations": Box(0, 255, (4, DX), np.uint8)},
+            "observations are images, .*supported are",
+        ),
+        (
+            {"actions": Box(-np.inf, np.inf, (DU,), np.float32)},
+            "actions have no bounds, .*Trajectories.ragged",
+        ),
         ({"actions": Box(0, np.inf, (DU,), np.float32)}, "actions have no bounds"),
         ({"change": goes_on}, "episode 0 goes on after its termination at step 2"),
         ({"change": beyond}, "actions of episode 1 leave the action space, by a factor of 3"),
         ({"change": not_finite}, "not finite, the first in episode 1, step 2, field 'x1'"),
         ({"change": too_few_states}, r"states \(5, 3\) and actions \(5, 2\) of episode 1"),
-        ({"lengths": (60_000, *[1] * 100)}, "101 episodes of up to 60000 steps, padded to one length, take"),
+        (
+            {"lengths": (60_000, *[1] * 100)},
+            "101 episodes of up to 60000 steps, padded to one length, take",
+        ),
     ],
     ids=lambda part: "" if isinstance(part, dict) else part[:30],
-)  # fmt: skip
+)
 def test_another_kind_of_data_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     folder = written(**options)
     with pytest.raises(StoreError, match=message) as caught:
@@ -160,10 +198,38 @@ def test_another_kind_of_data_is_refused_by_name(options: dict[str, Any], messag
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"tsmlib": {"env": 3, "dt": 1, "names": ["a"] * 3, "units": ["m"] * 3, "angles": []}}, "expected texts"),
-        ({"tsmlib": {"env": "a", "dt": -1, "names": ["a"] * 3, "units": ["m"] * 3, "angles": []}}, "dt is -1"),
-        ({"tsmlib": {"env": "a", "dt": 1, "names": ["a"] * 3, "units": ["m"] * 3, "angles": [3]}}, "angles are"),
-        ({"tsmlib": {"env": "a", "dt": 1, "names": ["a"] * 2, "units": ["m"] * 3, "angles": []}}, "2 names"),
+        (
+            {"tsmlib": {"env": 3, "dt": 1, "names": ["a"] * 3, "units": ["m"] * 3, "angles": []}},
+            "expected texts",
+        ),
+        (
+            {
+                "tsmlib": {
+                    "env": "a",
+                    "dt": -1,
+                    "names": ["a"] * 3,
+                    "units": ["m"] * 3,
+                    "angles": [],
+                }
+            },
+            "dt is -1",
+        ),
+        (
+            {
+                "tsmlib": {
+                    "env": "a",
+                    "dt": 1,
+                    "names": ["a"] * 3,
+                    "units": ["m"] * 3,
+                    "angles": [3],
+                }
+            },
+            "angles are",
+        ),
+        (
+            {"tsmlib": {"env": "a", "dt": 1, "names": ["a"] * 2, "units": ["m"] * 3, "angles": []}},
+            "2 names",
+        ),
         ({"tsmlib": []}, "no usable Minari"),
         ({"env_spec": json.dumps({"id": ["os:system"]})}, "expected texts"),
         ({"data_format": "arrow"}, "in the format 'arrow', expected 'hdf5'"),
@@ -183,8 +249,13 @@ def test_ours_comes_back_as_it_was(recwarn: pytest.WarningsRecorder) -> None:
     data = Trajectories.ragged(
         [rng.normal(size=(n + 1, DX)).astype(np.float32) for n in sizes],
         [rng.uniform(-1, 1, (n, DU)).astype(np.float32) for n in sizes],
-        "my-cart", 0.05, ("a", "b", "c"), ("m", "m/s", "rad"), (2,), terminated=(False, True, True),
-    )  # fmt: skip
+        "my-cart",
+        0.05,
+        ("a", "b", "c"),
+        ("m", "m/s", "rad"),
+        (2,),
+        terminated=(False, True, True),
+    )
     folder = save_minari("made/cart-v0", data, rewards=np.arange(27.0).reshape(3, 9))
     again = load_minari(folder)
     for name in ("env", "dt", "names", "units", "angles", "lengths", "terminated"):
@@ -193,13 +264,21 @@ def test_ours_comes_back_as_it_was(recwarn: pytest.WarningsRecorder) -> None:
     np.testing.assert_array_equal(again.actions, data.actions)
     theirs = list(minari.load_dataset("made/cart-v0").iterate_episodes())
     assert [episode.rewards.tolist() for episode in theirs] == [[0, 1, 2, 3], [*range(9, 18)], [18]]
-    assert [(episode.terminations[-1], episode.truncations[-1]) for episode in theirs] == [(0, 1), (1, 0), (1, 0)]
+    assert [(episode.terminations[-1], episode.truncations[-1]) for episode in theirs] == [
+        (0, 1),
+        (1, 0),
+        (1, 0),
+    ]
     assert not [warning for warning in recwarn.list if "second" in str(warning.message)]
 
 
 def test_data_of_an_environment_are_written_in_its_own_units_and_replay_in_it() -> None:
-    torques = tsm.smooth_torques(3, 20, generator=torch.Generator().manual_seed(0), action_dim=1, rms=0.5, dt=0.05)
-    data = tsm.collect(gymnasium.make_vec("Pendulum-v1", num_envs=3), tsm.open_loop(torques), horizon=20, seed=7)
+    torques = tsm.smooth_torques(
+        3, 20, generator=torch.Generator().manual_seed(0), action_dim=1, rms=0.5, dt=0.05
+    )
+    data = tsm.collect(
+        gymnasium.make_vec("Pendulum-v1", num_envs=3), tsm.open_loop(torques), horizon=20, seed=7
+    )
     save_minari("made/pendulum-v0", data)
     again = load_minari("made/pendulum-v0")
     np.testing.assert_allclose(again.actions, data.actions, atol=1e-6)
@@ -210,11 +289,15 @@ def test_data_of_an_environment_are_written_in_its_own_units_and_replay_in_it() 
     episode = next(iter(theirs.iterate_episodes()))
     assert np.abs(episode.actions).max() > 1.0
     env.reset(seed=7)
-    np.testing.assert_allclose([env.step(u)[0] for u in episode.actions], episode.observations[1:], atol=1e-5)
+    np.testing.assert_allclose(
+        [env.step(u)[0] for u in episode.actions], episode.observations[1:], atol=1e-5
+    )
 
 
 def test_data_of_an_arm_and_of_its_variant_come_back() -> None:
-    for number, env in enumerate(("tsm/Reacher-v0", tsm.envs.variant("tsm/Reacher-v0", damping=2.0))):
+    for number, env in enumerate(
+        ("tsm/Reacher-v0", tsm.envs.variant("tsm/Reacher-v0", damping=2.0))
+    ):
         arms = gymnasium.make_vec(env, num_envs=2)
         data = tsm.collect(arms, tsm.open_loop(torch.zeros(2, 5, 2)), horizon=5, seed=0)
         again = load_minari(save_minari(f"made/arm-v{number}", data))

@@ -38,14 +38,19 @@ def recurrent(seed: int) -> tsm.RecurrentTSM:
 
 def given(n: int = B, steps: int = T) -> tuple[Segment, Tensor]:
     noise = drawn(7)
-    past = Segment(torch.randn(n, 10, DX, generator=noise).double(), torch.randn(n, 10, DU, generator=noise).double())
+    past = Segment(
+        torch.randn(n, 10, DX, generator=noise).double(),
+        torch.randn(n, 10, DU, generator=noise).double(),
+    )
     return past, torch.randn(n, steps, DU, generator=noise).double()
 
 
 def test_the_mode_is_the_mean_of_the_models_modes() -> None:
     models, (past, actions) = [one_step(0), recurrent(1)], given()
     found = tsm.rollout(tsm.Mixture(models), past, actions)
-    assert torch.allclose(found, torch.stack([tsm.rollout(model, past, actions) for model in models]).mean(0))
+    assert torch.allclose(
+        found, torch.stack([tsm.rollout(model, past, actions) for model in models]).mean(0)
+    )
 
 
 def test_a_sample_is_a_rollout_of_one_of_the_models_to_its_end() -> None:
@@ -71,10 +76,17 @@ def test_planners_are_shown_the_mode_of_each_model() -> None:
 
 @pytest.mark.parametrize(
     "noise",
-    [lambda: None, lambda: drawn(5), lambda: SharedNoise(drawn(5), 3), lambda: SeparateNoise((drawn(5), drawn(6)))],
+    [
+        lambda: None,
+        lambda: drawn(5),
+        lambda: SharedNoise(drawn(5), 3),
+        lambda: SeparateNoise((drawn(5), drawn(6))),
+    ],
     ids=["mode", "generator", "shared", "separate"],
 )
-def test_a_step_at_a_time_gives_the_states_of_the_rollout(noise: Callable[[], Noise | None]) -> None:
+def test_a_step_at_a_time_gives_the_states_of_the_rollout(
+    noise: Callable[[], Noise | None],
+) -> None:
     mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given(6)
     step = stepper(mixture, past, generator=noise())
     found = torch.stack([step(u) for u in actions.unbind(1)], dim=1)
@@ -84,7 +96,9 @@ def test_a_step_at_a_time_gives_the_states_of_the_rollout(noise: Callable[[], No
 def test_candidates_are_compared_in_the_same_futures() -> None:
     mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
     states = tsm.model_predictor(mixture, past, samples=6, seed=2)(actions[None].repeat(3, 1, 1, 1))
-    torch.testing.assert_close(states[:, 0], states[:, 1], rtol=0, atol=1e-12)  # some processors round rows differently
+    torch.testing.assert_close(
+        states[:, 0], states[:, 1], rtol=0, atol=1e-12
+    )  # some processors round rows differently
     torch.testing.assert_close(states[:, 0], states[:, 2], rtol=0, atol=1e-12)
     assert not torch.equal(states[0], states[1])
 
@@ -92,14 +106,18 @@ def test_candidates_are_compared_in_the_same_futures() -> None:
 def test_rows_that_share_noise_share_the_model_and_what_it_draws() -> None:
     mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given()
     twice = Segment(*(part.repeat(2, 1, 1) for part in past))
-    found = predict_segment(mixture, twice, actions.repeat(2, 1, 1), generator=SharedNoise(drawn(1), B))
+    found = predict_segment(
+        mixture, twice, actions.repeat(2, 1, 1), generator=SharedNoise(drawn(1), B)
+    )
     torch.testing.assert_close(found[:B], found[B:], rtol=0, atol=1e-12)
 
 
 def test_copies_draw_as_each_alone() -> None:
     mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
     twice = Segment(*(part.repeat(2, 1, 1) for part in past))
-    both = predict_segment(mixture, twice, actions.repeat(2, 1, 1), generator=SeparateNoise((drawn(1), drawn(2))))
+    both = predict_segment(
+        mixture, twice, actions.repeat(2, 1, 1), generator=SeparateNoise((drawn(1), drawn(2)))
+    )
     for part, seed in zip(both.split(B), (1, 2), strict=True):
         assert torch.allclose(part, predict_segment(mixture, past, actions, generator=drawn(seed)))
 
@@ -107,7 +125,9 @@ def test_copies_draw_as_each_alone() -> None:
 def test_copies_with_generators_of_their_own_within_shared_noise_are_refused() -> None:
     mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
     with pytest.raises(TypeError, match="several generators in SharedNoise; a Mixture takes one"):
-        predict_segment(mixture, past, actions, generator=SharedNoise(SeparateNoise((drawn(1),)), B))
+        predict_segment(
+            mixture, past, actions, generator=SharedNoise(SeparateNoise((drawn(1),)), B)
+        )
 
 
 def test_gradients_reach_the_actions() -> None:
@@ -119,11 +139,19 @@ def test_gradients_reach_the_actions() -> None:
 
 def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     env = "tsm/Reacher-v0"
-    mixture = tsm.Mixture([tsm.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "ensemble+mse")])
+    mixture = tsm.Mixture(
+        [tsm.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "ensemble+mse")]
+    )
     task, prior = tsm.load_task(env).take(2), tsm.load_pretrained("prior", env=env)
     past, space = task.past(mixture.past_len), tsm.LatentActions(prior, task.horizon)
     plan = tsm.cem(
-        tsm.model_predictor(mixture, past), task.reward, space, len(task), candidates=8, elites=2, iterations=2
+        tsm.model_predictor(mixture, past),
+        task.reward,
+        space,
+        len(task),
+        candidates=8,
+        elites=2,
+        iterations=2,
     )
     plan = tsm.reevaluate(plan, tsm.fresh_predictor(mixture, past, seed=1), task.reward)
     trial = tsm.execute(task, plan)
@@ -142,10 +170,16 @@ def test_each_member_of_each_model_judges_a_candidate() -> None:
 def test_what_is_no_models_of_one_environment_is_refused() -> None:
     with pytest.raises(ValueError, match="a mixture of no models"):
         tsm.Mixture([])
-    with pytest.raises(TypeError, match=r"a mixture of a OneStep; expected a list of models, as in Mixture\(\[one, "):
+    with pytest.raises(
+        TypeError,
+        match=r"a mixture of a OneStep; expected a list of models, as in Mixture\(\[one, ",
+    ):
         tsm.Mixture(one_step(0))  # type: ignore[arg-type]
     other = in_units(tsm.OneStep(10, DU, angles=(0, 1), hidden=16, layers=2))
-    with pytest.raises(ValueError, match=r"6 dimensions with angles \[0, 1\] and 10 dim.*expected models of one env"):
+    with pytest.raises(
+        ValueError,
+        match=r"6 dimensions with angles \[0, 1\] and 10 dim.*expected models of one env",
+    ):
         tsm.Mixture([one_step(0), other])
 
 

@@ -18,11 +18,11 @@ from tsmlib.models.features import Features
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import tables
-from tsmlib.study import pendulum, zoo
-from tsmlib.study.comparison import published
-from tsmlib.study.results.policies import finished_on_arms, gradients, learning_curves
-from tsmlib.study.results.table import select
-from tsmlib.study.runs import ROOT
+from tsmlib import zoo
+from reproduction.comparison import published
+from reproduction.results.policies import finished_on_arms, gradients, learning_curves
+from reproduction.results.table import select
+from reproduction.runs import ROOT
 
 FOLDER = ROOT / "benchmarks" / "model_free"
 needs_sb3 = pytest.mark.skipif(
@@ -30,7 +30,8 @@ needs_sb3 = pytest.mark.skipif(
     reason="Stable-Baselines3 and sb3-contrib are not installed; benchmarks/model_free/README.md tells how",
 )
 needs_sbx = pytest.mark.skipif(
-    not importlib.util.find_spec("sbx"), reason="SBX is not installed; benchmarks/model_free/README.md tells how"
+    not importlib.util.find_spec("sbx"),
+    reason="SBX is not installed; benchmarks/model_free/README.md tells how",
 )
 
 
@@ -39,7 +40,9 @@ model_free = load_script(FOLDER / "model_free.py")
 
 def driven(episodes: Any, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What is observed after each of actions (n, T, du), and the rewards: one batch of whole episodes."""
-    seen, rewards, over = zip(*(episodes.step(actions[:, step]) for step in range(actions.shape[1])), strict=True)
+    seen, rewards, over = zip(
+        *(episodes.step(actions[:, step]) for step in range(actions.shape[1])), strict=True
+    )
     assert over == (False,) * (actions.shape[1] - 1) + (True,)
     return np.stack(seen, axis=1), np.stack(rewards, axis=1)
 
@@ -48,9 +51,14 @@ def played(env: str, n: int = 4) -> tuple[Task, torch.Tensor, np.ndarray, np.nda
     """One batch of episodes with random torques: the task, the actions (n, T, 2), what was observed, the rewards."""
     episodes = model_free.Episodes(env, n, seed=3)
     episodes.reset()
-    start, target = episodes.robots._states.astype(np.float32), episodes.robots.target.astype(np.float32)
+    start, target = (
+        episodes.robots._states.astype(np.float32),
+        episodes.robots.target.astype(np.float32),
+    )
     task = Task.standard(env, start, torch.from_numpy(target))
-    episodes.robots.reset(options={"states": start, "target": target})  # as a task keeps them, in single precision
+    episodes.robots.reset(
+        options={"states": start, "target": target}
+    )  # as a task keeps them, in single precision
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (n, task.horizon, 2)).astype(np.float32)
     seen, rewards = driven(episodes, actions)
     seen = np.concatenate([model_free.observed(start, target)[:, None], seen], axis=1)
@@ -63,7 +71,8 @@ def test_the_same_actions_give_the_states_and_rewards_of_execute(env: str) -> No
     trial = execute(task, actions)
     states = trial.states.numpy()
     flat = model_free.observed(
-        states.reshape(-1, states.shape[2]), np.repeat(task.target.numpy(), task.horizon + 1, axis=0)
+        states.reshape(-1, states.shape[2]),
+        np.repeat(task.target.numpy(), task.horizon + 1, axis=0),
     )
     np.testing.assert_allclose(seen.reshape(len(flat), -1), flat, rtol=1e-6, atol=1e-6)
     per_step = task.reward(trial.states[:, 1:], actions)
@@ -77,7 +86,9 @@ def test_pendulums_do_and_earn_what_the_task_of_the_rounds_says() -> None:
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (3, task.horizon, 1)).astype(np.float32)
     first, (seen, rewards) = episodes.reset(), driven(episodes, actions)
     trial = execute(task, torch.from_numpy(actions).clamp(-1, 1))
-    np.testing.assert_allclose(np.concatenate([first[:, None], seen], axis=1), trial.states, atol=1e-5)
+    np.testing.assert_allclose(
+        np.concatenate([first[:, None], seen], axis=1), trial.states, atol=1e-5
+    )
     np.testing.assert_allclose(rewards.sum(1), trial.executed_return, atol=1e-4)
 
 
@@ -88,18 +99,25 @@ def test_training_seeds_share_no_start_of_the_pendulum() -> None:
 
 
 def test_the_pendulum_is_measured_from_the_starts_of_its_rounds_and_chosen_from_others() -> None:
-    tested, chosen = (model_free.SETUPS[pendulum.PENDULUM].task(split) for split in ("test", "validation"))
+    tested, chosen = (
+        model_free.SETUPS[pendulum.PENDULUM].task(split) for split in ("test", "validation")
+    )
     np.testing.assert_array_equal(tested.start, pendulum.swing_up(8, seed=pendulum.TESTED).start)
     assert not (tested.start[:, None] == chosen.start).all(2).any()
     found = model_free.measured(tested, lambda seen: np.zeros((len(seen), 1)))
     trial = execute(tested, torch.zeros(8, tested.horizon, 1))
-    assert found == {"return_true": pytest.approx(float(trial.executed_return.mean()), abs=1e-4), "success": 0.0}
+    assert found == {
+        "return_true": pytest.approx(float(trial.executed_return.mean()), abs=1e-4),
+        "success": 0.0,
+    }
 
 
 def test_a_policy_sees_what_ours_see_and_the_target() -> None:
     states, target = np.random.default_rng(0).normal(size=(5, 10)), np.arange(10.0).reshape(5, 2)
     ours = Features(10, (0, 1))(torch.from_numpy(states).float())
-    np.testing.assert_allclose(model_free.observed(states, target), np.concatenate([ours, target], axis=1), rtol=1e-6)
+    np.testing.assert_allclose(
+        model_free.observed(states, target), np.concatenate([ours, target], axis=1), rtol=1e-6
+    )
 
 
 def test_new_episodes_have_other_starts_and_targets_within_the_disc() -> None:
@@ -128,17 +146,29 @@ def test_the_first_configurations_try_each_pair_of_values_once() -> None:
         for pair in (list(settings[0])[:2], list(settings[0])[1:], list(settings[0])[::2]):
             assert len({tuple(setting[name] for name in pair) for setting in settings[:4]}) == 4
         for setting in settings:
-            assert setting["episodes"] * model_free.SETUPS["tsm/Reacher-v0"].horizon % model_free.MINIBATCH == 0
+            assert (
+                setting["episodes"]
+                * model_free.SETUPS["tsm/Reacher-v0"].horizon
+                % model_free.MINIBATCH
+                == 0
+            )
 
 
 def records(*steps: int) -> list[dict[str, float]]:
-    return [dict.fromkeys(model_free.UNITS, -1.0 - i) | {"steps": step} for i, step in enumerate(steps)]
+    return [
+        dict.fromkeys(model_free.UNITS, -1.0 - i) | {"steps": step} for i, step in enumerate(steps)
+    ]
 
 
 def test_a_finished_run_is_found_again_and_replaces_a_shorter_one(tmp_path: Path) -> None:
     path, task = tmp_path / "model_free.csv", study.load_task("tsm/Reacher-v0")
     key = dict(env=task.env, model="ppo", subset="", configuration="std=0.14", seed=1)
-    for other in ({"seed": 2}, {"model": "trpo"}, {"subset": "search"}, {"configuration": "std=0.37"}):
+    for other in (
+        {"seed": 2},
+        {"model": "trpo"},
+        {"subset": "search"},
+        {"configuration": "std=0.37"},
+    ):
         model_free.Table(path).put(key | other, task, records(0, 500))
     table = model_free.Table(path)
     assert table.kept(key, 1) == []
@@ -163,10 +193,15 @@ def test_its_rows_are_curves_of_figure_7(tmp_path: Path) -> None:
     assert "iterations" not in curves
 
 
-def test_rows_of_the_pendulum_are_those_of_its_rounds_and_have_no_part_in_figure_7(tmp_path: Path) -> None:
+def test_rows_of_the_pendulum_are_those_of_its_rounds_and_have_no_part_in_figure_7(
+    tmp_path: Path,
+) -> None:
     table, env = model_free.Table(tmp_path / "model_free.csv"), pendulum.PENDULUM
     key = dict(env=env, model="ppo", subset="", configuration="std=0.14", seed=0)
-    found = [{name: value for name, value in one.items() if name != "final_distance"} for one in records(0, 2000)]
+    found = [
+        {name: value for name, value in one.items() if name != "final_distance"}
+        for one in records(0, 2000)
+    ]
     rows = tables.frame(table.put(key, model_free.SETUPS[env].task("test"), found))
     theirs = select(published("10_explore"), env=env, metric="return_true")
     own = select(tables.load(table.path), metric="return_true")
@@ -192,7 +227,10 @@ def test_numbers_that_make_no_run_are_refused(tmp_path: Path, arguments: list[st
 def test_a_short_run_learns_from_the_first_to_the_last_record(algorithm: str) -> None:
     setting = dict(model_free.SETTINGS[algorithm][0], episodes=5)
     task = study.load_task("tsm/Reacher-v0", "validation").take(5)
-    runs = [list(model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0)) for _ in range(2)]
+    runs = [
+        list(model_free.learn(algorithm, task, setting, steps=500, records=2, seed=0))
+        for _ in range(2)
+    ]
     assert [record["steps"] for record in runs[0]] == [0, 250, 500]
     returns = [[record["return_true"] for record in found] for found in runs]
     assert returns[0] == returns[1]
@@ -225,9 +263,22 @@ def test_the_library_is_told_how_an_episode_ended() -> None:
 
 
 @needs_sb3
-def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_whole_study_is_not_repeated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "model_free.csv"
-    command = ["--env", "tsm/Reacher-v0", "--algorithm", "trpo", "--steps", "50", "--seeds", "2", "--records", "1"]
+    command = [
+        "--env",
+        "tsm/Reacher-v0",
+        "--algorithm",
+        "trpo",
+        "--steps",
+        "50",
+        "--seeds",
+        "2",
+        "--records",
+        "1",
+    ]
     for _ in range(2):
         model_free.main([*command, "--out", str(path)])
     first, second = capsys.readouterr().out.split(f"{path}\n")[:2]
@@ -239,7 +290,9 @@ def test_the_whole_study_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize(("without", "starts"), [("", True), ("lazy-loader", False)])
-def test_the_script_starts_where_nothing_is_installed_but_the_requirements(without: str, starts: bool) -> None:
+def test_the_script_starts_where_nothing_is_installed_but_the_requirements(
+    without: str, starts: bool
+) -> None:
     names = [name for name in pins(FOLDER / "requirements.txt") if name != without]
     code, said = start_with_only(FOLDER / "model_free.py", names)
     assert (code == 0) is starts, said[-500:]
@@ -249,7 +302,9 @@ def test_the_script_starts_where_nothing_is_installed_but_the_requirements(witho
 def test_pins_are_those_of_the_lock_where_both_name_a_package() -> None:
     own, lock = pins(FOLDER / "requirements.txt"), pins(ROOT / "environment.lock")
     assert {"stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco"} <= set(own)
-    assert {name: lock[name] for name in own if name in lock} == {k: v for k, v in own.items() if k in lock}
+    assert {name: lock[name] for name in own if name in lock} == {
+        k: v for k, v in own.items() if k in lock
+    }
 
 
 def test_the_readme_states_what_is_run() -> None:
@@ -262,11 +317,19 @@ def test_the_readme_states_what_is_run() -> None:
     known = {option for action in model_free.parser()._actions for option in action.option_strings}
     assert set(re.findall(r"`?(--(?!no-deps)[a-z]+)", readme)) <= known
     steps = model_free.STEPS
-    assert f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v1']:,} pushing" in readme
+    assert (
+        f"{steps['tsm/Reacher-v0']:,} steps reaching, {steps['tsm/ReacherPush-v1']:,} pushing"
+        in readme
+    )
     steps = model_free.SEARCH_STEPS
-    assert f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v1']:,} for" in readme
+    assert (
+        f"{steps['tsm/Reacher-v0']:,} steps each for reaching and {steps['tsm/ReacherPush-v1']:,} for"
+        in readme
+    )
     for name in ("learning_rate", "target_kl", "episodes", "std", "updates"):
-        values = sorted({s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s})
+        values = sorted(
+            {s[name] for settings in model_free.SETTINGS.values() for s in settings if name in s}
+        )
         assert all(re.search(rf"\b{value:g}\b", readme) for value in values), name
     assert f"minibatches of {model_free.MINIBATCH} steps" in readme
     assert f"gamma {model_free.GAMMA}" in readme

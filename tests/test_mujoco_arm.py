@@ -50,12 +50,16 @@ def smooth_torques(n: int, rms: float, steps: int = 100, seed: int = 0) -> np.nd
 
 def full_torques(n: int, steps: int = 100, seed: int = 0) -> np.ndarray:
     """Actions (n, steps, 2) of -1 or 1 that jump every tenth step; in a third of the episodes they never jump."""
-    actions = np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], (n, steps // 10, 2)), 10, axis=1)
+    actions = np.repeat(
+        np.random.default_rng(seed).choice([-1.0, 1.0], (n, steps // 10, 2)), 10, axis=1
+    )
     actions[: n // 3] = actions[: n // 3, :1]
     return actions
 
 
-def at_rest(q: tuple[float, float], block: tuple[float, float], velocity: tuple[float, float] = (0, 0)) -> np.ndarray:
+def at_rest(
+    q: tuple[float, float], block: tuple[float, float], velocity: tuple[float, float] = (0, 0)
+) -> np.ndarray:
     """A state (1, 10)."""
     return np.array([[*q, 0.0, 0.0, *fingertip(np.array(q)), *block, *velocity]])
 
@@ -121,16 +125,23 @@ def test_the_closest_gap_is_the_distance_that_mujoco_measures(env_id: str) -> No
             data.mocap_pos[0, :2] = state[6:8]
         mujoco.mj_kinematics(model, data)
         links = [model.geom(name).id for name in ("link0", "link1", "fingertip")]
-        distance = min(mujoco.mj_geomDistance(model, data, link, model.geom("block").id, 1.0, None) for link in links)
+        distance = min(
+            mujoco.mj_geomDistance(model, data, link, model.geom("block").id, 1.0, None)
+            for link in links
+        )
         assert gap == pytest.approx(distance, abs=1e-9)
 
 
 def test_an_untouched_object_does_not_move() -> None:
     env, start = arms(PUSH, 200)
     states = env.rollout(smooth_torques(200, DATA_RMS))
-    untouched = (closest_gap(states, PUSH) > 0.02).all(axis=1)  # further away than the arm moves in a step
+    untouched = (closest_gap(states, PUSH) > 0.02).all(
+        axis=1
+    )  # further away than the arm moves in a step
     assert untouched.sum() > 40
-    np.testing.assert_array_equal(states[untouched, :, 6:], np.repeat(start[untouched, None, 6:], 100, axis=1))
+    np.testing.assert_array_equal(
+        states[untouched, :, 6:], np.repeat(start[untouched, None, 6:], 100, axis=1)
+    )
 
 
 def test_an_obstacle_never_moves_and_stops_the_arm() -> None:
@@ -143,25 +154,37 @@ def test_an_obstacle_never_moves_and_stops_the_arm() -> None:
     states = env.rollout(press)
     assert (states[:, -1, 0] < np.pi / 2).all()  # it would have turned several times
     assert np.abs(states[:, -20:, 2]).max() < 0.05
-    assert np.abs(closest_gap(states[:, -20:], OBSTACLE)).max() < 1e-4  # even 200 N m do not press it in
+    assert (
+        np.abs(closest_gap(states[:, -20:], OBSTACLE)).max() < 1e-4
+    )  # even 200 N m do not press it in
 
 
 def test_the_object_bounces_off_the_walls_and_slows_down() -> None:
-    for block, velocity in (((0.2, 0.1), (1.5, 0.0)), ((0.1, -0.2), (0.0, -1.5)), ((-0.2, 0.1), (-1.5, 0))):
+    for block, velocity in (
+        ((0.2, 0.1), (1.5, 0.0)),
+        ((0.1, -0.2), (0.0, -1.5)),
+        ((-0.2, 0.1), (-1.5, 0)),
+    ):
         env, _ = arms(PUSH, 1)
         env.reset(options={"states": at_rest((1.0, 2.0), block, velocity)})
         states = env.rollout(np.zeros((1, 100, 2)))[0]
         axis = int(np.argmax(np.abs(velocity)))
         position, speed = np.abs(states[:, 6 + axis]), states[:, 8 + axis] / velocity[axis]
         assert (closest_gap(states, PUSH) > 0.01).all()
-        hit = 1.5 - (ROOM - abs(block[axis])) / BLOCK_DECAY  # m/s; a free object loses its travel / decay time
+        hit = (
+            1.5 - (ROOM - abs(block[axis])) / BLOCK_DECAY
+        )  # m/s; a free object loses its travel / decay time
         step = 3  # the bounce is over
-        left = 1.5 * -speed[step] * np.exp((step + 1) * DT / BLOCK_DECAY) * np.exp(-np.log(1.5 / hit))
+        left = (
+            1.5 * -speed[step] * np.exp((step + 1) * DT / BLOCK_DECAY) * np.exp(-np.log(1.5 / hit))
+        )
         assert RESTITUTION - 0.05 < left / hit < RESTITUTION + 0.15
         assert position.max() < ROOM + 3e-3
         assert np.abs(speed[-1]) < 1e-3
         ratio = speed[step + 10] / speed[step + 5]
-        assert ratio == pytest.approx(np.exp(-5 * DT / BLOCK_DECAY), rel=0.03)  # implicit steps: 1.2 % slower
+        assert ratio == pytest.approx(
+            np.exp(-5 * DT / BLOCK_DECAY), rel=0.03
+        )  # implicit steps: 1.2 % slower
 
 
 @pytest.mark.parametrize("env_id", [OBSTACLE, PUSH])
@@ -179,16 +202,22 @@ def test_nothing_tunnels_or_escapes_at_full_torque(env_id: str) -> None:
     env, _ = arms(env_id, 300)
     states = env.rollout(full_torques(300))
     assert -closest_gap(states, env_id).min() < BLOCK_RADIUS + ARM_RADIUS  # the centres never cross
-    assert np.abs(states[..., 6:8]).max() < WALL + 2 * BLOCK_RADIUS  # hit that hard, it dents a wall for an instant
+    assert (
+        np.abs(states[..., 6:8]).max() < WALL + 2 * BLOCK_RADIUS
+    )  # hit that hard, it dents a wall for an instant
     assert longest_runs(depth(states, env_id) > 5e-3).max() <= 3
-    assert np.abs(states[..., 2:4]).max() < GEAR  # no contact adds speed: torque over damping is the limit
+    assert (
+        np.abs(states[..., 2:4]).max() < GEAR
+    )  # no contact adds speed: torque over damping is the limit
 
 
 def test_a_free_object_slows_down_by_e_in_its_decay_time() -> None:
     env, _ = arms(PUSH, 1)
     env.reset(options={"states": at_rest((0.0, 0.0), (-0.1, 0.0), (0.0, 0.3))})
     speed = env.rollout(np.zeros((1, 10, 2)))[0, :, 9]
-    np.testing.assert_allclose(speed, 0.3 * np.exp(-DT * np.arange(1, 11) / BLOCK_DECAY), rtol=0.06)  # implicit steps
+    np.testing.assert_allclose(
+        speed, 0.3 * np.exp(-DT * np.arange(1, 11) / BLOCK_DECAY), rtol=0.06
+    )  # implicit steps
     decay = -DT * 9 / np.log(speed[-1] / speed[0])
     assert decay == pytest.approx(0.05, rel=0.02)
 
@@ -203,13 +232,17 @@ def test_random_torques_push_the_object_no_deeper_than_a_centimetre_into_a_wall(
 def test_energy_does_not_grow_without_torque(env_id: str) -> None:
     env, start = arms(env_id, 150)
     rng = np.random.default_rng(0)
-    start[:, :4] = np.concatenate([rng.uniform(-2.5, 2.5, (150, 2)), rng.uniform(-10, 10, (150, 2))], axis=1)
+    start[:, :4] = np.concatenate(
+        [rng.uniform(-2.5, 2.5, (150, 2)), rng.uniform(-10, 10, (150, 2))], axis=1
+    )
     if env_id != REACHER:
         start = start[closest_gap(start, env_id) > 0]  # the others begin inside the block
         env, _ = arms(env_id, len(start))
     env.reset(options={"states": start})
     states = np.concatenate([start[:, None], env.rollout(np.zeros((len(start), 200, 2)))], axis=1)
-    energy = 0.5 * (states[..., 2:4] ** 2).sum(axis=-1)  # 1 kg m^2 in each joint; the links add a thousandth
+    energy = 0.5 * (states[..., 2:4] ** 2).sum(
+        axis=-1
+    )  # 1 kg m^2 in each joint; the links add a thousandth
     if env_id == PUSH:
         energy += 0.5 * (states[..., 8:] ** 2).sum(axis=-1)
     assert (energy <= 1.001 * energy[:, :1]).all()
@@ -231,12 +264,18 @@ def test_a_blow_up_is_raised_with_episode_and_step(
     env._physics = snapshot[:, :-4]  # as if it had come about by itself
     with pytest.raises(SimulationUnstable) as caught:
         env.rollout(np.zeros((300, 4, 2)))
-    assert (caught.value.env, caught.value.episode, caught.value.step) == (env_id, 277, 3)  # steps since reset
+    assert (caught.value.env, caught.value.episode, caught.value.step) == (
+        env_id,
+        277,
+        3,
+    )  # steps since reset
     assert "QVEL" in caught.value.reason
     assert not os.listdir(tmp_path)  # MuJoCo would leave a log file here
 
 
-def test_a_machine_without_opengl_draws_the_scene_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_opengl_draws_the_scene_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def fail(*args: object) -> None:
         raise mujoco.FatalError("an OpenGL platform library has not been loaded")
 

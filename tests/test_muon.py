@@ -16,7 +16,9 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def stepped(optimizer: torch.optim.Optimizer, weight: nn.Parameter, gradients: list[torch.Tensor]) -> torch.Tensor:
+def stepped(
+    optimizer: torch.optim.Optimizer, weight: nn.Parameter, gradients: list[torch.Tensor]
+) -> torch.Tensor:
     for gradient in gradients:
         weight.grad = gradient.clone()
         optimizer.step()
@@ -27,7 +29,10 @@ def stepped(optimizer: torch.optim.Optimizer, weight: nn.Parameter, gradients: l
 @pytest.mark.parametrize("shape", [(24, 6), (6, 24), (10, 10)])
 def test_it_is_torchs_but_for_bfloat16(shape: tuple[int, int]) -> None:
     ours, theirs, free = (nn.Parameter(drawn(*shape)) for _ in range(3))
-    gradients, settings = [drawn(*shape, seed=1 + i) for i in range(5)], dict(lr=0.02, weight_decay=0.1)
+    gradients, settings = (
+        [drawn(*shape, seed=1 + i) for i in range(5)],
+        dict(lr=0.02, weight_decay=0.1),
+    )
     found = stepped(Muon([ours], **settings), ours, gradients)
     expected = stepped(torch.optim.Muon([theirs], **settings), theirs, gradients)
     moved = (expected - drawn(*shape)).norm()
@@ -53,7 +58,9 @@ def test_a_stack_is_its_matrices_one_by_one(inputs: int, outputs: int) -> None:
     settings = dict(lr=0.02, weight_decay=0.1)
     found = stepped(Muon([stack], **settings), stack, gradients)
     for m, single in enumerate(singles):
-        alone = stepped(Muon([single], **settings), single, [gradient[m].mT for gradient in gradients])
+        alone = stepped(
+            Muon([single], **settings), single, [gradient[m].mT for gradient in gradients]
+        )
         torch.testing.assert_close(found[m], alone.mT, rtol=1e-4, atol=1e-5)
 
 
@@ -63,9 +70,13 @@ def names(model: nn.Module) -> set[str]:
 
 
 def test_matrices_are_the_weights_of_linear_and_recurrent_layers_and_stacks_of_them() -> None:
-    assert names(Ensemble(3, 2, angles=(0,), hidden=8, layers=2)) == {f"weights.{i}" for i in range(3)}
+    assert names(Ensemble(3, 2, angles=(0,), hidden=8, layers=2)) == {
+        f"weights.{i}" for i in range(3)
+    }
     found = names(LSTM(3, 2, angles=(0,)))
-    assert found == {name for name, weight in LSTM(3, 2, angles=(0,)).named_parameters() if weight.ndim == 2}
+    assert found == {
+        name for name, weight in LSTM(3, 2, angles=(0,)).named_parameters() if weight.ndim == 2
+    }
     tsm = TSM(3, 2, angles=(0,), segment_len=4, channels=8, dilations=(1, 2))
     kernels = {name for name, weight in tsm.named_parameters() if "convolutions" in name}
     assert kernels
@@ -81,5 +92,8 @@ def test_a_model_may_keep_layers_to_adam() -> None:
     model.adam_only = ("1",)
     assert names(model) == {"0.weight"}
     model.adam_only = ("code",)
-    with pytest.raises(ValueError, match="adam_only of Sequential names 'code'; expected a layer or parameter of it"):
+    with pytest.raises(
+        ValueError,
+        match="adam_only of Sequential names 'code'; expected a layer or parameter of it",
+    ):
         matrices(model)

@@ -28,16 +28,30 @@ class Still:
 def test_a_model_of_two_names_plans_scores_and_is_controlled() -> None:
     task = tsm.load_task("tsm/Reacher-v0").take(2)
     space = tsm.DirectActions(task.horizon)
-    plan = tsm.cem(tsm.model_predictor(Still(), task.past(5)), task.reward, space, 2, candidates=30, iterations=2)
+    plan = tsm.cem(
+        tsm.model_predictor(Still(), task.past(5)),
+        task.reward,
+        space,
+        2,
+        candidates=30,
+        iterations=2,
+    )
     assert torch.isfinite(tsm.execute(task, plan).executed_return).all()
     trial = tsm.mpc(task, Still(), space, partial(tsm.cem, candidates=30, iterations=1), every=25)
     assert trial.states.shape == (2, 51, 6)
     data = tsm.collect(
-        gymnasium.make_vec(task.env, num_envs=8), tsm.open_loop(torch.zeros(8, 30, 2)), horizon=30, seed=0
+        gymnasium.make_vec(task.env, num_envs=8),
+        tsm.open_loop(torch.zeros(8, 30, 2)),
+        horizon=30,
+        seed=0,
     )
     features = Features(6, data.angles).fit(torch.from_numpy(data.states))
-    scores = tsm.score(Still(), features, data.take(slice(0, 4)), data.take(slice(4, 8)), samples=1, horizon=10)
-    assert float(scores.against_horizon()["nrmse"].mean()) < 0.1  # without torque the arm hardly moves
+    scores = tsm.score(
+        Still(), features, data.take(slice(0, 4)), data.take(slice(4, 8)), samples=1, horizon=10
+    )
+    assert (
+        float(scores.against_horizon()["nrmse"].mean()) < 0.1
+    )  # without torque the arm hardly moves
 
 
 class Gusts:
@@ -45,7 +59,9 @@ class Gusts:
 
     segment_len, past_len = 10, 1
 
-    def predict_segment(self, past: Segment, actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, generator: torch.Generator | None = None
+    ) -> Tensor:
         x, states = past.states[:, -1], []
         for u in actions.unbind(1):
             x = x + 0.1 * u.sum(1, keepdim=True)
@@ -79,17 +95,23 @@ def test_a_model_that_draws_from_a_torch_generator_is_planned_through_in_futures
         partial(tsm.mppi, candidates=4, iterations=1),
     ):
         assert torch.isfinite(planner(predict, task.reward, space, 2).predicted_return).all()
-    trial = tsm.mpc(task, Gusts(), space, partial(tsm.mppi, candidates=2, iterations=1), every=25, judge=judge)
+    trial = tsm.mpc(
+        task, Gusts(), space, partial(tsm.mppi, candidates=2, iterations=1), every=25, judge=judge
+    )
     assert torch.isfinite(trial.executed_return).all()
 
 
 def test_common_random_numbers_of_a_torch_generator_are_those_of_standard_normal() -> None:
     def noise() -> SharedNoise:
-        return SharedNoise(SeparateNoise(tuple(torch.Generator().manual_seed(k) for k in (1, 2))), 6)
+        return SharedNoise(
+            SeparateNoise(tuple(torch.Generator().manual_seed(k) for k in (1, 2))), 6
+        )
 
     drawn, again, like = noise(), noise(), torch.zeros(12, 2)
     for _ in range(2):  # the second draw goes on where the first ended
-        parts = [torch.randn(len(like[rows]), 2, generator=own) for rows, own in by_generator(12, drawn)]
+        parts = [
+            torch.randn(len(like[rows]), 2, generator=own) for rows, own in by_generator(12, drawn)
+        ]
         assert torch.equal(torch.cat(parts), standard_normal((12, 2), again, like))
 
 
@@ -98,12 +120,19 @@ def test_common_random_numbers_of_a_torch_generator_are_those_of_standard_normal
     [
         ({"segment_len": None}, "segment_len of Other is None; expected a positive int"),
         ({"segment_len": 0}, "segment_len of Other is 0; expected a positive int"),
-        ({"predict_segment": lambda self, past, actions: past.states},
-         r"gave a tensor \(2, 5, 6\) for actions \(2, 3, 2\); expected states \(2, 3, 6\)"),
-        ({"predict_segment": lambda self, past, actions: None}, "predict_segment of Other gave a NoneType"),
+        (
+            {"predict_segment": lambda self, past, actions: past.states},
+            r"gave a tensor \(2, 5, 6\) for actions \(2, 3, 2\); expected states \(2, 3, 6\)",
+        ),
+        (
+            {"predict_segment": lambda self, past, actions: None},
+            "predict_segment of Other gave a NoneType",
+        ),
     ],
-)  # fmt: skip
-def test_a_model_that_is_something_else_is_refused_by_what_is_wrong(changes: dict[str, Any], message: str) -> None:
+)
+def test_a_model_that_is_something_else_is_refused_by_what_is_wrong(
+    changes: dict[str, Any], message: str
+) -> None:
     other = type("Other", (Still,), changes)()
     past = tsm.load_task("tsm/Reacher-v0").take(2).past(5)
     with pytest.raises(TypeError, match=message):
@@ -113,6 +142,7 @@ def test_a_model_that_is_something_else_is_refused_by_what_is_wrong(changes: dic
 def test_an_object_that_cannot_predict_is_refused_by_what_it_lacks() -> None:
     past = tsm.load_task("tsm/Reacher-v0").take(2).past(5)
     with pytest.raises(
-        TypeError, match="object cannot predict: it has no segment_len and no predict_segment. The least"
+        TypeError,
+        match="object cannot predict: it has no segment_len and no predict_segment. The least",
     ):
         tsm.model_predictor(object(), past)(torch.zeros(1, 2, 3, 2))  # type: ignore[arg-type]

@@ -21,8 +21,8 @@ from tsmlib.models.features import Features
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.sampling import SharedNoise
 from tsmlib.storage import tables
-from tsmlib.study import runs, worlds
-from tsmlib.study.runs import ROOT
+from reproduction import runs, worlds
+from reproduction.runs import ROOT
 from tsmlib.trajectory import Segment, Trajectories
 
 FOLDER = ROOT / "benchmarks" / "peers"
@@ -33,7 +33,8 @@ pets = load_script(FOLDER / "pets.py")
 speed = load_script(FOLDER / "speed.py")
 loop = load_script(FOLDER / "loop.py")
 needs_mbrl = pytest.mark.skipif(
-    not all(importlib.util.find_spec(name) for name in ("mbrl", "hydra")), reason="mbrl-lib is not installed; README.md"
+    not all(importlib.util.find_spec(name) for name in ("mbrl", "hydra")),
+    reason="mbrl-lib is not installed; README.md",
 )
 
 
@@ -43,7 +44,9 @@ def data() -> Trajectories:
     walk = torch.randn(20, 31, DX, generator=generator).cumsum(1) * torch.logspace(-2, 0, DX)
     walk[..., FIXED] = walk[:, :1, FIXED]
     actions = torch.rand(20, 30, DU, generator=generator)
-    return Trajectories(walk.numpy(), actions.numpy(), "arm", 0.02, ("x",) * DX, ("m",) * DX, (0, 1))
+    return Trajectories(
+        walk.numpy(), actions.numpy(), "arm", 0.02, ("x",) * DX, ("m",) * DX, (0, 1)
+    )
 
 
 @pytest.fixture
@@ -57,15 +60,21 @@ def by_member(inputs: Tensor) -> tuple[Tensor, None]:
     return steps.expand(MEMBERS, inputs.shape[1], DX), None
 
 
-def future(data: Trajectories, model: Any, seed: int | None = 0, rows: int = 20, steps: int = 12) -> tuple[Any, Tensor]:
+def future(
+    data: Trajectories, model: Any, seed: int | None = 0, rows: int = 20, steps: int = 12
+) -> tuple[Any, Tensor]:
     """Where each row starts (rows, 1, dx), and its rollout (rows, steps, dx)."""
     whole = data.padded(0)
     past = Segment(*(part[:rows, :10] for part in whole))
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    return past.states[:, -1:], rollout(model, past, whole.actions[:rows, 10 : 10 + steps], generator=generator)
+    return past.states[:, -1:], rollout(
+        model, past, whole.actions[:rows, 10 : 10 + steps], generator=generator
+    )
 
 
-def test_a_network_reads_features_of_the_last_state_and_the_action(data: Trajectories, features: Features) -> None:
+def test_a_network_reads_features_of_the_last_state_and_the_action(
+    data: Trajectories, features: Features
+) -> None:
     seen = []
 
     def network(inputs: Tensor) -> tuple[Tensor, None]:
@@ -80,7 +89,9 @@ def test_a_network_reads_features_of_the_last_state_and_the_action(data: Traject
     assert len(seen) == 2
 
 
-def test_targets_have_unit_variance_and_undo_themselves(data: Trajectories, features: Features) -> None:
+def test_targets_have_unit_variance_and_undo_themselves(
+    data: Trajectories, features: Features
+) -> None:
     before, actions, after = pets.transitions(data, pets.unit_of(features))
     target, moving = torch.from_numpy(after - before), features.moving
     assert before.shape == (600, DX)
@@ -98,10 +109,15 @@ def test_targets_have_unit_variance_and_undo_themselves(data: Trajectories, feat
     assert torch.allclose(states[3], torch.from_numpy(data.states)[3, 11:23], atol=1e-4)
 
 
-def test_a_row_keeps_its_member_for_the_whole_rollout(data: Trajectories, features: Features) -> None:
+def test_a_row_keeps_its_member_for_the_whole_rollout(
+    data: Trajectories, features: Features
+) -> None:
     peer = pets.Peer(by_member, features)
     start, states = future(data, peer)
-    steps = torch.cat([start, states], dim=1).diff(dim=1)[..., features.moving] / features.step_std[features.moving]
+    steps = (
+        torch.cat([start, states], dim=1).diff(dim=1)[..., features.moving]
+        / features.step_std[features.moving]
+    )
     members = steps[:, 0, 0].round()
     assert torch.allclose(steps, members[:, None, None].expand_as(steps), atol=1e-2)
     assert set(members.tolist()) == {1.0, 2.0, 3.0, 4.0, 5.0}
@@ -122,14 +138,18 @@ def test_every_member_is_drawn_equally_often_whatever_the_number_of_rows(
     assert ((shares - 0.2).abs() < 0.12).all()
 
 
-def test_without_a_generator_every_step_takes_the_mean_of_the_members(data: Trajectories, features: Features) -> None:
+def test_without_a_generator_every_step_takes_the_mean_of_the_members(
+    data: Trajectories, features: Features
+) -> None:
     start, states = future(data, pets.Peer(by_member, features), seed=None)
     travelled = 3.0 * torch.arange(1, 13)[:, None] * features.step_std * features.moving
     assert torch.allclose(states, start + travelled, atol=1e-4)
 
 
 @pytest.mark.parametrize("seed", [None, 0])
-def test_an_obstacle_does_not_move(data: Trajectories, features: Features, seed: int | None) -> None:
+def test_an_obstacle_does_not_move(
+    data: Trajectories, features: Features, seed: int | None
+) -> None:
     start, states = future(data, pets.Peer(by_member, features), seed=seed)
     assert torch.equal(states[..., FIXED], start[..., FIXED].expand(-1, 12, -1))
 
@@ -141,17 +161,24 @@ def test_stated_noise_is_added_at_every_step(data: Trajectories, features: Featu
 
     model = pets.Peer(network, features)
     start, states = future(data, model, steps=20)
-    steps = torch.cat([start, states], dim=1).diff(dim=1)[..., features.moving] / features.step_std[features.moving]
+    steps = (
+        torch.cat([start, states], dim=1).diff(dim=1)[..., features.moving]
+        / features.step_std[features.moving]
+    )
     assert abs(steps.std().item() - 3) < 0.15
     flat = steps.flatten(1)
     assert abs((flat[:, :-6] * flat[:, 6:]).mean().item()) < 0.5  # the next step's noise is another
     assert torch.equal(future(data, model, seed=None)[1], start.expand(-1, 12, -1))
 
 
-def test_shared_noise_gives_candidates_the_same_members(data: Trajectories, features: Features) -> None:
+def test_shared_noise_gives_candidates_the_same_members(
+    data: Trajectories, features: Features
+) -> None:
     past = Segment(*(part[:10, :10].repeat(2, 1, 1) for part in data.padded(0)))
     noise = SharedNoise(torch.Generator().manual_seed(0), period=10)
-    states = pets.Peer(by_member, features).predict_segment(past, torch.zeros(20, 3, DU), generator=noise)
+    states = pets.Peer(by_member, features).predict_segment(
+        past, torch.zeros(20, 3, DU), generator=noise
+    )
     assert torch.equal(states[:10], states[10:])
 
 
@@ -173,13 +200,18 @@ def test_rows_of_the_same_model_are_replaced(tmp_path: Path) -> None:
     path = tmp_path / "peers_pets.csv"
     for model, value in (("pets", 1.0), ("pets+mse", 2.0), ("pets", 3.0)):
         pets.table(path, [dict(env="arm", model=model, seed=0, metric="nrmse", value=value)])
-    assert {row["model"]: row["value"] for row in tables.records(tables.load(path))} == {"pets": 3.0, "pets+mse": 2.0}
+    assert {row["model"]: row["value"] for row in tables.records(tables.load(path))} == {
+        "pets": 3.0,
+        "pets+mse": 2.0,
+    }
 
 
 # Beside ours: speed.py --------------------------------------------------------------------------------------------
 
 
-def trainer(name: str, per_update: int = 100, parameters: int = 1000, run: Any = lambda updates: None) -> Any:
+def trainer(
+    name: str, per_update: int = 100, parameters: int = 1000, run: Any = lambda updates: None
+) -> Any:
     return speed.Trainer(name, True, run, per_update, parameters)
 
 
@@ -214,12 +246,21 @@ def test_every_member_of_ours_sees_as_many_transitions_as_are_counted(
     made = speed.ours(form, features, data, batch=64, bf16=False)
     made.run(3)
     assert seen == [(MEMBERS, made.per_update)] * 3
-    widths = [DX + 2 + DU, 200, 200, 200, 200, DX * (2 if form == "gaussian" else 1)]  # of mbrl-lib's GaussianMLP
+    widths = [
+        DX + 2 + DU,
+        200,
+        200,
+        200,
+        200,
+        DX * (2 if form == "gaussian" else 1),
+    ]  # of mbrl-lib's GaussianMLP
     theirs = MEMBERS * sum((i + 1) * o for i, o in pairwise(widths)) + 2 * DX * (form == "gaussian")
     assert made.parameters == theirs
 
 
-def test_a_batch_that_cannot_be_dealt_out_equally_is_refused(data: Trajectories, features: Features) -> None:
+def test_a_batch_that_cannot_be_dealt_out_equally_is_refused(
+    data: Trajectories, features: Features
+) -> None:
     with pytest.raises(ValueError, match="not 63"):
         speed.ours("mse", features, data, batch=63, bf16=False)
 
@@ -233,7 +274,10 @@ def test_networks_of_another_size_are_not_compared() -> None:
 def test_theirs_earns_the_reward_of_the_task_step_by_step() -> None:
     task, unit = study.load_task(speed.ENV).take(3), torch.logspace(-1, 1, 10)
     generator = torch.Generator().manual_seed(0)
-    states, actions = torch.randn(7, 3, 4, 10, generator=generator), torch.randn(7, 3, 4, 2, generator=generator)
+    states, actions = (
+        torch.randn(7, 3, 4, 10, generator=generator),
+        torch.randn(7, 3, 4, 2, generator=generator),
+    )
     expected = task.reward(states, actions)  # (C, B, T)
     for b in range(3):
         single = speed.at(task, [b])
@@ -282,12 +326,19 @@ def test_every_target_is_planned_for_once_by_theirs_and_in_every_round_by_ours(
     assert first.seconds.tolist() == [3.0, 3.0]  # a target, however many are in a share
     assert second.trial.actions.shape == (5, 4, 2)
     assert len(second.seconds) == 2
-    assert (first.trial.executed_return - first.predicted_return).abs().max() < 0.1  # nothing was pushed
+    assert (
+        first.trial.executed_return - first.predicted_return
+    ).abs().max() < 0.1  # nothing was pushed
 
 
 def outcome(way: Any, seconds: float, true: list[float]) -> Any:
     executed = torch.tensor(true)
-    trial = Trial(torch.zeros(len(true), 4, 2), torch.zeros(len(true), 5, 10), executed, torch.zeros(len(true)))
+    trial = Trial(
+        torch.zeros(len(true), 4, 2),
+        torch.zeros(len(true), 5, 10),
+        executed,
+        torch.zeros(len(true)),
+    )
     return speed.Outcome(way, np.array([seconds, 2 * seconds]), trial, executed)
 
 
@@ -295,14 +346,18 @@ def test_only_what_earns_as_much_counts_as_faster(capsys: pytest.CaptureFixture[
     subject = outcome(THEIRS, 10.0, [-3.0, -1.0])
     worse, slower, best = (
         outcome(replace(OURS, iterations=i), seconds, true)
-        for i, (seconds, true) in enumerate(((0.1, [-3.0, -2.0]), (5.0, [0.0, 0.0]), (2.0, [-2.0, -2.0])), start=1)
+        for i, (seconds, true) in enumerate(
+            ((0.1, [-3.0, -2.0]), (5.0, [0.0, 0.0]), (2.0, [-2.0, -2.0])), start=1
+        )
     )
     assert speed.as_good(subject, [worse, slower, best]) is best
     assert speed.as_good(subject, [worse]) is None
     assert speed.times_faster(best, subject).tolist() == [5.0, 5.0]
     gain, half = speed.compared(slower, subject)
     assert gain == pytest.approx(2.0)
-    assert half == pytest.approx(12.706, rel=1e-3)  # differences 3 and 1: their deviation over the root of 2 is 1
+    assert half == pytest.approx(
+        12.706, rel=1e-3
+    )  # differences 3 and 1: their deviation over the root of 2 is 1
     speed.verdicts([subject, worse, slower, best])
     printed = capsys.readouterr().out
     assert "5.00 (5.00 to 5.00) times faster" in printed
@@ -317,7 +372,9 @@ def test_ways_of_both_are_compared_and_mixed_ones_are_told_apart() -> None:
     assert len({way.name for way in speed.WAYS}) == len(speed.WAYS)
     for way in speed.WAYS:
         if way.planner == "mbrl-cem" and way.model == "pets":
-            assert way.candidates * way.samples % MEMBERS == 0  # as mbrl-lib deals rows out among members
+            assert (
+                way.candidates * way.samples % MEMBERS == 0
+            )  # as mbrl-lib deals rows out among members
 
 
 def test_the_trained_network_is_found_again_until_its_training_changes(
@@ -342,14 +399,29 @@ def test_the_trained_network_is_found_again_until_its_training_changes(
 
 def test_pins_are_those_of_the_lock_where_both_name_a_package() -> None:
     own, lock = pins(FOLDER / "requirements.txt"), pins(ROOT / "environment.lock")
-    assert {"torch", "hydra-core", "omegaconf", "antlr4-python3-runtime", "gymnasium", "mujoco"} <= set(own)
+    assert {
+        "torch",
+        "hydra-core",
+        "omegaconf",
+        "antlr4-python3-runtime",
+        "gymnasium",
+        "mujoco",
+    } <= set(own)
     assert "mbrl" not in own  # it would bring its own pins
-    assert {name: lock[name] for name in own if name in lock} == {k: v for k, v in own.items() if k in lock}
+    assert {name: lock[name] for name in own if name in lock} == {
+        k: v for k, v in own.items() if k in lock
+    }
 
 
-@pytest.mark.parametrize(("script", "without", "starts"), [
-    ("pets", "", True), ("loop", "", True), ("speed", "", True), ("pets", "lazy-loader", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("script", "without", "starts"),
+    [
+        ("pets", "", True),
+        ("loop", "", True),
+        ("speed", "", True),
+        ("pets", "lazy-loader", False),
+    ],
+)
 def test_the_scripts_start_where_nothing_is_installed_but_the_requirements(
     script: str, without: str, starts: bool
 ) -> None:
@@ -368,7 +440,10 @@ def test_the_readme_names_the_pins_and_options_that_exist() -> None:
         assert (ROOT / path).exists(), path
     for option in re.findall(r" (--(?!no-deps)[a-z-]+)", readme):
         assert f'add_argument("{option}"' in source, option
-    assert f"{pets.LEARNING_RATE:g}, weight decay {pets.WEIGHT_DECAY:.5f}, batches of {pets.BATCH}" in readme
+    assert (
+        f"{pets.LEARNING_RATE:g}, weight decay {pets.WEIGHT_DECAY:.5f}, batches of {pets.BATCH}"
+        in readme
+    )
 
 
 @pytest.mark.parametrize("env", loop.SETTINGS)
@@ -376,7 +451,9 @@ def test_a_robot_of_mbrl_lib_returns_what_the_same_actions_do_here(env: str) -> 
     here = worlds.world(env)
     task, unit = here.drawn(2, 5), loop.unit_of(here.random(2, 3))
     robot = loop.Robot(lambda i: task.take([i]), unit, bound=1.0)
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 100, task.action_dim)).astype(np.float32)
+    actions = (
+        np.random.default_rng(0).uniform(-0.3, 0.3, (2, 100, task.action_dim)).astype(np.float32)
+    )
     returns, seen = [], []
     for episode in actions:
         first, _ = robot.reset()
@@ -390,7 +467,9 @@ def test_a_robot_of_mbrl_lib_returns_what_the_same_actions_do_here(env: str) -> 
         np.testing.assert_allclose(predicted[:, 0], [reward for _, reward, *_ in steps], atol=1e-4)
     trial = execute(task, torch.from_numpy(actions))
     np.testing.assert_allclose(returns, trial.executed_return, atol=1e-3)
-    assert loop.executed(task, torch.from_numpy(actions))["return_true"] == pytest.approx(np.mean(returns), abs=1e-3)
+    assert loop.executed(task, torch.from_numpy(actions))["return_true"] == pytest.approx(
+        np.mean(returns), abs=1e-3
+    )
 
 
 @needs_mbrl

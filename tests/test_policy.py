@@ -38,8 +38,8 @@ from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts, files
-from tsmlib.study import policies as study_policies
-from tsmlib.study import runs
+from reproduction import policies as study_policies
+from reproduction import runs
 from tsmlib.training.callbacks import CsvCallback, Progress
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
@@ -51,9 +51,13 @@ MODELS: dict[str, Callable[[], Any]] = {
     "tsm, state skip": lambda: TSM(DX, DU, state_skip=8, **SMALL),
     "onestep": lambda: OneStep(DX, DU, hidden=8, layers=1),
     "lstm": lambda: LSTM(DX, DU, hidden=8, past_len=H, segment_len=8),
-    "rtsm": lambda: RecurrentTSM(DX, DU, hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=8),
+    "rtsm": lambda: RecurrentTSM(
+        DX, DU, hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=8
+    ),
     "ensemble": lambda: Ensemble(DX, DU, members=3, hidden=8, layers=1, segment_len=8),
-    "ensemble+mse": lambda: Ensemble(DX, DU, members=3, hidden=8, layers=1, segment_len=8, gaussian=False),
+    "ensemble+mse": lambda: Ensemble(
+        DX, DU, members=3, hidden=8, layers=1, segment_len=8, gaussian=False
+    ),
 }
 
 
@@ -65,12 +69,16 @@ class Sled:
     def __init__(self, noise: float = 0.0) -> None:
         self.noise = noise
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         x, states = past.states[:, -1], []
         for u in actions.unbind(1):
             velocity = 0.8 * x[:, 2:] + DT * u
             if generator is not None:
-                velocity = velocity + self.noise * standard_normal(velocity.shape, generator, velocity)
+                velocity = velocity + self.noise * standard_normal(
+                    velocity.shape, generator, velocity
+                )
             x = torch.cat([x[:, :2] + DT * velocity, velocity], dim=1)
             states.append(x)
         return torch.stack(states, dim=1)
@@ -104,7 +112,9 @@ def policy(kind: str, state_dim: int = 4, *, copies: int = 1, seed: int = 0, **o
     options = dict(angles=(), target_std=1.0, copies=copies, seed=seed) | options
     if kind == "onestep":
         return OneStepPolicy(state_dim, DU, hidden=16, **options).double()
-    return SegmentPolicy(state_dim, prior(), **dict(channels=8, dilations=(1, 2)) | options).double()
+    return SegmentPolicy(
+        state_dim, prior(), **dict(channels=8, dilations=(1, 2)) | options
+    ).double()
 
 
 KINDS = pytest.mark.parametrize("kind", ["onestep", "segment"])
@@ -125,8 +135,12 @@ def around(scale: float = 0.5) -> Callable[[int, torch.Generator], tuple[Tensor,
 
 def learn(learner: Any, world: Any = None, reward: Any = arrive, **settings: Any) -> LearningCurve:
     schedule = dict(horizon=5, episodes=4, iterations=4, record_every=2, lr=1e-2)
-    schedule |= {name: settings.pop(name) for name in LearningOptions.__annotations__ if name in settings}
-    return learn_policy(learner, world or Sled(), reward, around(), LearningOptions(**schedule), **settings)
+    schedule |= {
+        name: settings.pop(name) for name in LearningOptions.__annotations__ if name in settings
+    }
+    return learn_policy(
+        learner, world or Sled(), reward, around(), LearningOptions(**schedule), **settings
+    )
 
 
 def weights(learner: Any) -> dict[str, Tensor]:
@@ -154,7 +168,11 @@ def test_a_model_that_cannot_step_predicts_segments_of_one_action() -> None:
     whole, actions = model("tsm"), normal(3, 6, DU, seed=2).tanh()
 
     class Plain:
-        segment_len, past_len, predict_segment = whole.segment_len, whole.past_len, whole.predict_segment
+        segment_len, past_len, predict_segment = (
+            whole.segment_len,
+            whole.past_len,
+            whole.predict_segment,
+        )
 
     past = some_past(3)
     step, seen = stepper(Plain(), past), []  # type: ignore[arg-type]
@@ -185,7 +203,9 @@ def test_the_last_position_alone_is_the_last_of_all(
     positions: int, dilations: tuple[int, ...], state_skip: int
 ) -> None:
     torch.manual_seed(0)
-    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=dilations, state_skip=state_skip).double()
+    decoder = CausalDecoder(
+        3, 2, 4, channels=8, dilations=dilations, state_skip=state_skip
+    ).double()
     inputs, z = normal(5, positions, 3), normal(5, 4, seed=1)
     torch.testing.assert_close(decoder.last(inputs, z), decoder(inputs, z)[:, -1])
 
@@ -227,8 +247,16 @@ def test_an_action_depends_on_the_target_and_on_the_states_of_its_own_episode(ki
     other[0] += 1
     moved = Segment(past.states.clone(), past.actions)
     moved.states[1] += 1
-    assert (controller(actor, other)(past) != before).any(-1).flatten().tolist() == [True, False, False]
-    assert (controller(actor, target)(moved) != before).any(-1).flatten().tolist() == [False, True, False]
+    assert (controller(actor, other)(past) != before).any(-1).flatten().tolist() == [
+        True,
+        False,
+        False,
+    ]
+    assert (controller(actor, target)(moved) != before).any(-1).flatten().tolist() == [
+        False,
+        True,
+        False,
+    ]
 
 
 @KINDS
@@ -238,7 +266,15 @@ def test_actions_stay_within_their_bounds(kind: str) -> None:
         for p in actor.parameters():
             p *= 100
     start, target = 10 * normal(20, 4), 10 * normal(20, 2, seed=1)
-    seen = imagine(actor, Sled(), start, target, horizon=10, noise=3.0, generator=torch.Generator().manual_seed(0))
+    seen = imagine(
+        actor,
+        Sled(),
+        start,
+        target,
+        horizon=10,
+        noise=3.0,
+        generator=torch.Generator().manual_seed(0),
+    )
     assert seen.actions.abs().max() <= 1
     assert seen.actions.abs().max() > 0.9
 
@@ -253,15 +289,24 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
         def __init__(self, env: Any) -> None:
             self.env = env.unwrapped
 
-        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        def predict_segment(
+            self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+        ) -> Tensor:
             return torch.from_numpy(self.env.rollout(actions.detach().numpy())).float()
 
-    actor, target = policy(kind, 6, angles=(0, 1), target_std=0.1, copies=2).float(), 0.1 * normal(4, 2).float()
+    actor, target = (
+        policy(kind, 6, angles=(0, 1), target_std=0.1, copies=2).float(),
+        0.1 * normal(4, 2).float(),
+    )
     env = gymnasium.make_vec("tsm/Reacher-v0", num_envs=4)
     seen = collect(env, controller(actor, target), horizon=5, seed=0)
     start, _ = env.reset(seed=0)
-    rollout_of_policy = imagine(actor, World(env), torch.from_numpy(start).float(), target, horizon=5)  # type: ignore[arg-type]
-    torch.testing.assert_close(rollout_of_policy.actions, torch.from_numpy(seen.actions), rtol=1e-4, atol=1e-4)
+    rollout_of_policy = imagine(
+        actor, World(env), torch.from_numpy(start).float(), target, horizon=5
+    )  # type: ignore[arg-type]
+    torch.testing.assert_close(
+        rollout_of_policy.actions, torch.from_numpy(seen.actions), rtol=1e-4, atol=1e-4
+    )
     env.close()
 
 
@@ -275,7 +320,9 @@ def test_a_policy_learned_through_the_true_model_arrives(kind: str) -> None:
         return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
 
     actor, (start, target) = policy(kind), around()(50, torch.Generator().manual_seed(9))
-    curve = learn(actor, Sled(0.01), horizon=10, episodes=20, iterations=90, record_every=45, measure=distance)
+    curve = learn(
+        actor, Sled(0.01), horizon=10, episodes=20, iterations=90, record_every=45, measure=distance
+    )
     (before,), _, (after,) = curve.measured["distance"]
     assert after < 0.2 * before
     assert curve.iteration == [0, 45, 90]
@@ -289,7 +336,9 @@ def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, nam
     start, target = 0.1 * normal(4, DX), normal(4, 2, seed=1)
 
     def value() -> Tensor:
-        seen = imagine(actor, world, start, target, horizon=9, generator=torch.Generator().manual_seed(5))
+        seen = imagine(
+            actor, world, start, target, horizon=9, generator=torch.Generator().manual_seed(5)
+        )
         return discounted(arrive(target)(*seen), 0.9).sum()
 
     trained = [p for p in actor.parameters() if p.requires_grad]
@@ -311,10 +360,15 @@ def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, nam
 @pytest.mark.parametrize("name", ["tsm", "ensemble"])
 @KINDS
 def test_copies_learn_as_they_would_alone(kind: str, name: str) -> None:
-    world, options = model(name), LearningOptions(horizon=5, episodes=4, iterations=3, record_every=3, clip=0.5)
+    world, options = (
+        model(name),
+        LearningOptions(horizon=5, episodes=4, iterations=3, record_every=3, clip=0.5),
+    )
 
     def starts(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        return torch.zeros(n, DX, dtype=torch.float64), torch.rand(n, 2, generator=generator, dtype=torch.float64)
+        return torch.zeros(n, DX, dtype=torch.float64), torch.rand(
+            n, 2, generator=generator, dtype=torch.float64
+        )
 
     def learned(copies: int, seed: int) -> tuple[Any, LearningCurve]:
         actor = policy(kind, DX, copies=copies, seed=seed)
@@ -328,7 +382,9 @@ def test_copies_learn_as_they_would_alone(kind: str, name: str) -> None:
             torch.testing.assert_close(
                 p[m : m + 1] if p.requires_grad else p, q, msg=lambda text, name=name: name + text
             )
-        torch.testing.assert_close(torch.tensor(curve.predicted)[:, m : m + 1], torch.tensor(own.predicted))
+        torch.testing.assert_close(
+            torch.tensor(curve.predicted)[:, m : m + 1], torch.tensor(own.predicted)
+        )
     first = next(together.parameters() if kind == "onestep" else together.head.parameters())
     assert not torch.equal(first[0], first[1])
 
@@ -357,7 +413,9 @@ def test_a_policy_sees_states_as_its_model_does_unless_it_was_fitted_before(kind
         learn_policy(each, world, arrive, starts, once)
     assert same(weights(actor.features), weights(world.features))
     assert same(weights(fitted.features), statistics)
-    with pytest.warns(UserWarning, match=r"angles \[0\], the model \[\], .* raw units. Make it with angles=\(\)"):
+    with pytest.warns(
+        UserWarning, match=r"angles \[0\], the model \[\], .* raw units. Make it with angles=\(\)"
+    ):
         learn_policy(policy(kind, DX, angles=(0,)), world, arrive, starts, once)
 
 
@@ -394,7 +452,9 @@ def test_what_is_measured_may_be_no_number_and_comes_back_from_a_checkpoint(tmp_
     def measure(_: Any) -> dict[str, Tensor]:
         return {"distance": torch.tensor([math.nan]), "bound": torch.tensor([-math.inf])}
 
-    curves = [learn(policy("onestep"), measure=measure, checkpoint=tmp_path / "policy") for _ in range(2)]
+    curves = [
+        learn(policy("onestep"), measure=measure, checkpoint=tmp_path / "policy") for _ in range(2)
+    ]
     for curve in curves:
         assert np.isnan(curve.measured["distance"]).all()
         assert curve.measured["bound"] == [[-math.inf]] * 3
@@ -404,7 +464,9 @@ def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> N
     def attempt(starts: Tensor, radius: float) -> None:
         options = LearningOptions(horizon=5, episodes=4, iterations=2, record_every=1)
         draw = episodes_from(starts, radius=radius)
-        learn_policy(policy("onestep"), Sled(), arrive, draw, options, checkpoint=tmp_path / "policy")
+        learn_policy(
+            policy("onestep"), Sled(), arrive, draw, options, checkpoint=tmp_path / "policy"
+        )
 
     starts = normal(50, 4)
     attempt(starts, 0.2)
@@ -415,18 +477,26 @@ def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> N
 
 
 def test_a_callback_sees_every_record_of_learning_and_leaves_the_bits_alone() -> None:
-    alone, watched, seen = policy("onestep", copies=2), policy("onestep", copies=2), list[Progress]()
+    alone, watched, seen = (
+        policy("onestep", copies=2),
+        policy("onestep", copies=2),
+        list[Progress](),
+    )
     settings: dict[str, Any] = dict(measure=lambda _: {"asked": torch.tensor([1.0, 3.0])})
     learn(alone, **settings)
     curve = learn(watched, callback=seen.append, **settings)
     assert same(weights(watched), weights(alone))
     assert [one.step for one in seen] == curve.iteration == [0, 2, 4]
-    assert [one.values["predicted"] for one in seen] == [sum(copies) / 2 for copies in curve.predicted]
+    assert [one.values["predicted"] for one in seen] == [
+        sum(copies) / 2 for copies in curve.predicted
+    ]
     assert [one.values["asked"] for one in seen] == [2.0] * 3
 
 
 @KINDS
-def test_a_policy_whose_learning_was_stopped_has_every_record_once_in_its_table(kind: str, tmp_path: Path) -> None:
+def test_a_policy_whose_learning_was_stopped_has_every_record_once_in_its_table(
+    kind: str, tmp_path: Path
+) -> None:
     table = CsvCallback(tmp_path / "returns.csv")
 
     def stop(progress: Progress) -> None:
@@ -473,7 +543,9 @@ def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
     again = artifacts.load_model(path, type(actor), expect={"env": "tsm/Reacher-v0"})
     past, target = Segment(*(part.float() for part in some_past(4, 4))), torch.ones(4, 2)
     assert torch.equal(controller(again, target)(past), controller(actor, target)(past))
-    with pytest.raises(files.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'"):
+    with pytest.raises(
+        files.StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'"
+    ):
         artifacts.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v1"})
 
 
@@ -483,7 +555,10 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
 ) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     net, about = study.load_or_train(run, "tsm/Reacher-v0", "onestep")
-    task, method = study.load_task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", space, "policy")
+    task, method = (
+        study.load_task("tsm/Reacher-v0", "validation").take(3),
+        study.method("onestep", space, "policy"),
+    )
     assert study.stored_budget(run, task.env, method) is None
     actor, header = study.learn(run, task, method, study.Budget(copies=2))
     assert study.stored_budget(run, task.env, method) == study.Budget(copies=2, iterations=4)
@@ -495,7 +570,9 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
         assert torch.tensor(header["curve"]["measured"][metric]).shape == (5, 2)
     assert header["targets"] == 2  # of the three, so that the curve is the same for whoever asks
     found = study.assess(actor, net, task.take(2), seed=2)
-    last = {metric: torch.tensor(values[-1]) for metric, values in header["curve"]["measured"].items()}
+    last = {
+        metric: torch.tensor(values[-1]) for metric, values in header["curve"]["measured"].items()
+    }
     for metric, values in found.items():
         torch.testing.assert_close(values, last[metric])
     with monkeypatch.context() as patch:
@@ -509,19 +586,28 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
         artifacts.save_model(run.models / "Reacher" / "onestep.safetensors", net, about)
         with pytest.raises(TypeError):
             study.learn(run, task, method, study.Budget(copies=2))
-    assert [path.name for path in (run.models / "Reacher").glob("policy*")] == [f"policy-onestep-{space}.safetensors"]
+    assert [path.name for path in (run.models / "Reacher").glob("policy*")] == [
+        f"policy-onestep-{space}.safetensors"
+    ]
 
 
 def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: Path) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    task, method = study.load_task("tsm/Reacher-v0", "validation").take(3), study.method("onestep", "latent", "policy")
+    task, method = (
+        study.load_task("tsm/Reacher-v0", "validation").take(3),
+        study.method("onestep", "latent", "policy"),
+    )
     whole = study.Budget(copies=2)
     curve = study.learn(run, task, method, whole).header["curve"]["measured"]["return_true"]
     before = {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()}
     assert not [row for row in study.policy_rows(run, [(task, method, whole)]) if row.get("subset")]
     rows = study.early_rows(run, [(task, method, study.Budget(copies=2, iterations=2))])
-    told = [(row["metric"], row["subset"], row["iteration"], row["copy"], row["value"]) for row in rows]
-    assert told == [("return_true", "early", i, copy, curve[i][copy]) for i in range(3) for copy in range(2)]
+    told = [
+        (row["metric"], row["subset"], row["iteration"], row["copy"], row["value"]) for row in rows
+    ]
+    assert told == [
+        ("return_true", "early", i, copy, curve[i][copy]) for i in range(3) for copy in range(2)
+    ]
     assert {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()} == before
     again = study.policy_rows(run, [(task, method, whole)])
     assert [row for row in again if row.get("subset") == "early"] == rows
@@ -529,8 +615,14 @@ def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: 
 
 def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    task = study.load_task("tsm/Reacher-v0").take(2).with_reward("reach", lambda states, actions: -states[..., 0].abs())
-    with pytest.raises(ValueError, match=r"task 'reach' has a reward of its own; .* with tsmlib.learn_policy"):
+    task = (
+        study.load_task("tsm/Reacher-v0")
+        .take(2)
+        .with_reward("reach", lambda states, actions: -states[..., 0].abs())
+    )
+    with pytest.raises(
+        ValueError, match=r"task 'reach' has a reward of its own; .* with tsmlib.learn_policy"
+    ):
         study.learn(run, task, study.method("onestep", "direct", "policy"))
 
 
@@ -567,13 +659,19 @@ BAD: dict[str, tuple[Callable[[Tensor, Tensor], Any], str]] = {
         lambda x, u: -x.square().sum((1, 2)),
         r"is a tensor \(50,\); expected a tensor \(50, 5\), one number per step",
     ),
-    "per dimension": (lambda x, u: -x.square(), r"is a tensor \(50, 5, 4\); expected a tensor \(50, 5\)"),
+    "per dimension": (
+        lambda x, u: -x.square(),
+        r"is a tensor \(50, 5, 4\); expected a tensor \(50, 5\)",
+    ),
     "a number": (lambda x, u: 1.0, "is a float; expected a tensor"),
     "nan": (
         lambda x, u: (x.sum(-1) - x.sum(-1)) / 0,
         "the reward is nan for target 0 at step 0, although the state there is finite",
     ),
-    "infinite": (lambda x, u: x.sum(-1) / 0, "the reward is infinite, although the states are finite"),
+    "infinite": (
+        lambda x, u: x.sum(-1) / 0,
+        "the reward is infinite, although the states are finite",
+    ),
     "no gradient": (lambda x, u: (x[..., 0] > 0).double(), "the reward has no gradient"),
 }
 
@@ -598,7 +696,10 @@ def test_numbers_that_are_not_positive_are_refused(name: str) -> None:
 
 @KINDS
 def test_a_policy_of_another_environment_is_refused(kind: str) -> None:
-    with pytest.raises(ValueError, match=r"states have 6 dimensions, this \w+ was made for 4: it belongs to another"):
+    with pytest.raises(
+        ValueError,
+        match=r"states have 6 dimensions, this \w+ was made for 4: it belongs to another",
+    ):
         controller(policy(kind), torch.zeros(3, 2).double())(some_past(3))
 
 
@@ -606,12 +707,22 @@ def test_pasts_and_targets_that_do_not_fit_are_refused() -> None:
     past = some_past(4, 4)
     for actor, target, message in (
         (policy("onestep", copies=3), torch.zeros(4, 2), "4 episodes do not divide among 3 copies"),
-        (policy("onestep"), torch.zeros(3, 2), r"targets are \(3, 2\), expected one per episode, \(4, 2\)"),
-        (policy("segment"), torch.zeros(4, 3), r"targets are \(4, 3\), expected one per episode, \(4, 2\)"),
+        (
+            policy("onestep"),
+            torch.zeros(3, 2),
+            r"targets are \(3, 2\), expected one per episode, \(4, 2\)",
+        ),
+        (
+            policy("segment"),
+            torch.zeros(4, 3),
+            r"targets are \(4, 3\), expected one per episode, \(4, 2\)",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             actor.begin(past, target)
-    with pytest.raises(ValueError, match="the past holds 2 steps, SegmentPolicy needs 4; collect with past_len=4"):
+    with pytest.raises(
+        ValueError, match="the past holds 2 steps, SegmentPolicy needs 4; collect with past_len=4"
+    ):
         policy("segment").begin(past.last(2), torch.zeros(4, 2))
     with pytest.raises(ValueError, match="copies is 0"):
         policy("onestep", copies=0)
@@ -622,14 +733,20 @@ def test_what_is_not_finite_stops_learning_with_the_weights_of_the_last_record(f
     class Breaking(Sled):
         calls = 0
 
-        def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+        def predict_segment(
+            self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+        ) -> Tensor:
             states = super().predict_segment(past, actions, generator=generator)
             if not torch.is_grad_enabled():
                 return states
             self.calls += 1
             if self.calls <= 15:  # three iterations of five steps
                 return states
-            return states * math.nan if fault == "states" else states + (states - states.detach()).abs().sqrt()
+            return (
+                states * math.nan
+                if fault == "states"
+                else states + (states - states.detach()).abs().sqrt()
+            )
 
     actor, kept = policy("onestep"), []
 
@@ -637,8 +754,15 @@ def test_what_is_not_finite_stops_learning_with_the_weights_of_the_last_record(f
         kept.append(weights(learner))
         return {}
 
-    message = "the model predicts states that are not" if fault == "states" else "the gradient of the return is not"
-    with pytest.raises(TrainingStopped, match=f"{message} finite at iteration 3 of 4; the weights of iteration 2 are"):
+    message = (
+        "the model predicts states that are not"
+        if fault == "states"
+        else "the gradient of the return is not"
+    )
+    with pytest.raises(
+        TrainingStopped,
+        match=f"{message} finite at iteration 3 of 4; the weights of iteration 2 are",
+    ):
         learn(actor, Breaking(), measure=keep)
     assert same(weights(actor), kept[-1])
     assert len(kept) == 2

@@ -14,22 +14,37 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib.figures import Method, figure7
-from tsmlib.figures.policies import AXES
+from tsmlib.plots import Method, figure7
+from tsmlib.plots.policies import AXES
 from tsmlib.statistics import interval
-from tsmlib.study.zoo import method
+from tsmlib.zoo import method
 
 LATENT, DIRECT, RIVAL = method("tsm", "latent"), method("tsm", "direct"), method("lstm", "direct")
 METHODS = (LATENT, DIRECT, method("rtsm", "latent"), method("onestep", "direct"), RIVAL)
 PPO, TRPO, ZERO = method("ppo"), method("trpo"), method("zero")
-FLOORS = {"reach": {method("oracle", "latent", "cem"): -4.2, method("oracle", "direct", "cem"): -4.1, ZERO: -12.0}}
+FLOORS = {
+    "reach": {
+        method("oracle", "latent", "cem"): -4.2,
+        method("oracle", "direct", "cem"): -4.1,
+        ZERO: -12.0,
+    }
+}
 
 
 def learned(k: int = 3, end: float = -4.5, samples: float = 50_000) -> dict[str, np.ndarray]:
     """Curves from -12 to ``end`` over 11 records; the model predicts 0.5 m more."""
-    true = end + (-12 - end) * np.exp(-np.arange(11.0)) + 0.1 * np.random.default_rng(0).normal(size=(k, 11))
-    return {"return_true": true, "return_predicted": true + 0.5, "steps": 220_000.0 * np.arange(11),
-            "samples": np.full(11, samples), "seconds": 400 + 100.0 * np.arange(11)}  # fmt: skip
+    true = (
+        end
+        + (-12 - end) * np.exp(-np.arange(11.0))
+        + 0.1 * np.random.default_rng(0).normal(size=(k, 11))
+    )
+    return {
+        "return_true": true,
+        "return_predicted": true + 0.5,
+        "steps": 220_000.0 * np.arange(11),
+        "samples": np.full(11, samples),
+        "seconds": 400 + 100.0 * np.arange(11),
+    }
 
 
 def model_free(k: int = 3) -> dict[str, np.ndarray]:
@@ -48,7 +63,9 @@ def both_tasks() -> dict[str, dict[Method, dict[str, np.ndarray]]]:
 
 
 def lines(ax: Axes, method: Method) -> list[Any]:
-    return [line for line in ax.lines if to_hex(line.get_color()).lower() == method.look.colour.lower()]
+    return [
+        line for line in ax.lines if to_hex(line.get_color()).lower() == method.look.colour.lower()
+    ]
 
 
 def below(figure: Figure) -> str:
@@ -63,7 +80,9 @@ EVERY: dict[str, Callable[[], Figure]] = {
     "two tasks": lambda: figure7(both_tasks(), FLOORS),
     "one task, steps": lambda: figure7({"reach": {LATENT: learned()}}, against=["steps"]),
     "one copy": lambda: figure7({"reach": {LATENT: learned(k=1)}}, FLOORS),
-    "only model-free": lambda: figure7({"push": {TRPO: model_free()}}, against=["samples", "seconds"]),
+    "only model-free": lambda: figure7(
+        {"push": {TRPO: model_free()}}, against=["samples", "seconds"]
+    ),
 }
 
 
@@ -79,7 +98,11 @@ def test_figure_7_is_laid_out_without_warnings_and_not_left_open(name: str) -> N
 def bars(ax: Axes, method: Method) -> list[np.ndarray]:
     """Both ends of each interval of a method that is drawn as a bar."""
     found = [part for part in ax.collections if isinstance(part, LineCollection)]
-    return [part.get_segments()[0] for part in found if to_hex(part.get_color()[0]) == method.look.colour.lower()]
+    return [
+        part.get_segments()[0]
+        for part in found
+        if to_hex(part.get_color()[0]) == method.look.colour.lower()
+    ]
 
 
 def test_a_line_is_the_mean_and_its_end_stands_beside_the_axis_with_its_interval() -> None:
@@ -114,18 +137,31 @@ def test_tasks_stand_side_by_side_and_share_the_scale_of_their_column() -> None:
     assert [reach.get_title(loc="left"), push.get_title(loc="left")] == ["Reach", "Push"]
     for column in (figure.axes[::2], figure.axes[1::2]):
         assert len({ax.get_ylim() for ax in column}) == 1
-        assert [ax.get_xlabel().split("\n")[0].split(";")[0] for ax in column] == list(AXES.values())
+        assert [ax.get_xlabel().split("\n")[0].split(";")[0] for ax in column] == list(
+            AXES.values()
+        )
 
 
-def test_policies_of_a_data_set_stand_beside_the_axis_of_samples_and_a_model_free_run_is_a_line_on_it() -> None:
+def test_policies_of_a_data_set_stand_beside_the_axis_of_samples_and_a_model_free_run_is_a_line_on_it() -> (
+    None
+):
     given = learned(samples=50_000)
-    ax = figure7({"reach": {LATENT: given, RIVAL: learned(), PPO: model_free()}}, against=["samples"]).axes[0]
-    point, other = lines(ax, LATENT)[0], lines(ax, RIVAL)[0]  # then an arrow where an interval leaves the panel
+    ax = figure7(
+        {"reach": {LATENT: given, RIVAL: learned(), PPO: model_free()}}, against=["samples"]
+    ).axes[0]
+    point, other = (
+        lines(ax, LATENT)[0],
+        lines(ax, RIVAL)[0],
+    )  # then an arrow where an interval leaves the panel
     assert point.get_ydata().tolist() == [pytest.approx(given["return_true"][:, -1].mean())]
     assert len(lines(ax, PPO)[0].get_xdata()) == 26
-    ticks = dict(zip([text.get_text() for text in ax.get_xticklabels()], ax.get_xticks(), strict=True))
+    ticks = dict(
+        zip([text.get_text() for text in ax.get_xticklabels()], ax.get_xticks(), strict=True)
+    )
     assert 300_000 < point.get_xdata()[0] < ticks["models,\n50k steps"] < other.get_xdata()[0]
-    assert ax.spines["bottom"].get_bounds()[1] < point.get_xdata()[0]  # where the axis counts no steps
+    assert (
+        ax.spines["bottom"].get_bounds()[1] < point.get_xdata()[0]
+    )  # where the axis counts no steps
     (data,) = [line for line in ax.lines if list(line.get_xdata()) == [50_000, 50_000]]
     assert list(data.get_ydata()) == [0, 1]
     (bar,) = bars(ax, PPO)
@@ -141,8 +177,15 @@ def test_a_model_free_run_is_drawn_against_steps_of_the_environment_which_the_ax
 
 def test_the_legend_names_each_model_once_and_what_filled_and_open_mean() -> None:
     figure = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-5), PPO: model_free()}})
-    words = ["TSM", "PPO", "latent policy", "direct policy", "predicted return", "steps in the models' data",
-             "95 % interval over 3 copies of a policy, 3 seeds without a model"]  # fmt: skip
+    words = [
+        "TSM",
+        "PPO",
+        "latent policy",
+        "direct policy",
+        "predicted return",
+        "steps in the models' data",
+        "95 % interval over 3 copies of a policy, 3 seeds without a model",
+    ]
     assert legend(figure) == words
 
 
@@ -158,32 +201,51 @@ def test_seconds_are_logarithmic_and_leave_out_what_was_before_the_first() -> No
 
 def test_a_policy_through_the_prior_is_filled_and_one_of_torques_open() -> None:
     ax = figure7({"reach": {LATENT: learned(), DIRECT: learned(end=-6)}}, against=["steps"]).axes[0]
-    curves = [line for line in lines(ax, LATENT) if len(line.get_xdata()) > 1 and not line.is_dashed()]
-    assert [to_hex(line.get_markerfacecolor()).upper() for line in curves] == [LATENT.look.colour, "#FFFFFF"]
+    curves = [
+        line for line in lines(ax, LATENT) if len(line.get_xdata()) > 1 and not line.is_dashed()
+    ]
+    assert [to_hex(line.get_markerfacecolor()).upper() for line in curves] == [
+        LATENT.look.colour,
+        "#FFFFFF",
+    ]
 
 
 def test_references_are_lines_and_of_several_oracles_the_one_that_tables_divide_by() -> None:
     figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["steps"])
-    flat = {line.get_ydata()[0] for line in figure.axes[0].lines if list(line.get_ydata()) == [line.get_ydata()[0]] * 2}
+    flat = {
+        line.get_ydata()[0]
+        for line in figure.axes[0].lines
+        if list(line.get_ydata()) == [line.get_ydata()[0]] * 2
+    }
     assert flat == {-4.2, -12.0}
     assert "oracle" in legend(figure)
     assert "zero torque" not in legend(figure)  # far below, and in words
 
 
 def test_a_policy_that_fails_far_off_does_not_squeeze_the_others_and_is_told_in_words() -> None:
-    rows = {policy: learned() for policy in METHODS} | {method("multistep", "direct"): learned(end=-900.0)}
+    rows = {policy: learned() for policy in METHODS} | {
+        method("multistep", "direct"): learned(end=-900.0)
+    }
     figure = figure7({"reach": rows}, against=["steps"])
     assert figure.axes[0].get_ylim()[0] > -50
     assert "multi-step, direct to −900" in below(figure)
-    off = {LATENT: learned(end=-14), RIVAL: learned(end=-15), method("multistep", "direct"): learned(end=-33)}
+    off = {
+        LATENT: learned(end=-14),
+        RIVAL: learned(end=-15),
+        method("multistep", "direct"): learned(end=-33),
+    }
     levels = {"push": {method("oracle", "latent", "cem"): -8.4, ZERO: -17.4}}
     figure = figure7({"push": off}, levels, against=["steps"])
     assert "multi-step, direct to −33" in below(figure)
-    assert figure.axes[0].get_ylim()[0] > -22  # -33 is more than half as far below doing nothing as the oracle is above
+    assert (
+        figure.axes[0].get_ylim()[0] > -22
+    )  # -33 is more than half as far below doing nothing as the oracle is above
 
 
 def test_where_curves_begin_is_said_and_the_axis_shows_their_ends() -> None:
-    figure = figure7({"reach": {LATENT: learned(), RIVAL: learned(end=-5)}}, FLOORS, against=["steps"])
+    figure = figure7(
+        {"reach": {LATENT: learned(), RIVAL: learned(end=-5)}}, FLOORS, against=["steps"]
+    )
     low, high = figure.axes[0].get_ylim()
     assert -7 < low < -5 < -4.2 < high
     assert re.search("outside: curves begin at −1[12].*, zero torque −12", below(figure))
@@ -203,7 +265,9 @@ def test_environment_steps_are_told_in_thousands() -> None:
 
 def test_policies_of_yours_are_diamonds() -> None:
     mine = learned(k=1, end=-4.6)
-    figure = figure7({"reach": {LATENT: learned()}}, FLOORS, against=["steps"], yours={"reach": {LATENT: mine}})
+    figure = figure7(
+        {"reach": {LATENT: learned()}}, FLOORS, against=["steps"], yours={"reach": {LATENT: mine}}
+    )
     (own,) = (line for line in figure.axes[0].lines if line.get_marker() == "D")
     assert own.get_ydata()[-1] == pytest.approx(mine["return_true"][0, -1])
     assert "yours" in legend(figure)
@@ -217,7 +281,10 @@ def wrong(**changed: Any) -> dict[str, Any]:
     ("call", "message"),
     [
         (lambda: figure7({}), "nothing to draw"),
-        (lambda: figure7(wrong(return_true=np.full((3, 11), np.nan))), "reach, TSM, latent, return_true: 33 of 33"),
+        (
+            lambda: figure7(wrong(return_true=np.full((3, 11), np.nan))),
+            "reach, TSM, latent, return_true: 33 of 33",
+        ),
         (lambda: figure7(wrong(return_predicted=np.zeros((2, 11)))), r"expected \(3, 11\)"),
         (lambda: figure7(wrong(steps=np.arange(10))), r"expected \(11\)"),
         (lambda: figure7(wrong(seconds=-np.arange(11))), "seconds go backwards"),
@@ -225,7 +292,9 @@ def wrong(**changed: Any) -> dict[str, Any]:
         (lambda: figure7(wrong(), {"push": {ZERO: -8.6}}), "push"),
     ],
 )
-def test_input_that_cannot_be_drawn_is_refused_in_words(call: Callable[[], Figure], message: str) -> None:
+def test_input_that_cannot_be_drawn_is_refused_in_words(
+    call: Callable[[], Figure], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         call()
     assert plt.get_fignums() == []

@@ -11,7 +11,7 @@ from tsmlib import study
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.storage import artifacts, manifest, tables
-from tsmlib.study.runs import Run, RunError
+from reproduction.runs import Run, RunError
 
 ENV = "tsm/ReacherPush-v1"
 
@@ -23,7 +23,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.mark.parametrize("model", ["lstm", "ensemble"])
 @pytest.mark.parametrize("segments", [False, True])
-def test_scores_are_found_again_as_they_were(run: Run, model: str, segments: bool, monkeypatch) -> None:
+def test_scores_are_found_again_as_they_were(
+    run: Run, model: str, segments: bool, monkeypatch
+) -> None:
     first = study.scores(run, ENV, model, segments=segments)
     monkeypatch.setattr(prediction, "score", None)  # nothing is computed again
     second = study.scores(run, ENV, model, segments=segments)
@@ -58,15 +60,23 @@ def test_at_scale_paper_the_other_seeds_are_drawn_too_once_they_are_complete(tmp
     row = dict(env=ENV, sim="mujoco", model="tsm", metric="nrmse", value=1.0, n=1, scale="paper")
     tables.save(tmp_path / "seed1" / "metrics" / "03_predict.csv", [dict(row, seed=1)])
     run, own = Run("03_predict", "paper", 0, tmp_path / "seed0"), [dict(row, seed=0)]
-    with pytest.raises(RunError, match="03_predict in .*seed1 is not run, expected complete. Run it: .* --seed 1"):
+    with pytest.raises(
+        RunError, match="03_predict in .*seed1 is not run, expected complete. Run it: .* --seed 1"
+    ):
         study.pooled_rows(run, own)
     manifest.write_json(tmp_path / "seed1" / "status.json", {"03_predict": {"state": "complete"}})
     assert study.pooled_rows(run, own)["seed"].tolist() == [0, 1]
     changed = {"state": "complete", "changed_copy": True, "notebook": "0f"}
     manifest.write_json(tmp_path / "seed1" / "status.json", {"03_predict": changed})
-    with pytest.raises(RunError, match="03_predict in .*seed1 was executed from a copy with other cells"):
+    with pytest.raises(
+        RunError, match="03_predict in .*seed1 was executed from a copy with other cells"
+    ):
         study.pooled_rows(run, own)
-    manifest.write_json(tmp_path / "seed0" / "status.json", {"03_predict": changed | {"state": "running"}})
+    manifest.write_json(
+        tmp_path / "seed0" / "status.json", {"03_predict": changed | {"state": "running"}}
+    )
     assert study.pooled_rows(run, own)["seed"].tolist() == [0, 1]  # of the same copy
     laptop = Run("03_predict", "laptop", 0, tmp_path / "seed0")
-    assert study.pooled_rows(laptop, own).equals(tables.frame(own))  # seeds are pooled at scale paper alone
+    assert study.pooled_rows(laptop, own).equals(
+        tables.frame(own)
+    )  # seeds are pooled at scale paper alone

@@ -49,7 +49,9 @@ def full_torques(n: int = N, steps: int = T, seed: int = 0) -> np.ndarray:
     return actions
 
 
-def at_rest(q: tuple[float, float], block: tuple[float, float], velocity: tuple[float, float] = (0, 0)) -> np.ndarray:
+def at_rest(
+    q: tuple[float, float], block: tuple[float, float], velocity: tuple[float, float] = (0, 0)
+) -> np.ndarray:
     """A state (1, 10)."""
     return np.array([[*q, 0.0, 0.0, *fingertip(np.array(q)), *block, *velocity]])
 
@@ -58,7 +60,9 @@ def at_rest(q: tuple[float, float], block: tuple[float, float], velocity: tuple[
 def test_gymnasium_finds_no_fault(env_id: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*Box observation space (minimum|maximum) value is.*")
+        warnings.filterwarnings(
+            "ignore", message=".*Box observation space (minimum|maximum) value is.*"
+        )
         check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped)
 
 
@@ -66,7 +70,9 @@ def test_gymnasium_finds_no_fault(env_id: str) -> None:
 def test_an_untouched_object_does_not_move(env_id: str) -> None:
     env, start = arms(env_id, n=200)
     states = env.rollout(smooth_torques(200))
-    untouched = (closest_gap(states, env_id) > 0.02).all(axis=1)  # further away than the arm moves in a substep
+    untouched = (closest_gap(states, env_id) > 0.02).all(
+        axis=1
+    )  # further away than the arm moves in a substep
     assert untouched.sum() > 20
     moved = np.abs(states[untouched, :, 6:] - start[untouched, None, 6:])
     assert moved.max() < 1e-9
@@ -74,7 +80,9 @@ def test_an_untouched_object_does_not_move(env_id: str) -> None:
 
 def test_an_obstacle_never_moves() -> None:
     env, start = arms(OBSTACLE)
-    np.testing.assert_array_equal(env.rollout(full_torques())[..., 6:], np.repeat(start[:, None, 6:], T, axis=1))
+    np.testing.assert_array_equal(
+        env.rollout(full_torques())[..., 6:], np.repeat(start[:, None, 6:], T, axis=1)
+    )
 
 
 def test_an_obstacle_stops_the_arm() -> None:
@@ -103,7 +111,9 @@ def test_energy_without_torque_only_falls() -> None:
     env.reset(options={"states": states})
     states = np.concatenate([states[:, None], env.rollout(np.zeros((N, T, 2)))], axis=1)
     shoulder, elbow = states[..., 2], states[..., 2] + states[..., 3]
-    energy = (ARMATURE + ELBOW_MASS * LINK_LENGTHS[0] ** 2) * shoulder**2 / 2 + ARMATURE * elbow**2 / 2
+    energy = (
+        ARMATURE + ELBOW_MASS * LINK_LENGTHS[0] ** 2
+    ) * shoulder**2 / 2 + ARMATURE * elbow**2 / 2
     energy += BLOCK_MASS * np.sum(states[..., 8:] ** 2, axis=-1) / 2
     assert (np.diff(energy, axis=1) < 0).all()
     assert (energy[:, -1] < 0.3 * energy[:, 0]).all()
@@ -119,12 +129,15 @@ def test_the_free_arm_obeys_its_equation_of_motion() -> None:
         joint = np.array([w[0], w[1] - w[0]])
         w = w + DT / 200 * np.array(
             [
-                (shoulder - elbow - DAMPING * (joint[0] - joint[1])) / (ARMATURE + ELBOW_MASS * LINK_LENGTHS[0] ** 2),
+                (shoulder - elbow - DAMPING * (joint[0] - joint[1]))
+                / (ARMATURE + ELBOW_MASS * LINK_LENGTHS[0] ** 2),
                 (elbow - DAMPING * joint[1]) / ARMATURE,
             ]
         )
         q = q + DT / 200 * w
-    np.testing.assert_allclose(states[-1, :4], [q[0], q[1] - q[0], w[0], w[1] - w[0]], rtol=0.02, atol=1e-3)
+    np.testing.assert_allclose(
+        states[-1, :4], [q[0], q[1] - q[0], w[0], w[1] - w[0]], rtol=0.02, atol=1e-3
+    )
 
 
 def test_drag_slows_a_free_object_at_the_given_rate() -> None:
@@ -149,7 +162,9 @@ def test_the_state_describes_one_arm() -> None:
 def test_bodies_overlap_at_most_in_the_instant_of_impact(env_id: str, torques) -> None:
     env, _ = arms(env_id, n=100)
     states = env.rollout(torques(100))
-    overlap = np.maximum(-closest_gap(states, env_id), np.abs(states[..., 6:8]).max(axis=-1) - (WALL - BLOCK_RADIUS))
+    overlap = np.maximum(
+        -closest_gap(states, env_id), np.abs(states[..., 6:8]).max(axis=-1) - (WALL - BLOCK_RADIUS)
+    )
     assert np.mean(overlap > 1e-3) < (1e-3 if torques is smooth_torques else 1e-2)
     assert overlap.max() < BLOCK_RADIUS  # never past the middle: nothing passes through anything
 
@@ -227,7 +242,17 @@ def test_a_huge_action_counts_as_the_largest() -> None:
 
 @pytest.mark.parametrize(
     ("column", "value"),
-    [(0, 1e300), (1, 1e300), (2, 1e11), (2, 1e200), (3, 1e308), (6, 5.0), (7, 1e300), (8, 1e5), (9, 1e300)],
+    [
+        (0, 1e300),
+        (1, 1e300),
+        (2, 1e11),
+        (2, 1e200),
+        (3, 1e308),
+        (6, 5.0),
+        (7, 1e300),
+        (8, 1e5),
+        (9, 1e300),
+    ],
 )
 def test_a_blow_up_raises_at_its_own_step(column: int, value: float) -> None:
     env, states = arms(PUSH, n=3)

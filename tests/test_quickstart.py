@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib.study import runs
+from reproduction import runs
 
 NOTEBOOK = runs.notebooks()["quickstart"].path
 
@@ -42,26 +42,41 @@ def plain() -> dict[str, Any]:
 
 def shown(names: dict[str, Any]) -> Tensor:
     """Executed and predicted returns of both plans, (2, 2, 8)."""
-    return torch.stack([
-        torch.stack([trial.executed_return, trial.plan.predicted_return]) for trial in names["trials"].values()
-    ])  # fmt: skip
+    return torch.stack(
+        [
+            torch.stack([trial.executed_return, trial.plan.predicted_return])
+            for trial in names["trials"].values()
+        ]
+    )
 
 
 @pytest.mark.parametrize("given", [{"target_x": 0.15}, {"seed": 1}, {"model": "tsm"}], ids=str)
-def test_what_a_reader_changes_changes_what_is_shown(given: dict[str, object], plain: dict[str, Any]) -> None:
+def test_what_a_reader_changes_changes_what_is_shown(
+    given: dict[str, object], plain: dict[str, Any]
+) -> None:
     assert (shown(run_cells(**given)) - shown(plain)).abs().mean() > 0.01
 
 
 def test_it_uses_the_public_interface_and_says_the_equations_of_the_paper() -> None:
     cells = nbformat.read(NOTEBOOK, 4).cells
-    imports = {line for cell in cells for line in cell.source.splitlines() if line.startswith(("import ", "from "))}
+    imports = {
+        line
+        for cell in cells
+        for line in cell.source.splitlines()
+        if line.startswith(("import ", "from "))
+    }
     assert imports == {
-        "import gymnasium", "import torch", "import tsmlib", "from tsmlib import figures, study",
-        "from tsmlib.study.runs import resolve",
-    }  # fmt: skip
+        "import gymnasium",
+        "import torch",
+        "import tsmlib",
+        "from tsmlib import plots as figures, study",
+        "from reproduction.runs import resolve",
+    }
     for before, after in pairwise(cells):
         if "$$" in before.source:
-            assert "tsmlib." in after.source or after.cell_type == "markdown"  # beside the call that is it
+            assert (
+                "tsmlib." in after.source or after.cell_type == "markdown"
+            )  # beside the call that is it
     assert all(tag in "".join(cell.source for cell in cells) for tag in (r"\tag{2}", r"\tag{3}"))
 
 

@@ -14,7 +14,9 @@ from tsmlib.trajectory import Segment
 
 B, L, K, DX, DU = 4, 5, 13, 5, 2
 MODELS: dict[str, Any] = {
-    "rtsm": lambda angles: RecurrentTSM(DX, DU, angles=angles, hidden=6, latent_dim=3, past_len=L, code_len=4),
+    "rtsm": lambda angles: RecurrentTSM(
+        DX, DU, angles=angles, hidden=6, latent_dim=3, past_len=L, code_len=4
+    ),
     "lstm": lambda angles: LSTM(DX, DU, angles=angles, hidden=6, past_len=L),
 }
 DTYPES = pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
@@ -25,14 +27,18 @@ def plain(net: Any, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
     """The equations of ``models.recurrence``, one operation after the other."""
     layers = net.decoder if isinstance(net, RecurrentTSM) else net
 
-    def advance(x: Tensor, u: Tensor, h: Tensor, c: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def advance(
+        x: Tensor, u: Tensor, h: Tensor, c: Tensor, code: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         seen = torch.cat([net.features(x), u], dim=-1)
         q = layers.cell(torch.cat([seen, h], dim=-1))
         q = q + layers.codes(code) if hasattr(layers, "codes") else q
         forget, write, read, new = q.chunk(4, dim=-1)
         c = forget.sigmoid() * c + write.sigmoid() * new.tanh()
         h = read.sigmoid() * c.tanh()
-        change = layers.head(torch.cat([h, seen], dim=-1)) if hasattr(layers, "head") else layers.out(h)
+        change = (
+            layers.head(torch.cat([h, seen], dim=-1)) if hasattr(layers, "head") else layers.out(h)
+        )
         return x + net.features.step_std * change, h, c
 
     h = c = actions.new_zeros(len(actions), net.hidden)
@@ -47,10 +53,16 @@ def plain(net: Any, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
 
 
 def fast(net: Any, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
-    return net.decode(past, actions, z) if isinstance(net, RecurrentTSM) else net.predict_segment(past, actions)
+    return (
+        net.decode(past, actions, z)
+        if isinstance(net, RecurrentTSM)
+        else net.predict_segment(past, actions)
+    )
 
 
-def setting(name: str, angles: tuple[int, ...], dtype: torch.dtype) -> tuple[Any, Segment, Tensor, Tensor]:
+def setting(
+    name: str, angles: tuple[int, ...], dtype: torch.dtype
+) -> tuple[Any, Segment, Tensor, Tensor]:
     torch.manual_seed(0)
     net = MODELS[name](angles)
     net.features.fit(torch.randn(20, 31, DX).cumsum(1))
@@ -72,7 +84,9 @@ def test_values_and_gradients_are_those_of_the_plain_equations(
     for way in (fast, plain):
         states = way(net, past, actions, z)
         whole = [*known, *net.parameters()]
-        found.append((states, torch.autograd.grad((weights * states.sin()).sum(), whole, allow_unused=True)))
+        found.append(
+            (states, torch.autograd.grad((weights * states.sin()).sum(), whole, allow_unused=True))
+        )
     (ours, ours_d), (theirs, theirs_d) = found
     torch.testing.assert_close(ours, theirs, rtol=atol, atol=atol)
     for one, other in zip(ours_d, theirs_d, strict=True):
@@ -103,14 +117,18 @@ def test_what_runs_without_gradients_is_what_is_trained(name: str) -> None:
 def test_a_second_backward_pass_finds_what_the_first_found(name: str) -> None:
     net, past, actions, z = setting(name, (0, 1), torch.float64)
     value = fast(net, past, actions, z).square().sum()
-    twice = [torch.autograd.grad(value, list(net.parameters()), retain_graph=True) for _ in range(2)]
+    twice = [
+        torch.autograd.grad(value, list(net.parameters()), retain_graph=True) for _ in range(2)
+    ]
     assert all(torch.equal(*pair) for pair in zip(*twice, strict=True))
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_past_of_one_step_says_nothing_of_what_was_before(name: str) -> None:
     net, past, actions, z = setting(name, (0, 1), torch.float64)
-    torch.testing.assert_close(fast(net, past.last(1), actions, z), plain(net, past.last(1), actions, z))
+    torch.testing.assert_close(
+        fast(net, past.last(1), actions, z), plain(net, past.last(1), actions, z)
+    )
 
 
 def with_gradients(name: str, dtype: torch.dtype, *, forward: bool, backward: bool) -> list[Tensor]:
@@ -132,7 +150,9 @@ def test_autocast_rounds_products_of_a_cell_with_a_head_layer() -> None:
         assert 0 < (other - one).norm() < 0.03 * one.norm()
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("lstm", torch.float32), ("lstm", torch.float64), ("rtsm", torch.float64)])
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("lstm", torch.float32), ("lstm", torch.float64), ("rtsm", torch.float64)]
+)
 def test_autocast_leaves_float64_and_the_lstm_alone(name: str, dtype: torch.dtype) -> None:
     exact = with_gradients(name, dtype, forward=False, backward=False)
     under = with_gradients(name, dtype, forward=True, backward=False)
@@ -141,15 +161,22 @@ def test_autocast_leaves_float64_and_the_lstm_alone(name: str, dtype: torch.dtyp
 
 @pytest.mark.parametrize("name", MODELS)
 def test_autocast_around_the_backward_pass_changes_nothing(name: str) -> None:
-    outside, inside = (with_gradients(name, torch.float32, forward=True, backward=inner) for inner in (False, True))
+    outside, inside = (
+        with_gradients(name, torch.float32, forward=True, backward=inner) for inner in (False, True)
+    )
     assert all(torch.equal(*pair) for pair in zip(outside, inside, strict=True))
 
 
 @pytest.mark.parametrize("batch", [4, 33, 48])
-def test_nothing_depends_on_memory_that_was_never_written(batch: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_depends_on_memory_that_was_never_written(
+    batch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # Products in bfloat16 on AMX read beside the columns that they are given; elsewhere this proves nothing.
     net, *_ = setting("rtsm", (0, 1), torch.float32)
-    past, actions = Segment(torch.randn(batch, L, DX), torch.randn(batch, L, DU)), torch.randn(batch, K, DU)
+    past, actions = (
+        Segment(torch.randn(batch, L, DX), torch.randn(batch, L, DU)),
+        torch.randn(batch, K, DU),
+    )
     empty, empty_like = torch.Tensor.new_empty, torch.empty_like
 
     def spoiled(make: Any) -> Any:

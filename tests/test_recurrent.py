@@ -13,7 +13,7 @@ from torch import Tensor
 from tsmlib.models.base import rollout, stepper
 from tsmlib.models.energy import energy_score
 from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib.study import zoo
+from tsmlib import zoo
 from tsmlib.training.fit import keep_freed_memory
 from tsmlib.trajectory import Segment, Window
 
@@ -27,7 +27,14 @@ def rng(seed: int = 0) -> torch.Generator:
 def model(mode_weight: float = 0.0, segment_len: int = 100) -> RecurrentTSM:
     torch.manual_seed(0)
     net = RecurrentTSM(
-        DX, DU, hidden=8, latent_dim=3, past_len=H, code_len=H, segment_len=segment_len, mode_weight=mode_weight
+        DX,
+        DU,
+        hidden=8,
+        latent_dim=3,
+        past_len=H,
+        code_len=H,
+        segment_len=segment_len,
+        mode_weight=mode_weight,
     )
     net.features.fit(torch.randn(20, 31, DX, generator=rng()).cumsum(1))
     return net.double()
@@ -48,7 +55,9 @@ def test_codes_that_differ_in_the_second_segment_differ_from_there_on() -> None:
     ours, theirs = (net.decode(past, future.actions, codes) for codes in (z, other))
     assert torch.equal(ours[:, :H], theirs[:, :H])
     assert (ours[:, H:] != theirs[:, H:]).all()
-    assert torch.equal(net.decode(past, future.actions, z[:, 0]), net.decode(past, future.actions, z[:, :1]))
+    assert torch.equal(
+        net.decode(past, future.actions, z[:, 0]), net.decode(past, future.actions, z[:, :1])
+    )
 
 
 @pytest.mark.parametrize("seed", [None, 0])
@@ -62,7 +71,9 @@ def test_the_hidden_state_is_carried_from_code_to_code(seed: int | None) -> None
     for begun in (net.begin(past, generator=noise()), stepper(net, past, generator=noise())):
         steps = torch.stack([begun(u) for u in future.actions.unbind(1)], dim=1)
         torch.testing.assert_close(steps, whole, rtol=1e-12, atol=1e-12)
-    anew = rollout(model(segment_len=10), past, future.actions, generator=noise())  # which begins again after ten
+    anew = rollout(
+        model(segment_len=10), past, future.actions, generator=noise()
+    )  # which begins again after ten
     torch.testing.assert_close(anew[:, :10], whole[:, :10], rtol=1e-12, atol=1e-12)
     assert (anew[:, 10:] - whole[:, 10:]).abs().max() > 1e-6
 
@@ -77,7 +88,10 @@ def test_the_energy_score_is_what_a_double_loop_makes_of_it(n: int) -> None:
     for b in range(B):
         off = sum(math.dist(x.flatten(), truth[b].flatten()) for x in samples[:, b]) / n
         apart = [
-            math.dist(samples[i, b].flatten(), samples[j, b].flatten()) for i in range(n) for j in range(n) if i != j
+            math.dist(samples[i, b].flatten(), samples[j, b].flatten())
+            for i in range(n)
+            for j in range(n)
+            if i != j
         ]
         found.append(off - sum(apart) / len(apart) / 2 if apart else off)
     assert float(energy_score(samples, truth)) == pytest.approx(sum(found) / B, rel=1e-6)
@@ -95,7 +109,9 @@ def test_the_loss_is_the_energy_score_of_two_rollouts_and_the_distance_of_the_mo
     drawn = rollout(net, both, future.actions.repeat(2, 1, 1), generator=rng())
     first, second, mode = *drawn.chunk(2), rollout(net, past, future.actions)
     total = 0.0
-    for a, b, m, x in zip(*(features(net, states) for states in (first, second, mode, future.states)), strict=True):
+    for a, b, m, x in zip(
+        *(features(net, states) for states in (first, second, mode, future.states)), strict=True
+    ):
         off = lambda one, other: (one - other).flatten(1).norm(dim=1).mean()  # noqa: E731
         total += float((off(a, x) + off(b, x) - off(a, b)) / 2 + 0.7 * off(m, x)) / 2
     assert float(net.loss(seen, rng())) == pytest.approx(total, rel=1e-6)

@@ -20,7 +20,7 @@ from reliability.world import Outcome
 from tqdm.auto import tqdm
 
 from tsmlib.storage import manifest
-from tsmlib.study import runs, workflow
+from reproduction import runs, workflow
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills, forks and looks into /proc")
 QUICK = {check.__name__: quick for part in CHECKS.values() for check, quick, _ in part}
@@ -133,7 +133,9 @@ def test_every_check_says_which_number_it_answers() -> None:
         assert what, check
 
 
-def test_a_table_keeps_the_lines_of_checks_that_were_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_keeps_the_lines_of_checks_that_were_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = tmp_path / "reliability.md"
     page.write_bytes(long.DOCS.read_bytes())
     monkeypatch.setattr(long, "DOCS", page)
@@ -147,7 +149,8 @@ def test_a_table_keeps_the_lines_of_checks_that_were_not_run(tmp_path: Path, mon
     long.write_table(tmp_path / "nothing was run")
     assert not changed()
     manifest.write_json(
-        tmp_path / "full_disk.json", {"right": 3, "of": 4, "note": "a | b", "seconds": 5, "day": "2026-11-27"}
+        tmp_path / "full_disk.json",
+        {"right": 3, "of": 4, "note": "a | b", "seconds": 5, "day": "2026-11-27"},
     )
     long.write_table(tmp_path)
     number, what = said(training.full_disk)
@@ -166,7 +169,9 @@ def test_on_a_cluster_each_kind_is_killed_as_often_and_in_every_order() -> None:
 def test_on_a_cluster_steps_are_counted_by_the_marks_of_a_workflow(tmp_path: Path) -> None:
     notebook = runs.notebooks()["train"]
     given = {"env": "tsm/Reacher-v0", "models": "prior"}
-    steps = workflow.steps(workflow.prepare([notebook], (0, 2), scale="smoke", device="", given=given), given)
+    steps = workflow.steps(
+        workflow.prepare([notebook], (0, 2), scale="smoke", device="", given=given), given
+    )
     for n, step in enumerate(steps.values()):
         assert cluster.steps_done(tmp_path) == n
         mark = tmp_path / "runs" / "smoke" / "workflow" / step.done

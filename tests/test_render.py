@@ -12,7 +12,9 @@ from tsmlib.envs.render import EXTENT, draw_scene, render_array
 from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS
 
 
-def a_state(env_id: str, q: tuple[float, float] = (0.5, 1.0), block: tuple[float, float] = (-0.1, -0.15)) -> np.ndarray:
+def a_state(
+    env_id: str, q: tuple[float, float] = (0.5, 1.0), block: tuple[float, float] = (-0.1, -0.15)
+) -> np.ndarray:
     arm = np.array([*q, 0.0, 0.0, *fingertip(np.array(q))])
     return arm if env_id.endswith("Reacher-v0") else np.concatenate([arm, block, np.zeros(2)])
 

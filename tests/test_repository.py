@@ -14,7 +14,7 @@ import yaml
 
 import tsmlib
 from tsmlib.storage import manifest, tables
-from tsmlib.study.runs import ROOT
+from reproduction.runs import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = sorted((ROOT / "tsmlib").rglob("*.py"))
@@ -37,7 +37,11 @@ def test_the_lock_holds_exact_versions_and_no_addresses() -> None:
 
 
 def test_the_lock_covers_every_dependency() -> None:
-    extras = {**PROJECT["optional-dependencies"], "mbrl": [], "cluster": []}  # installed by hand, next to other pins
+    extras = {
+        **PROJECT["optional-dependencies"],
+        "mbrl": [],
+        "cluster": [],
+    }  # installed by hand, next to other pins
     wanted = [*PROJECT["dependencies"], *(line for lines in extras.values() for line in lines)]
     names = {re.split(r"[<>=!~\[ ]", line)[0].lower().replace("_", "-") for line in wanted}
     locked = pins() | pins("docs/requirements.lock")
@@ -76,34 +80,72 @@ def imported(path: Path) -> set[str]:
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_nothing_can_execute_what_it_reads(path: Path) -> None:
     source = path.read_text()
-    assert not {name.split(".")[0] for name in imported(path)} & {"pickle", "cloudpickle", "joblib", "dill", "shelve"}
+    assert not {name.split(".")[0] for name in imported(path)} & {
+        "pickle",
+        "cloudpickle",
+        "joblib",
+        "dill",
+        "shelve",
+    }
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)
-            assert called not in ("eval", "exec", "torch.load", "torch.save", "np.load", "np.save", "yaml.load"), called
+            assert called not in (
+                "eval",
+                "exec",
+                "torch.load",
+                "torch.save",
+                "np.load",
+                "np.save",
+                "yaml.load",
+            ), called
 
 
 def test_imports_point_one_way() -> None:
     """The contracts of pyproject.toml: layers, figures that take arrays, models that know no physics."""
     done = subprocess.run(
-        [str(Path(sys.executable).with_name("lint-imports"))], cwd=ROOT, capture_output=True, text=True, check=False
+        [str(Path(sys.executable).with_name("lint-imports"))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.skipif(not (ROOT / "data").exists(), reason="nothing ships")
 def test_everything_that_ships_is_intact_and_listed() -> None:
-    shipped = {path for path in (ROOT / "data").rglob("*") if path.is_file() and not path.name.startswith(".")}
+    shipped = {
+        path
+        for path in (ROOT / "data").rglob("*")
+        if path.is_file() and not path.name.startswith(".")
+    }
     again = "python -c 'from tsmlib.storage import manifest; manifest.write_manifest(\"data\")'"
-    assert not shipped or set(manifest.verify(ROOT / "data")) == shipped, f"list what is new: {again}"
+    assert not shipped or set(manifest.verify(ROOT / "data")) == shipped, (
+        f"list what is new: {again}"
+    )
 
 
 def test_what_running_leaves_behind_is_ignored() -> None:
     if not (ROOT / ".git").exists():
         pytest.skip("not a git checkout")
-    made = [".venv/x", "runs/laptop/seed0/x", "tsmlib.egg-info/x", "tsmlib/__pycache__/x", ".ruff_cache/x"]
-    made += ["notebooks/.ipynb_checkpoints/x", "MUJOCO_LOG.TXT", "data/.x.csv.tmp-12", "data/.lock", "data/.writer"]
-    done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
+    made = [
+        ".venv/x",
+        "runs/laptop/seed0/x",
+        "tsmlib.egg-info/x",
+        "tsmlib/__pycache__/x",
+        ".ruff_cache/x",
+    ]
+    made += [
+        "notebooks/.ipynb_checkpoints/x",
+        "MUJOCO_LOG.TXT",
+        "data/.x.csv.tmp-12",
+        "data/.lock",
+        "data/.writer",
+    ]
+    done = subprocess.run(
+        ["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.stdout.split() == made
 
 

@@ -18,9 +18,9 @@ from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
 from tsmlib.storage import tables
-from tsmlib.study import drawings, media, runs, zoo
-from tsmlib.study.results import planning as planning_results
-from tsmlib.study.results import table
+from tsmlib import zoo
+from reproduction.results import planning as planning_results
+from reproduction.results import table
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 TSM, LSTM = (zoo.method(model, "latent", "cem") for model in ("tsm", "lstm"))
@@ -36,12 +36,23 @@ def foreseen(task: Task, torques: Any, gap: float = 0.0) -> Trial:
     """A trial of torques whose predicted states are the executed ones; its predicted return is more by ``gap``."""
     seen = execute(task, torques)
     states = seen.states[None, :, 1:].clone()
-    plan = Plan(torques, torques, states, seen.executed_return + gap, seen.executed_return[None], seconds=1.0)
+    plan = Plan(
+        torques,
+        torques,
+        states,
+        seen.executed_return + gap,
+        seen.executed_return[None],
+        seconds=1.0,
+    )
     return dataclasses.replace(seen, plan=plan)
 
 
 def value(rows: Any, metric: str, **wanted: Any) -> float:
-    (found,) = (row["value"] for row in rows if row["metric"] == metric and all(row[k] == v for k, v in wanted.items()))
+    (found,) = (
+        row["value"]
+        for row in rows
+        if row["metric"] == metric and all(row[k] == v for k, v in wanted.items())
+    )
     return float(found)
 
 
@@ -55,9 +66,13 @@ def test_a_table_holds_what_the_trials_measured() -> None:
     assert value(summary, "return_true") == pytest.approx(float(trial.executed_return.mean()))
     near = trial.final_distance <= task.tolerance
     assert value(summary, "success") == pytest.approx(float(near.float().mean()))
-    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {("none", "zero", 2, 4)}
+    assert {(row["model"], row["planner"], row["seed"], row["n"]) for row in summary} == {
+        ("none", "zero", 2, 4)
+    }
     np.testing.assert_allclose(
-        planning_results.by_target(tables.frame(per_target), "return_true")[ZERO], trial.executed_return, rtol=1e-6
+        planning_results.by_target(tables.frame(per_target), "return_true")[ZERO],
+        trial.executed_return,
+        rtol=1e-6,
     )
 
 
@@ -73,7 +88,9 @@ def test_costs_are_held_against_the_oracle_and_gains_against_doing_nothing() -> 
     assert value(rows, "gain_share", planner="zero") == pytest.approx(0)
 
 
-def test_a_predicted_rollout_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> None:
+def test_a_predicted_rollout_that_breaks_an_invariant_is_in_the_rows_and_the_truth_breaks_none() -> (
+    None
+):
     task = some_task()
     torques = random_torques(task)
     sound, careless = foreseen(task, torques), foreseen(task, torques)
@@ -85,10 +102,16 @@ def test_a_predicted_rollout_that_breaks_an_invariant_is_in_the_rows_and_the_tru
     rows, per_target = planning_results.rows([task], {PUSH: {TSM: sound, LSTM: careless}}, RUN)
     assert value(rows, "violations", model="tsm") == 0
     assert value(rows, "violations", model="lstm") == pytest.approx(0.05, abs=0.006)
-    assert value(rows, "violations_worst", model="lstm") == pytest.approx(0.5, abs=0.06)  # the worst tenth is that one
+    assert value(rows, "violations_worst", model="lstm") == pytest.approx(
+        0.5, abs=0.06
+    )  # the worst tenth is that one
     assert planning_results.by_target(tables.frame(per_target), "violations")[LSTM].argmax() == 3
-    closed, _ = planning_results.rows([task], {PUSH: {TSM: sound}}, RUN, execution=planning_results.CLOSED)
-    assert not any(row["metric"].startswith("violations") for row in closed)  # each plan predicts from another start
+    closed, _ = planning_results.rows(
+        [task], {PUSH: {TSM: sound}}, RUN, execution=planning_results.CLOSED
+    )
+    assert not any(
+        row["metric"].startswith("violations") for row in closed
+    )  # each plan predicts from another start
 
 
 def test_rough_torques_are_told_from_smooth_ones() -> None:
@@ -130,21 +153,45 @@ def test_how_soon_a_plan_was_nearly_done_is_counted_target_by_target() -> None:
     assert {(row["execution"], row["horizon"], row["metric"]) for row in rows} == {
         ("open loop", 20, "iterations_to_95")
     }
-    assert cells(planning_results.convergence_table(tables.frame(rows)))[1][2:] == ["3", "60", "66.7%", "66.7%"]
+    assert cells(planning_results.convergence_table(tables.frame(rows)))[1][2:] == [
+        "3",
+        "60",
+        "66.7%",
+        "66.7%",
+    ]
 
 
 def test_the_size_of_a_gap_is_that_of_each_seed_before_seeds_are_averaged() -> None:
-    given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", execution="open loop")
+    given = dict(
+        env="tsm/Reacher-v0",
+        model="tsm",
+        search_space="latent",
+        planner="cem",
+        execution="open loop",
+    )
     predicted = {0: 3.0, 1: -1.0}  # of 1: two too much, and two too little
-    rows = [dict(given, metric="return_true", target=i, seed=seed, value=1.0) for seed in predicted for i in range(3)]
-    rows += [dict(given, metric="return_predicted", target=i, seed=seed, value=value)
-             for seed, value in predicted.items() for i in range(3)]  # fmt: skip
-    np.testing.assert_array_equal(planning_results.gap_sizes(tables.frame(rows))[TSM], [[2.0, 2.0, 2.0]] * 2)
+    rows = [
+        dict(given, metric="return_true", target=i, seed=seed, value=1.0)
+        for seed in predicted
+        for i in range(3)
+    ]
+    rows += [
+        dict(given, metric="return_predicted", target=i, seed=seed, value=value)
+        for seed, value in predicted.items()
+        for i in range(3)
+    ]
+    np.testing.assert_array_equal(
+        planning_results.gap_sizes(tables.frame(rows))[TSM], [[2.0, 2.0, 2.0]] * 2
+    )
 
 
 def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_and_over_seeds_as_well() -> None:
     given = dict(
-        env="tsm/Reacher-v0", search_space="latent", planner="cem", execution="open loop", metric="return_true"
+        env="tsm/Reacher-v0",
+        search_space="latent",
+        planner="cem",
+        execution="open loop",
+        metric="return_true",
     )
     costs = {
         ("tsm", 0): [1.0, 2.0, 3.0],
@@ -152,43 +199,87 @@ def test_a_cost_that_is_paired_by_target_is_told_for_each_seed_and_over_seeds_as
         ("tsm", 1): [1.0, 2.0, 3.0],
         ("lstm", 1): [4.0, 5.0, 6.0],
     }
-    rows = [dict(given, model=model, target=i, seed=seed, value=-cost)
-            for (model, seed), each in costs.items() for i, cost in enumerate(each)]  # fmt: skip
-    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict("records")
-    assert (line["cost of tsm minus this"], line["in each seed"]) == ("-2.00 (12.71)", "-1.00, -3.00")  # t of 2 seeds
+    rows = [
+        dict(given, model=model, target=i, seed=seed, value=-cost)
+        for (model, seed), each in costs.items()
+        for i, cost in enumerate(each)
+    ]
+    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict(
+        "records"
+    )
+    assert (line["cost of tsm minus this"], line["in each seed"]) == (
+        "-2.00 (12.71)",
+        "-1.00, -3.00",
+    )  # t of 2 seeds
     rows = [row for row in rows if row["seed"] == 0]
-    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict("records")
+    _, line = planning_results.paired_table(tables.frame(rows), "tsm/Reacher-v0", "tsm").to_dict(
+        "records"
+    )
     assert line["cost of tsm minus this"] == "-1.00"
 
 
 def test_targets_that_a_method_lacks_take_no_seed_away() -> None:
-    given = dict(env=PUSH, search_space="latent", planner="cem", execution="open loop", metric="return_true")
-    rows = [dict(given, model=model, target=i, seed=seed, value=-cost - i)
-            for model, cost, n in (("tsm", 1.0, 4), ("lstm", 2.0, 3)) for seed in (0, 1) for i in range(n)]  # fmt: skip
+    given = dict(
+        env=PUSH, search_space="latent", planner="cem", execution="open loop", metric="return_true"
+    )
+    rows = [
+        dict(given, model=model, target=i, seed=seed, value=-cost - i)
+        for model, cost, n in (("tsm", 1.0, 4), ("lstm", 2.0, 3))
+        for seed in (0, 1)
+        for i in range(n)
+    ]
     _, line = planning_results.paired_table(tables.frame(rows), PUSH, "tsm").to_dict("records")
     assert (line["in each seed"], line["n"]) == ("-1.00, -1.00", 3)
-    apart = [row for row in rows if (row["model"], row["seed"]) not in {("tsm", 0), ("lstm", 1)}]  # no seed of both
+    apart = [
+        row for row in rows if (row["model"], row["seed"]) not in {("tsm", 0), ("lstm", 1)}
+    ]  # no seed of both
     _, line = planning_results.paired_table(tables.frame(apart), PUSH, "tsm").to_dict("records")
     assert line["cost of tsm minus this"] == ""
 
 
 def test_open_and_closed_loop_are_compared_in_the_seeds_that_were_executed_both_ways() -> None:
-    given = dict(env=PUSH, search_space="latent", planner="cem", metric="final_distance", n=1, target=0)
-    seeds = {("tsm", "open loop"): (0, 1), ("tsm", "closed loop"): (1, 2), ("lstm", "closed loop"): (0, 1)}
-    rows = tables.frame([dict(given, model=model, execution=way, seed=seed, value=seed + (way == "open loop"))
-                         for (model, way), own in seeds.items() for seed in own])  # fmt: skip
+    given = dict(
+        env=PUSH, search_space="latent", planner="cem", metric="final_distance", n=1, target=0
+    )
+    seeds = {
+        ("tsm", "open loop"): (0, 1),
+        ("tsm", "closed loop"): (1, 2),
+        ("lstm", "closed loop"): (0, 1),
+    }
+    rows = tables.frame(
+        [
+            dict(given, model=model, execution=way, seed=seed, value=seed + (way == "open loop"))
+            for (model, way), own in seeds.items()
+            for seed in own
+        ]
+    )
     drawn = planning_results.final_distances(rows, PUSH)
-    assert {way: values.tolist() for way, values in drawn[TSM].items()} == {"open": [2], "closed": [1]}
-    assert {way: values.tolist() for way, values in drawn[LSTM].items()} == {"closed": [0, 1]}  # of no open loop
+    assert {way: values.tolist() for way, values in drawn[TSM].items()} == {
+        "open": [2],
+        "closed": [1],
+    }
+    assert {way: values.tolist() for way, values in drawn[LSTM].items()} == {
+        "closed": [0, 1]
+    }  # of no open loop
     _, ours, theirs = cells(planning_results.loops_table(rows))
     assert ours[-3:] == ["1", "2.000", "1.000"]
     assert theirs[-3:] == ["2", "", "0.500"]
 
 
 def test_distances_that_are_drawn_are_those_of_every_seed() -> None:
-    given = dict(env="tsm/Reacher-v0", model="tsm", search_space="latent", planner="cem", metric="final_distance")
-    rows = [dict(given, execution=way, target=i, seed=seed, value=i + seed)
-            for way in ("open loop", "closed loop") for seed in (0, 10) for i in range(2)]  # fmt: skip
+    given = dict(
+        env="tsm/Reacher-v0",
+        model="tsm",
+        search_space="latent",
+        planner="cem",
+        metric="final_distance",
+    )
+    rows = [
+        dict(given, execution=way, target=i, seed=seed, value=i + seed)
+        for way in ("open loop", "closed loop")
+        for seed in (0, 10)
+        for i in range(2)
+    ]
     drawn = planning_results.final_distances(tables.frame(rows), "tsm/Reacher-v0")[TSM]
     assert sorted(drawn["closed"]) == sorted(drawn["open"]) == [0, 1, 10, 11]
 
@@ -196,7 +287,9 @@ def test_distances_that_are_drawn_are_those_of_every_seed() -> None:
 def test_seeds_are_averaged_target_by_target() -> None:
     given = dict(model="tsm", search_space="latent", planner="cem", metric="return_true")
     rows = [dict(given, target=i, seed=seed, value=i + seed) for seed in (0, 2) for i in range(3)]
-    np.testing.assert_array_equal(planning_results.by_target(tables.frame(rows), "return_true")[TSM], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(
+        planning_results.by_target(tables.frame(rows), "return_true")[TSM], [1.0, 2.0, 3.0]
+    )
 
 
 # Tables --------------------------------------------------------------------------------------------------------------
@@ -204,12 +297,22 @@ def test_seeds_are_averaged_target_by_target() -> None:
 
 def test_a_point_is_a_target_of_a_seed_and_every_model_is_searched_in_one_space() -> None:
     task = some_task(n=2)
-    common = dict(env=task.env, task=task.name, planner="cem", execution="open loop", scale="paper", n=2)
-    rows = tables.frame([
-        common | dict(model=model, search_space=space, metric=metric, value=-1.0 - k - i, seed=k, target=i)
-        for model in (zoo.OURS, "lstm") for space in ("latent", "direct")
-        for metric in ("return_true", "return_predicted") for k in range(3) for i in range(2)
-    ]).assign(source=table.YOURS)  # fmt: skip
+    common = dict(
+        env=task.env, task=task.name, planner="cem", execution="open loop", scale="paper", n=2
+    )
+    rows = tables.frame(
+        [
+            common
+            | dict(
+                model=model, search_space=space, metric=metric, value=-1.0 - k - i, seed=k, target=i
+            )
+            for model in (zoo.OURS, "lstm")
+            for space in ("latent", "direct")
+            for metric in ("return_true", "return_predicted")
+            for k in range(3)
+            for i in range(2)
+        ]
+    ).assign(source=table.YOURS)
     drawing = drawings.predicted_and_executed(rows, [task])
     assert [ax.get_title(loc="left") for ax in drawing.figure.axes] == [
         "recurrent TSM\nlatent, CEM",
@@ -228,9 +331,17 @@ def cells(markdown: str) -> list[list[str]]:
 def made_up(**changed: float) -> pd.DataFrame:
     """Rows of a study in which every threshold is reached, but for what is ``changed``."""
     given = {
-        "near": 1.05, "relative": 0.02, "far": 1.1, "size": 0.1, "rival_size": 0.3, "executed": -7.0, "rival": -7.5,
-        "success": 0.5, "oracle_success": 0.4, "violations": 0.01,
-    } | changed  # fmt: skip
+        "near": 1.05,
+        "relative": 0.02,
+        "far": 1.1,
+        "size": 0.1,
+        "rival_size": 0.3,
+        "executed": -7.0,
+        "rival": -7.5,
+        "success": 0.5,
+        "oracle_success": 0.4,
+        "violations": 0.01,
+    } | changed
     ours, oracle, rival = ("tsm", "latent"), ("oracle", "latent"), ("lstm", "direct")
     numbers = [
         (REACHER, *ours, planning_results.OPEN, "cost_over_oracle", given["near"]),
@@ -247,20 +358,29 @@ def made_up(**changed: float) -> pd.DataFrame:
         (PUSH, *oracle, planning_results.CLOSED, "success", given["oracle_success"]),
     ]
     columns = ("env", "model", "search_space", "execution", "metric", "value")
-    return tables.frame(dict(zip(columns, row, strict=True), planner="cem", n=100) for row in numbers)
+    return tables.frame(
+        dict(zip(columns, row, strict=True), planner="cem", n=100) for row in numbers
+    )
 
 
 def test_every_threshold_can_be_reached_and_missed() -> None:
     found = planning_results.thresholds(made_up(), "tsm")
     assert found["reached"].all()
     for changed in (
-        {"near": 1.2}, {"relative": 0.06}, {"far": 1.16}, {"size": 0.2}, {"rival": -6.9}, {"success": 0.3},
+        {"near": 1.2},
+        {"relative": 0.06},
+        {"far": 1.16},
+        {"size": 0.2},
+        {"rival": -6.9},
+        {"success": 0.3},
         {"violations": 0.06},
-    ):  # fmt: skip
+    ):
         missed = planning_results.thresholds(made_up(**changed), "tsm")
         assert (~missed["reached"]).sum() == 1, changed
         assert [line[-1] for line in cells(table.markdown(missed))].count("no") == 1
-    most = planning_results.thresholds(made_up(success=0.8, oracle_success=0.9), "tsm").set_index("what")
+    most = planning_results.thresholds(made_up(success=0.8, oracle_success=0.9), "tsm").set_index(
+        "what"
+    )
     assert most["reached"]["push, closed loop: within 0.05 m, the oracle's or 80 %"]
 
 
@@ -275,7 +395,9 @@ def test_tables_keep_models_planners_and_loops_apart() -> None:
     head, ours, _ = cells(planning_results.planners_table(rows[rows["env"] == PUSH]))
     assert head == ["environment", "method", "CEM", "MPPI"]
     assert ours[1:] == ["TSM, latent", "-7.00 (+0.10)", "-1.00 (-1.00)"]
-    (line,) = (line for line in planning_results.loops_table(rows).splitlines() if "| TSM, latent" in line)
+    (line,) = (
+        line for line in planning_results.loops_table(rows).splitlines() if "| TSM, latent" in line
+    )
     assert "50.0%" in line
     assert "| 1.0%" in planning_results.violations_table(rows)
 
@@ -336,7 +458,9 @@ def test_a_film_of_two_methods_has_a_column_for_each_and_what_was_predicted_abov
     task = dataclasses.replace(some_task("tsm/PymunkPush-v1", 2), horizon=3)
     sound = foreseen(task, random_torques(task))
     assert sound.plan is not None
-    careless = dataclasses.replace(sound, plan=dataclasses.replace(sound.plan, states=sound.plan.states + 0.05))
+    careless = dataclasses.replace(
+        sound, plan=dataclasses.replace(sound.plan, states=sound.plan.states + 0.05)
+    )
     film = media.compared_film(task, {TSM: sound, LSTM: careless}, 1)
     above, below = np.split(film, 2, axis=1)
     (left, right), (done, again) = (np.split(row, 2, axis=2) for row in (above, below))
@@ -364,7 +488,9 @@ def test_a_film_says_the_time_of_each_frame_and_how_far_the_target_is() -> None:
     task = dataclasses.replace(some_task(REACHER, 1), horizon=3)
     start = torch.from_numpy(task.start)[:, None].expand(-1, 3, -1)
     still = foreseen(task, zero_torques(task))
-    still = dataclasses.replace(still, states=torch.cat([start[:, :1], start], 1))  # an arm that never moves
+    still = dataclasses.replace(
+        still, states=torch.cat([start[:, :1], start], 1)
+    )  # an arm that never moves
     _, frames = np.split(media.film(task, still, 0), 2, axis=2)
     away = np.linalg.norm(task.start[0, 4:6] - task.target[0].numpy())
     where = np.s_[440:470]  # the line of text, in pixels

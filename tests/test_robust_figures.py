@@ -13,13 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from tsmlib.figures import Look, Method, advantage_map, figure8, filtering_errors, imperfect_episode
+from tsmlib.plots import Look, Method, advantage_map, figure8, filtering_errors, imperfect_episode
 from tsmlib.statistics import interval
-from tsmlib.study.zoo import method
+from tsmlib.zoo import method
 
 STEPS, DT = 20, 0.02
 TSM, LSTM, ONE_STEP, ZERO = method("tsm"), method("lstm"), method("onestep"), method("zero")
-KALMAN, SMOOTHED = method("filter"), Method("exponential", look=Look("exponential filter", "#8C8C8C"))
+KALMAN, SMOOTHED = (
+    method("filter"),
+    Method("exponential", look=Look("exponential filter", "#8C8C8C")),
+)
 LATENT, DIRECT, RIVAL = method("tsm", "latent"), method("tsm", "direct"), method("lstm", "direct")
 FLOOR = {method("random"): -13.5, ZERO: -12.1}
 draw = np.random.default_rng(0)
@@ -46,8 +49,10 @@ def precompute(level: float, k: int = 3) -> np.ndarray:
     return level * (1 + 0.1 * np.arange(10)) + 0.002 * draw.normal(size=(k, 10))
 
 
-AHEAD = {part: {TSM: precompute(0.1 + 0.02 * i), LSTM: precompute(0.15), KALMAN: precompute(0.08, k=1)}
-         for i, part in enumerate(PARTS)}  # fmt: skip
+AHEAD = {
+    part: {TSM: precompute(0.1 + 0.02 * i), LSTM: precompute(0.15), KALMAN: precompute(0.08, k=1)}
+    for i, part in enumerate(PARTS)
+}
 NOW = {part: {KALMAN: 0.07, SMOOTHED: 0.15} for part in PARTS}
 RAW = {part: 0.25 - 0.01 * i for i, part in enumerate(PARTS)}
 ONE_STEP = method("onestep")
@@ -58,7 +63,9 @@ MAP = {
 
 
 def episode(**changed: Any) -> Figure:
-    given: dict[str, Any] = dict(clean=CLEAN, noisy=NOISY, taken=SENT, applied=APPLIED, titles=TITLES, dt=DT)
+    given: dict[str, Any] = dict(
+        clean=CLEAN, noisy=NOISY, taken=SENT, applied=APPLIED, titles=TITLES, dt=DT
+    )
     return imperfect_episode(**given | changed)
 
 
@@ -67,7 +74,9 @@ def grid(given: Any = MAP, yours: Any = None) -> Figure:
 
 
 def lines(ax: Axes, method: Method) -> list[Any]:
-    return [line for line in ax.lines if to_hex(line.get_color()).lower() == method.look.colour.lower()]
+    return [
+        line for line in ax.lines if to_hex(line.get_color()).lower() == method.look.colour.lower()
+    ]
 
 
 def legend(figure: Figure) -> list[str]:
@@ -116,10 +125,14 @@ def test_figure_8_has_a_column_for_each_condition_and_one_scale_for_all() -> Non
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["Clean", "Noise", "Delay"]
     (scale,) = {ax.get_ylim() for ax in figure.axes}
     assert scale[0] < -13.5
-    assert scale[1] > max(row["return_true"].mean(0).max() for rows in CURVES.values() for row in rows.values())
+    assert scale[1] > max(
+        row["return_true"].mean(0).max() for rows in CURVES.values() for row in rows.values()
+    )
 
 
-def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in_every_panel() -> None:
+def test_curves_of_a_condition_are_means_with_their_interval_and_floors_stand_in_every_panel() -> (
+    None
+):
     for ax, (_, rows) in zip(figure8(CURVES, FLOOR).axes, CURVES.items(), strict=True):
         (lstm,) = lines(ax, LSTM)
         np.testing.assert_allclose(lstm.get_ydata(), rows[RIVAL]["return_true"].mean(0))
@@ -173,7 +186,13 @@ def test_errors_stand_at_their_steps_and_a_filter_begins_with_the_present() -> N
         (raw,) = lines(ax, ZERO)
         assert set(raw.get_ydata()) == {RAW[part]}
     assert [ax.get_title(loc="left") for ax in figure.axes] == [part.capitalize() for part in PARTS]
-    assert legend(figure) == ["TSM", "LSTM", "Kalman filter", "exponential filter", "raw observation"]
+    assert legend(figure) == [
+        "TSM",
+        "LSTM",
+        "Kalman filter",
+        "exponential filter",
+        "raw observation",
+    ]
 
 
 def test_all_parts_share_a_scale_in_which_the_raw_observation_is_seen() -> None:
@@ -189,7 +208,10 @@ def test_a_model_that_is_far_off_is_told_in_words() -> None:
     figure = filtering_errors(rows, NOW, RAW)
     assert figure.axes[0].get_ylim()[1] < 1
     told = [ax.get_xlabel().replace("\n", " ") for ax in figure.axes]
-    assert told[2] == f"steps ahead outside: one-step to {rows['velocities'][ONE_STEP].mean(0).max():.3g}"
+    assert (
+        told[2]
+        == f"steps ahead outside: one-step to {rows['velocities'][ONE_STEP].mean(0).max():.3g}"
+    )
     assert told[0] == told[1] == told[3] == "steps ahead"
     assert len(lines(figure.axes[2], ONE_STEP)) == 2  # the line and its arrow
 
@@ -197,12 +219,17 @@ def test_a_model_that_is_far_off_is_told_in_words() -> None:
 # The map -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of_its_colours() -> None:
+def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of_its_colours() -> (
+    None
+):
     figure = grid()
     ax, bar = figure.axes
     (image,) = ax.images
     np.testing.assert_array_equal(image.get_array().filled(np.nan), [[-1.24, 8.0], [np.nan, 0.5]])
-    assert [text.get_text() for text in ax.get_xticklabels()] == ["against one-step", "against LSTM"]
+    assert [text.get_text() for text in ax.get_xticklabels()] == [
+        "against one-step",
+        "against LSTM",
+    ]
     places = [text.get_text() for text in ax.get_yticklabels()]
     assert places == ["noise 0, delay 5 (1 to 3 seeds)", "obstacle, after contact (1 seed)"]
     assert (image.norm.vmin, image.norm.vcenter, image.norm.vmax) == (-8.0, 0.0, 8.0)
@@ -210,10 +237,18 @@ def test_a_map_has_a_line_per_place_a_column_per_rival_and_zero_in_the_middle_of
 
 
 def test_every_cell_says_its_mean_half_an_interval_of_several_seeds_and_yours_in_brackets() -> None:
-    yours = {"noise 0, delay 5": {LSTM: np.array([7.0])}, "obstacle, after contact": {ONE_STEP: np.array([-3.0])}}
+    yours = {
+        "noise 0, delay 5": {LSTM: np.array([7.0])},
+        "obstacle, after contact": {ONE_STEP: np.array([-3.0])},
+    }
     ax = grid(yours=yours).axes[0]
     half = interval(MAP["noise 0, delay 5"][LSTM])[1]
-    assert [text.get_text() for text in ax.texts] == ["−1.2", f"+8.0 ± {half:.1f} (+7.0)", "(−3.0)", "+0.5"]
+    assert [text.get_text() for text in ax.texts] == [
+        "−1.2",
+        f"+8.0 ± {half:.1f} (+7.0)",
+        "(−3.0)",
+        "+0.5",
+    ]
     assert ax.get_xlabel() == "±: half the 95 % interval over seeds; in brackets: yours"
 
 
@@ -224,25 +259,51 @@ def test_every_cell_says_its_mean_half_an_interval_of_several_seeds_and_yours_in
     ("call", "message"),
     [
         (lambda: figure8({}), "nothing to draw"),
-        (lambda: figure8({"noise": {LATENT: learned(-4) | {"steps": np.arange(4)}}}), r"expected \(5\)"),
-        (lambda: figure8({"noise": {LATENT: learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}),
-         "noise, TSM, latent, return_true: 15 of 15"),
+        (
+            lambda: figure8({"noise": {LATENT: learned(-4) | {"steps": np.arange(4)}}}),
+            r"expected \(5\)",
+        ),
+        (
+            lambda: figure8(
+                {"noise": {LATENT: learned(-4) | {"return_true": np.full((3, 5), np.nan)}}}
+            ),
+            "noise, TSM, latent, return_true: 15 of 15",
+        ),
         (lambda: episode(titles=TITLES[:2]), r"clean has shape \(21, 3\), expected \(T, 2\)"),
         (lambda: episode(noisy=NOISY[1:]), r"noisy has shape \(20, 3\), expected \(21, 3\)"),
         (lambda: episode(taken=SENT[1:]), r"taken has shape \(19,\), expected \(20\)"),
-        (lambda: episode(applied=np.append(APPLIED, 0)), r"applied has shape \(21,\), expected \(20\)"),
-        (lambda: episode(clean=np.where(CLEAN > 0, CLEAN, np.inf)), "clean: .* values are not finite"),
+        (
+            lambda: episode(applied=np.append(APPLIED, 0)),
+            r"applied has shape \(21,\), expected \(20\)",
+        ),
+        (
+            lambda: episode(clean=np.where(CLEAN > 0, CLEAN, np.inf)),
+            "clean: .* values are not finite",
+        ),
         (lambda: filtering_errors({}, {}, {}), "nothing to draw"),
-        (lambda: filtering_errors(AHEAD, NOW, {"angles": 0.25}), "raw has the panels angles; expected whole"),
+        (
+            lambda: filtering_errors(AHEAD, NOW, {"angles": 0.25}),
+            "raw has the panels angles; expected whole",
+        ),
         (lambda: filtering_errors(AHEAD, {}, RAW), "now has the panels ; expected whole state"),
-        (lambda: filtering_errors({"angles": {TSM: np.zeros(10)}}, {"angles": {}}, {"angles": 0.25}),
-         r"angles, TSM has shape \(10,\), expected \(k, K\)"),
-        (lambda: filtering_errors({"angles": {TSM: np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}),
-         "angles, TSM: 10 of 10 values are not finite"),
+        (
+            lambda: filtering_errors(
+                {"angles": {TSM: np.zeros(10)}}, {"angles": {}}, {"angles": 0.25}
+            ),
+            r"angles, TSM has shape \(10,\), expected \(k, K\)",
+        ),
+        (
+            lambda: filtering_errors(
+                {"angles": {TSM: np.full((1, 10), np.nan)}}, {"angles": {}}, {"angles": 0.25}
+            ),
+            "angles, TSM: 10 of 10 values are not finite",
+        ),
         (lambda: grid({}), "nothing to draw"),
     ],
-)  # fmt: skip
-def test_input_that_cannot_be_drawn_is_refused_in_words(call: Callable[[], Figure], message: str) -> None:
+)
+def test_input_that_cannot_be_drawn_is_refused_in_words(
+    call: Callable[[], Figure], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         call()
     assert plt.get_fignums() == []

@@ -16,25 +16,29 @@ import torch
 from scripts import load_script, run_script
 
 import tsmlib
-from tsmlib import figures
+from tsmlib import plots as figures
 from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.exploration import Exploration
 from tsmlib.planning import execution
 from tsmlib.statistics import interval
 from tsmlib.storage import manifest, tables
-from tsmlib.study import adaptation, drawings, pendulum, rounds, runs, worlds
-from tsmlib.study.comparison import published
-from tsmlib.study.results import adaptation as adaptation_results
-from tsmlib.study.results import exploration as results
-from tsmlib.study.results import table
-from tsmlib.study.results.exploration import PENDULUM, PUSH
-from tsmlib.study.runs import ROOT, Run
+from reproduction import adaptation, drawings, pendulum, rounds, runs, worlds
+from reproduction.comparison import published
+from reproduction.results import adaptation as adaptation_results
+from reproduction.results import exploration as results
+from reproduction.results import table
+from reproduction.results.exploration import PENDULUM, PUSH
+from reproduction.runs import ROOT, Run
 
 RUN = Run("10_explore", "smoke", 0, ROOT / "runs" / "nowhere")
 
 
-@pytest.mark.parametrize(("word", "lacks"), [("lstm", set()), ("ensemble+mse", {"highest"})])  # what a prior does
-def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lacks: set[str]) -> None:
+@pytest.mark.parametrize(
+    ("word", "lacks"), [("lstm", set()), ("ensemble+mse", {"highest"})]
+)  # what a prior does
+def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(
+    word: str, lacks: set[str]
+) -> None:
     rows = tables.frame(rounds.loop(RUN, word).rows)
     assert set(rows["metric"]) == set(results.ROUNDS[PENDULUM]) - lacks
     assert rows["env_steps"].unique().tolist() == [400, 600]
@@ -45,7 +49,9 @@ def test_rounds_leave_a_row_for_each_round_and_metric_and_a_curve(word: str, lac
     assert values.shape == (1, 2)
     figures.rounds(panels, "", yours=panels)
     assert "own plans, round 0 -> 1: executed return" in results.sentences(rows)
-    assert results.rounds_table(rows) == results.rounds_table(rows.iloc[::-1]), "a line's place is that of its round"
+    assert results.rounds_table(rows) == results.rounds_table(rows.iloc[::-1]), (
+        "a line's place is that of its round"
+    )
 
 
 def test_a_pendulum_that_measures_starts_as_none_that_is_learned_from() -> None:
@@ -57,22 +63,34 @@ def test_a_pendulum_that_measures_starts_as_none_that_is_learned_from() -> None:
 
 def test_an_arm_pushes_by_rounds_of_its_own_plans_and_of_others(tmp_path: Path) -> None:
     sizes = worlds.WORLDS[PUSH].sizes["smoke"]
-    found = [rounds.loop(RUN, "lstm", env=PUSH, data=data, folder=tmp_path) for data in results.DATA]
+    found = [
+        rounds.loop(RUN, "lstm", env=PUSH, data=data, folder=tmp_path) for data in results.DATA
+    ]
     everything = tables.frame([row for part in found for row in part.rows])
     rows = table.select(everything, execution="closed loop")
     assert set(rows["metric"]) == set(results.ROUNDS[PUSH])
     assert set(rows["sim"]) == {"mujoco"}
     first, last = 100 * sizes.first, 100 * (sizes.first + sizes.episodes)
-    for data, steps in zip(results.DATA, ([first, last], [first, last], [first, first]), strict=True):
-        assert table.select(rows, configuration=data, metric="success")["env_steps"].tolist() == steps
+    for data, steps in zip(
+        results.DATA, ([first, last], [first, last], [first, first]), strict=True
+    ):
+        assert (
+            table.select(rows, configuration=data, metric="success")["env_steps"].tolist() == steps
+        )
     before = table.select(rows, iteration=0, metric="return_true")["value"]
     assert len(before) == 3
     assert before.nunique() == 1  # all begin with one learner
     panels = results.round_panels(rows, ["share within 5 cm"], PUSH)["share within 5 cm"]
-    assert [method.variant for method in panels] == [results.PLANNED, results.RANDOM]  # those that take steps
+    assert [method.variant for method in panels] == [
+        results.PLANNED,
+        results.RANDOM,
+    ]  # those that take steps
     assert results.round_panels(rows, ["share within 5 cm"]) == {}  # of the pendulum, nothing
     assert "share within 5 cm" in results.rounds_table(rows, PUSH)
-    assert f"`{PUSH}`, `lstm` on {results.NONE}, round 0 -> 1: executed return" in results.sentences(rows)
+    assert (
+        f"`{PUSH}`, `lstm` on {results.NONE}, round 0 -> 1: executed return"
+        in results.sentences(rows)
+    )
     _check_episodes(everything, found, [first, last])
     _check_priors(everything)
 
@@ -88,7 +106,9 @@ def _check_episodes(rows: pd.DataFrame, loops: list[rounds.Loop], steps: list[in
         ]
         assert own["n"].tolist() == [len(each) for each in loop.episodes if each]
     assert "contacts per episode" in results.rounds_table(rows, PUSH)
-    assert "contacts per episode" not in results.rounds_table(table.select(rows, execution="closed loop"), PUSH)
+    assert "contacts per episode" not in results.rounds_table(
+        table.select(rows, execution="closed loop"), PUSH
+    )
 
 
 def _check_priors(rows: pd.DataFrame) -> None:
@@ -104,14 +124,24 @@ def _check_priors(rows: pd.DataFrame) -> None:
     assert "iterations of the last prior" in results.priors_table(rows)
 
 
-def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_one_never_gets_there() -> None:
+def test_a_prior_that_is_better_from_the_start_needs_no_iteration_and_a_worse_one_never_gets_there() -> (
+    None
+):
     better = {results.FIRST_PRIOR: [-9, -5, -5], results.LAST_PRIOR: [-4, -3, -2]}
     worse = {results.FIRST_PRIOR: [-9, -6, -5], results.LAST_PRIOR: [-9, -8, -7]}
     for curves, needed, said in ((better, [1, 0], "0.0"), (worse, [2], "> 2")):
-        about = dict(env_steps=900, env=PUSH, data=results.PLANNED, torques=dict(zip(curves, (0.1, 0.07), strict=True)))
+        about = dict(
+            env_steps=900,
+            env=PUSH,
+            data=results.PLANNED,
+            torques=dict(zip(curves, (0.1, 0.07), strict=True)),
+        )
         rows = tables.frame(results.prior_rows(RUN, "rtsm", curves, 25, **about))  # type: ignore[arg-type]
         assert table.select(rows, metric="iterations_to_same_return")["value"].tolist() == needed
-        cells = [cell.strip() for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")]
+        cells = [
+            cell.strip()
+            for cell in results.priors_table(rows).splitlines()[-1].strip("|").split("|")
+        ]
         assert cells[4:] == [f"{needed[0]:.1f}", said, "0.1000", "0.0700", "25"]
 
 
@@ -121,7 +151,9 @@ def test_the_map_has_as_many_episodes_of_each_source() -> None:
     assert [*found] == ["fingertip: few", "fingertip: many", "object: few", "object: many"]
     assert {points.shape for points in found.values()} == {(2 * (rounds.HORIZON + 1), 2)}
     np.testing.assert_array_equal(found["object: few"], seen["few"].states[..., 6:8].reshape(-1, 2))
-    assert {ax.get_aspect() for ax in figures.visited(found, ("x", "y"), {}, equal=True).axes} == {1.0}
+    assert {ax.get_aspect() for ax in figures.visited(found, ("x", "y"), {}, equal=True).axes} == {
+        1.0
+    }
 
 
 def test_contacts_beside_the_map_are_of_all_episodes_and_points_of_the_first() -> None:
@@ -134,7 +166,9 @@ def test_contacts_beside_the_map_are_of_all_episodes_and_points_of_the_first() -
     assert len(figure.axes[2].lines[0].get_xdata()) == 2 * (rounds.HORIZON + 1)
 
 
-def test_states_of_random_episodes_of_both_priors_and_of_own_plans_are_drawn_beside_each_other() -> None:
+def test_states_of_random_episodes_of_both_priors_and_of_own_plans_are_drawn_beside_each_other() -> (
+    None
+):
     random, own = (pendulum.first_episodes(n, seed=n) for n in (3, 2))
     first, last = (tsmlib.ActionPrior.for_data(random, seed=seed, channels=4) for seed in (0, 1))
     figure, n = drawings.visited(random, own, first, last, n=4)
@@ -143,10 +177,14 @@ def test_states_of_random_episodes_of_both_priors_and_of_own_plans_are_drawn_bes
     sources = (random, pendulum.walks(first, 4), pendulum.walks(last, 4), own)
     for points, data in zip(drawn, sources, strict=True):
         np.testing.assert_array_equal(points, pendulum.plane(data))
-    assert f"2 episodes, highest {pendulum.highest(own):.2f}" in (figure.axes[3].get_title(loc="left") or "")
+    assert f"2 episodes, highest {pendulum.highest(own):.2f}" in (
+        figure.axes[3].get_title(loc="left") or ""
+    )
 
 
-def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_loop_of_the_study_goes_on_with_the_same_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = rounds.loop(RUN, "rtsm", env=PUSH).rows
 
     def killed(*given: object, **named: object) -> None:
@@ -169,7 +207,13 @@ def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does(
         judge = tsmlib.expected_predictor if judging else tsmlib.model_predictor
         found = rounds.planned(few, model, prior, sizes, 0).found
         again = tsmlib.mpc(
-            few, model, rounds.space_of(prior), rounds.planner(sizes, 0), every=50, judge=judge, seed=1000
+            few,
+            model,
+            rounds.space_of(prior),
+            rounds.planner(sizes, 0),
+            every=50,
+            judge=judge,
+            seed=1000,
         )
         assert found is not None
         assert found.first.found is not None
@@ -180,10 +224,16 @@ def test_plans_that_measure_are_those_of_mpc_and_begin_as_their_first_plan_does(
 
 def test_rounds_that_were_measured_by_other_names_have_no_rows() -> None:
     record = {"round": 1.0, "env_steps": 8.0, "tested_success": 0.5, "success": 0.25}
-    found = Exploration(*[pendulum.first_episodes(3, 0)] * 2, [record], seconds=[{"cpu_seconds": 2.0}])
-    assert rounds.tested_records(found) == [{"round": 1, "env_steps": 8, "success": 0.5, "cpu_seconds": 2}]
+    found = Exploration(
+        *[pendulum.first_episodes(3, 0)] * 2, [record], seconds=[{"cpu_seconds": 2.0}]
+    )
+    assert rounds.tested_records(found) == [
+        {"round": 1, "env_steps": 8, "success": 0.5, "cpu_seconds": 2}
+    ]
     del record["tested_success"]
-    with pytest.raises(ValueError, match=r"round 1 has round, env_steps, success, and nothing named tested_"):
+    with pytest.raises(
+        ValueError, match=r"round 1 has round, env_steps, success, and nothing named tested_"
+    ):
         rounds.tested_records(found)
 
 
@@ -219,7 +269,11 @@ def untrained() -> tuple[tsmlib.Task, tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
     """Three starts of the pendulum, and a model and a prior that were never trained."""
     data = pendulum.first_episodes(3, 0)
     model = tsmlib.RecurrentTSM.for_data(data, hidden=8)
-    return pendulum.swing_up(3, seed=pendulum.TESTED), model, tsmlib.ActionPrior.for_data(data, channels=4)
+    return (
+        pendulum.swing_up(3, seed=pendulum.TESTED),
+        model,
+        tsmlib.ActionPrior.for_data(data, channels=4),
+    )
 
 
 def unstable(bad: np.ndarray, run: Any) -> Any:
@@ -243,7 +297,9 @@ def measured_everywhere(monkeypatch: pytest.MonkeyPatch) -> tuple[tsmlib.Task, w
     return every, sizes
 
 
-def test_an_unstable_episode_that_measures_has_failed_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unstable_episode_that_measures_has_failed_and_is_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     task, model, prior = untrained()
     every, sizes = measured_everywhere(monkeypatch)
     monkeypatch.setattr(rounds, "mpc", unstable(task.start[:1], rounds.mpc))
@@ -298,10 +354,15 @@ def test_rows_say_what_a_round_took_and_by_what_its_candidates_were_judged() -> 
     sizes = replace(worlds.world(PENDULUM).sizes["smoke"], every=50)
     found = rounds.loop(RUN, "rtsm", sizes=sizes)
     assert {row["samples"] for row in found.rows} == {8}
-    assert [(row["metric"], row["iteration"]) for row in found.seconds] == [("cpu_seconds", 1), ("wall_seconds", 1)]
+    assert [(row["metric"], row["iteration"]) for row in found.seconds] == [
+        ("cpu_seconds", 1),
+        ("wall_seconds", 1),
+    ]
     assert all(float(str(row["value"])) > 0 for row in found.seconds)
     header = results.rounds_table(tables.frame([*found.rows, *found.seconds])).splitlines()[0]
-    assert all(title in header for title in ("judge", "CPU s", "wall s", "the first plan's gap open loop"))
+    assert all(
+        title in header for title in ("judge", "CPU s", "wall s", "the first plan's gap open loop")
+    )
     by_rollout = rounds.loop(RUN, "lstm", sizes=sizes).rows  # which has no samples
     assert not any("samples" in row for row in by_rollout)
     assert "judge" not in results.rounds_table(tables.frame(by_rollout))
@@ -319,12 +380,17 @@ def test_a_table_of_rounds_says_of_every_learner_what_judged_its_plans() -> None
     ]
     where = lines[0].index("judge")
     assert [(line[0], line[where]) for line in lines[2:]] == [
-        ("`rtsm`", "mode, 8 samples"), ("`rtsm`", "mode"), ("`lstm`", "its rollout"), ("`ensemble+mse`", "members"),
+        ("`rtsm`", "mode, 8 samples"),
+        ("`rtsm`", "mode"),
+        ("`lstm`", "its rollout"),
+        ("`ensemble+mse`", "members"),
         ("`pets`", ""),
-    ]  # fmt: skip
+    ]
 
 
-def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(tmp_path: Path) -> None:
+def test_a_file_of_a_loop_by_the_mode_is_not_taken_for_one_by_an_expectation(
+    tmp_path: Path,
+) -> None:
     path, sizes = tmp_path / "round-0.json", asdict(worlds.world(PENDULUM).sizes["smoke"])
     old = {name: value for name, value in sizes.items() if name not in ("judging", "screened")}
     path.write_text(json.dumps({"made from": {"sizes": old, "seed": 0}, "found": 1.0}))
@@ -342,37 +408,55 @@ def test_the_training_of_the_pendulum_is_chosen_on_starts_that_no_published_row_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path))
-    script, place, seen = ROOT / "benchmarks" / "exploration" / "pendulum.py", tmp_path / "pendulum.csv", []
+    script, place, seen = (
+        ROOT / "benchmarks" / "exploration" / "pendulum.py",
+        tmp_path / "pendulum.csv",
+        [],
+    )
     row = dict(seed=10, iteration=0, env_steps=600)
 
     def measured(run: Run, word: str, *, sizes: worlds.Sizes) -> rounds.Loop:
         seen.append((run.seed, worlds.world(PENDULUM).tested(8).start))
-        return rounds.Loop([row | {"metric": m, "value": 1} for m in ("return_true", "success", "gap_absolute")], [])
+        return rounds.Loop(
+            [row | {"metric": m, "value": 1} for m in ("return_true", "success", "gap_absolute")],
+            [],
+        )
 
     monkeypatch.setattr(rounds, "loop", measured)
     published = worlds.world(PENDULUM).tested(8).start
     for updates in (2, 4, 2):  # the third takes the place of the first
         run_script(script, "rtsm", "--updates", str(updates), "--out", str(place))
     assert pd.read_csv(place)["updates"].tolist() == [4, 2]
-    assert all(seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen)
+    assert all(
+        seed > 9 and not (starts[:, None] == published).all(-1).any() for seed, starts in seen
+    )
 
 
 def test_the_notebook_says_of_noise_and_disagreement_what_their_table_says() -> None:
     rows = pd.read_csv(ROOT / "benchmarks" / "exploration" / "table.csv")
     wide = rows[rows["round"] == 5].pivot(index="seed", columns="way", values="within_3cm")
     assert wide.index.tolist() == [0, 1, 2]
-    found = {way: interval(100 * (wide["planned"] - wide[way])) for way in ("random", "bonus", "noise")}
-    ends = {way: [round(float(end)) for end in (mean, mean - half, mean + half)] for way, (mean, half) in found.items()}
+    found = {
+        way: interval(100 * (wide["planned"] - wide[way])) for way in ("random", "bonus", "noise")
+    }
+    ends = {
+        way: [round(float(end)) for end in (mean, mean - half, mean + half)]
+        for way, (mean, half) in found.items()
+    }
     assert ends == {"random": [21, 10, 31], "bonus": [11, 4, 19], "noise": [-4, -21, 13]}
 
 
 @pytest.mark.parametrize("way", ["planned", "random"])
-def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(
+    way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     module = load_script(ROOT / "benchmarks" / "exploration" / "run.py", "exploration_run")
     for name, size in (("FIRST", 10), ("ROUNDS", 1), ("EPISODES", 3), ("TARGETS", 2)):
         monkeypatch.setattr(module, name, size)
     monkeypatch.setattr(module, "SEARCH", dict(candidates=4, elites=2, iterations=1, screened=0.25))
-    monkeypatch.setattr(module, "training", lambda past, future, _: tsmlib.TrainingOptions(past, future, 1))
+    monkeypatch.setattr(
+        module, "training", lambda past, future, _: tsmlib.TrainingOptions(past, future, 1)
+    )
     lines = module.rounds(way, 0)
     assert [(line["round"], line["env_steps"]) for line in lines] == [(0, 500), (1, 650)]
     found = pd.read_csv(io.StringIO(pd.DataFrame(lines).to_csv()))
@@ -383,11 +467,17 @@ def test_a_loop_on_the_plain_arm_has_a_line_of_every_round(way: str, monkeypatch
 def test_rates_of_rounds_are_chosen_on_episodes_that_no_training_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    script, place, judged = ROOT / "benchmarks" / "exploration" / "rates.py", tmp_path / "rates.csv", []
+    script, place, judged = (
+        ROOT / "benchmarks" / "exploration" / "rates.py",
+        tmp_path / "rates.csv",
+        [],
+    )
     here = worlds.world(PUSH)
     monkeypatch.setitem(worlds.WORLDS, PUSH, replace(here, sizes={"paper": here.sizes["smoke"]}))
 
-    def scored(model: tsmlib.DynamicsModel, env: str, data: tuple[tsmlib.Trajectories, tsmlib.Trajectories]) -> Any:
+    def scored(
+        model: tsmlib.DynamicsModel, env: str, data: tuple[tsmlib.Trajectories, tsmlib.Trajectories]
+    ) -> Any:
         judged.append(data[0].states[:, 0])
         return SimpleNamespace(against_horizon=lambda: {"energy_score_noise": np.ones(80)})
 
@@ -399,15 +489,26 @@ def test_rates_of_rounds_are_chosen_on_episodes_that_no_training_has(
     assert found["stage"].tolist() == ["before the first round", results.NONE, results.RANDOM] * 3
     assert np.isfinite(found["loss"]).all()
     assert len(judged) == 9
-    seen = np.concatenate([here.first(200, 10).states[:, 0], here.random(150, 1_101_000).states[:, 0]])
+    seen = np.concatenate(
+        [here.first(200, 10).states[:, 0], here.random(150, 1_101_000).states[:, 0]]
+    )
     assert not (judged[0][:, None] == seen).all(-1).any()
 
 
-@pytest.mark.parametrize(("given", "said"), [
-    (("rtsm", {"env": "tsm/Reacher-v0"}), "no rounds are measured on 'tsm/Reacher-v0'; there are Pendulum-v1, tsm/Re"),
-    (("tsm", {}), "'tsm' does not explore Pendulum-v1; there are rtsm, lstm, ensemble"),
-    (("rtsm", {"data": "none"}), "data is 'none'; expected one of own plans, random episodes, no new episodes"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            ("rtsm", {"env": "tsm/Reacher-v0"}),
+            "no rounds are measured on 'tsm/Reacher-v0'; there are Pendulum-v1, tsm/Re",
+        ),
+        (("tsm", {}), "'tsm' does not explore Pendulum-v1; there are rtsm, lstm, ensemble"),
+        (
+            ("rtsm", {"data": "none"}),
+            "data is 'none'; expected one of own plans, random episodes, no new episodes",
+        ),
+    ],
+)
 def test_a_loop_that_nobody_knows_is_refused(given: tuple[str, dict[str, str]], said: str) -> None:
     word, named = given
     with pytest.raises(ValueError, match=said):
@@ -416,61 +517,161 @@ def test_a_loop_that_nobody_knows_is_refused(given: tuple[str, dict[str, str]], 
 
 def test_steps_of_rounds_stand_beside_those_of_a_policy_to_the_same_return() -> None:
     common = dict(env=PUSH, metric="return_true", scale="paper")
-    loop = common | dict(model="rtsm", planner="cem", execution="closed loop", configuration=results.PLANNED)
+    loop = common | dict(
+        model="rtsm", planner="cem", execution="closed loop", configuration=results.PLANNED
+    )
     policy = common | dict(model="sac", planner="policy", execution="policy", seed=0)
-    rows = tables.frame([
-        loop | dict(seed=seed, iteration=k, env_steps=steps, value=value + seed)
-        for seed in (0, 2) for k, (steps, value) in enumerate([(500, -21), (600, -16), (700, -11)])
-    ])  # fmt: skip
-    free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (9000, -15))])
-    cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
-    assert cells == ["SAC", "9,000", "-15.00", "`rtsm`", "600", "6.7%", "in round 1", "-10.00", "-", "1 / 2"]
+    rows = tables.frame(
+        [
+            loop | dict(seed=seed, iteration=k, env_steps=steps, value=value + seed)
+            for seed in (0, 2)
+            for k, (steps, value) in enumerate([(500, -21), (600, -16), (700, -11)])
+        ]
+    )
+    free = tables.frame(
+        [policy | dict(env_steps=steps, value=value) for steps, value in ((0, -30), (9000, -15))]
+    )
+    cells = [
+        cell.strip()
+        for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")
+    ]
+    assert cells == [
+        "SAC",
+        "9,000",
+        "-15.00",
+        "`rtsm`",
+        "600",
+        "6.7%",
+        "in round 1",
+        "-10.00",
+        "-",
+        "1 / 2",
+    ]
     falls_back = [(0, -30), (800, -10), (900, -12), (1000, -9)]  # below what the rounds end with
-    free = tables.frame([policy | dict(env_steps=steps, value=value) for steps, value in falls_back])
+    free = tables.frame(
+        [policy | dict(env_steps=steps, value=value) for steps, value in falls_back]
+    )
     line = results.steps_table(rows, free).splitlines()[-1]
     assert [cell.strip() for cell in line.split("|")][-3:-1] == ["1,000", "1 / 2"]
-    assert results.steps_table(tables.frame([]), free) == results.steps_table(rows, tables.frame([])) == ""
+    assert (
+        results.steps_table(tables.frame([]), free)
+        == results.steps_table(rows, tables.frame([]))
+        == ""
+    )
 
 
 def test_a_seed_that_lost_an_episode_is_compared_with_the_others_round_by_round() -> None:
-    loop = dict(env=PUSH, model="rtsm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=4)
-    ends = {0: (500, 600, 700), 1: (500, 580, 680)}  # of each round; seed 1 lost an episode in the first
-    rows = tables.frame([
-        loop | dict(seed=seed, iteration=k, env_steps=steps, metric="return_true", value=-20 + 5 * k - 10 * seed)
-        for seed, of_round in ends.items() for k, steps in enumerate(of_round)
-    ])  # fmt: skip
-    ((at, values),) = results.round_panels(rows, ["executed return"], PUSH)["executed return"].values()
+    loop = dict(
+        env=PUSH,
+        model="rtsm",
+        planner="cem",
+        execution="closed loop",
+        configuration=results.PLANNED,
+        n=4,
+    )
+    ends = {
+        0: (500, 600, 700),
+        1: (500, 580, 680),
+    }  # of each round; seed 1 lost an episode in the first
+    rows = tables.frame(
+        [
+            loop
+            | dict(
+                seed=seed,
+                iteration=k,
+                env_steps=steps,
+                metric="return_true",
+                value=-20 + 5 * k - 10 * seed,
+            )
+            for seed, of_round in ends.items()
+            for k, steps in enumerate(of_round)
+        ]
+    )
+    ((at, values),) = results.round_panels(rows, ["executed return"], PUSH)[
+        "executed return"
+    ].values()
     assert at.tolist() == [500, 590, 690]
     assert values.tolist() == [[-20, -15, -10], [-30, -25, -20]]
-    lines = [line for line in str(results.rounds_table(rows, PUSH)).splitlines() if "`rtsm`" in line]
-    assert [line.count(steps) for line, steps in zip(lines, ("500", "590", "690"), strict=True)] == [1, 1, 1]
-    sac = dict(env=PUSH, metric="return_true", model="sac", planner="policy", execution="policy", seed=0)
+    lines = [
+        line for line in str(results.rounds_table(rows, PUSH)).splitlines() if "`rtsm`" in line
+    ]
+    assert [
+        line.count(steps) for line, steps in zip(lines, ("500", "590", "690"), strict=True)
+    ] == [1, 1, 1]
+    sac = dict(
+        env=PUSH, metric="return_true", model="sac", planner="policy", execution="policy", seed=0
+    )
     free = tables.frame([sac | dict(env_steps=9000, value=-20)])
-    cells = [cell.strip() for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")]
+    cells = [
+        cell.strip()
+        for cell in results.steps_table(rows, free).splitlines()[-1].strip("|").split("|")
+    ]
     assert cells[4:8] == ["590", "6.6%", "in round 1", "-15.00"]
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    (["rounds", "--envs", "tsm/Reacher-v0", "--models", "rtsm"], "no rounds are measured on 'tsm/Reacher-v0'"),
-    (["rounds", "--envs", PUSH, "--models", "tsm"], "'tsm' does not explore tsm/ReacherPush-v1"),
-    (["predict", "--envs", PENDULUM, "--models", "rtsm"], "predict takes no Pendulum-v1"),
-    (["predict", "--envs", PUSH, "--models", "oracle"], "predict takes no oracle; --models are some of tsm, rtsm"),
-    (["control", "--envs", PUSH, "--models", "oracle", "--planners", "adam"], "--planners of oracle are cem and mppi"),
-    (["convergence", "--scale", "laptop", "--envs", PUSH, "--models", "tsm"], "nothing converges at scale laptop"),
-    (["adaptation", "--models", "rtsm", "--variants", "mass2"], "cannot be chosen: it has no object"),
-    (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
-    (["adaptation", "--models", "ensemble+mse", "--envs", "tsm/PymunkPush-v1"], "no pretrained ensemble"),
-    (["adaptation", "--models", "rtsm", "--episodes", "1"], "expected at least 2, since one is held out"),
-    (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected 1 to 100"),
-    (["rounds", "--models", "rtsm", "--targets", "5"], "--targets 5: expected 1 to 100, and of adaptation alone"),
-    (["rounds", "--models", "rtsm", "--seed", "1000001"], "seed 1000001 draws held-out episodes or targets"),
-    (["rounds", "--models", "rtsm", "--seed", "-1"], "seed is -1, expected a whole number from 0 to 2147483647"),
-    (["rounds", "--models", "rtsm", "--scale", "foo"], "scale is 'foo', expected one of smoke, laptop, paper"),
-    (["policies", "--envs", PUSH, "--models", "rtsm", "--copies", "0"], "--copies 0, --iterations 880: expected"),
-    (["peers", str(ROOT / "README.md")], "README.md is not a results table"),
-    (["peers"], "peers and whole, and nothing else, take tables that are there; got none"),
-    (["peers", "nowhere.csv"], "take tables that are there; got ['nowhere.csv']"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            ["rounds", "--envs", "tsm/Reacher-v0", "--models", "rtsm"],
+            "no rounds are measured on 'tsm/Reacher-v0'",
+        ),
+        (
+            ["rounds", "--envs", PUSH, "--models", "tsm"],
+            "'tsm' does not explore tsm/ReacherPush-v1",
+        ),
+        (["predict", "--envs", PENDULUM, "--models", "rtsm"], "predict takes no Pendulum-v1"),
+        (
+            ["predict", "--envs", PUSH, "--models", "oracle"],
+            "predict takes no oracle; --models are some of tsm, rtsm",
+        ),
+        (
+            ["control", "--envs", PUSH, "--models", "oracle", "--planners", "adam"],
+            "--planners of oracle are cem and mppi",
+        ),
+        (
+            ["convergence", "--scale", "laptop", "--envs", PUSH, "--models", "tsm"],
+            "nothing converges at scale laptop",
+        ),
+        (
+            ["adaptation", "--models", "rtsm", "--variants", "mass2"],
+            "cannot be chosen: it has no object",
+        ),
+        (["adaptation", "--models", "tsm"], "'tsm' is not adapted; there are rtsm, lstm, ensemble"),
+        (
+            ["adaptation", "--models", "ensemble+mse", "--envs", "tsm/PymunkPush-v1"],
+            "no pretrained ensemble",
+        ),
+        (
+            ["adaptation", "--models", "rtsm", "--episodes", "1"],
+            "expected at least 2, since one is held out",
+        ),
+        (["adaptation", "--models", "rtsm", "--targets", "-1"], "--targets -1: expected 1 to 100"),
+        (
+            ["rounds", "--models", "rtsm", "--targets", "5"],
+            "--targets 5: expected 1 to 100, and of adaptation alone",
+        ),
+        (
+            ["rounds", "--models", "rtsm", "--seed", "1000001"],
+            "seed 1000001 draws held-out episodes or targets",
+        ),
+        (
+            ["rounds", "--models", "rtsm", "--seed", "-1"],
+            "seed is -1, expected a whole number from 0 to 2147483647",
+        ),
+        (
+            ["rounds", "--models", "rtsm", "--scale", "foo"],
+            "scale is 'foo', expected one of smoke, laptop, paper",
+        ),
+        (
+            ["policies", "--envs", PUSH, "--models", "rtsm", "--copies", "0"],
+            "--copies 0, --iterations 880: expected",
+        ),
+        (["peers", str(ROOT / "README.md")], "README.md is not a results table"),
+        (["peers"], "peers and whole, and nothing else, take tables that are there; got none"),
+        (["peers", "nowhere.csv"], "take tables that are there; got ['nowhere.csv']"),
+    ],
+)
 def test_rows_that_cannot_be_made_are_refused_before_any_work(
     options: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -479,19 +680,34 @@ def test_rows_that_cannot_be_made_are_refused_before_any_work(
     assert said in capsys.readouterr().err
 
 
-def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_other_libraries_are_published_beside_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(runs, "RESULTS", tmp_path / "results")
     (tmp_path / "results").mkdir()
-    row = dict(env=PUSH, metric="return_true", value=-9.0, n=4, seed=0, scale="paper", configuration="own plans")
+    row = dict(
+        env=PUSH,
+        metric="return_true",
+        value=-9.0,
+        n=4,
+        seed=0,
+        scale="paper",
+        configuration="own plans",
+    )
     made = {
-        "loop": row | dict(model="pets", planner="cem", execution="closed loop", iteration=5, env_steps=75_000),
+        "loop": row
+        | dict(model="pets", planner="cem", execution="closed loop", iteration=5, env_steps=75_000),
         "free": row | dict(model="sac", planner="policy", execution="policy", env_steps=1_000_000),
         "scores": row | dict(model="pets", planner="none", execution="open loop", metric="nrmse"),
     }
     for name, each in made.items():
         tables.save(tmp_path / f"{name}.csv", [each])
     for _ in range(2):  # once more changes nothing
-        run_script(ROOT / "benchmarks" / "settings" / "rows.py", "peers", *(str(tmp_path / f"{n}.csv") for n in made))
+        run_script(
+            ROOT / "benchmarks" / "settings" / "rows.py",
+            "peers",
+            *(str(tmp_path / f"{n}.csv") for n in made),
+        )
     names = ("10_explore", "model_free", "peers_pets")
     found = {name: tables.load(tmp_path / "results" / f"{name}.csv") for name in names}
     assert [rows["model"].tolist() for rows in found.values()] == [["pets"], ["sac"], ["pets"]]
@@ -505,14 +721,29 @@ def test_rows_of_other_libraries_are_published_beside_ours(tmp_path: Path, monke
 def test_every_loop_of_one_call_is_published_beside_those_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = dict(env=PUSH, metric="return_true", value=-9.0, seed=0, scale="smoke", iteration=0, env_steps=600)
+    row = dict(
+        env=PUSH,
+        metric="return_true",
+        value=-9.0,
+        seed=0,
+        scale="smoke",
+        iteration=0,
+        env_steps=600,
+    )
     (tmp_path / "results").mkdir()
-    tables.save(tmp_path / "results" / "10_explore.csv", [row | dict(model="pets", configuration="own plans")])
+    tables.save(
+        tmp_path / "results" / "10_explore.csv",
+        [row | dict(model="pets", configuration="own plans")],
+    )
     manifest.write_manifest(tmp_path)  # from now on a table that is not as it says is refused
     monkeypatch.setattr(runs, "RESULTS", tmp_path / "results")
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path / "runs"))
     monkeypatch.setattr(
-        rounds, "loop", lambda run, word, *, data, **_: rounds.Loop([row | dict(model=word, configuration=data)], [])
+        rounds,
+        "loop",
+        lambda run, word, *, data, **_: rounds.Loop(
+            [row | dict(model=word, configuration=data)], []
+        ),
     )
     options = ["rounds", "--scale", "smoke", "--envs", PUSH, "--models", "rtsm", "lstm"]
     run_script(ROOT / "benchmarks" / "settings" / "rows.py", *options)
@@ -525,11 +756,26 @@ def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
     loop = dict(env=PUSH, planner="cem", execution="closed loop", n=9, scale="paper")
     seeds_of = {results.PLANNED: (2, 0, 1), results.NONE: (0, 1, 2), results.RANDOM: (1, 2)}
     rows = [
-        loop | dict(model=word, configuration=data, iteration=k, seed=seed, metric=metric, value=rng.uniform())
-        for word in ("rtsm", "lstm") for data, seeds in seeds_of.items() for seed in seeds for k in range(3)
-        for metric in ("return_true", "success") if (word, data) != ("lstm", results.NONE)
-    ]  # fmt: skip
-    value = {(r["model"], r["configuration"], r["iteration"], r["seed"], r["metric"]): r["value"] for r in rows}
+        loop
+        | dict(
+            model=word,
+            configuration=data,
+            iteration=k,
+            seed=seed,
+            metric=metric,
+            value=rng.uniform(),
+        )
+        for word in ("rtsm", "lstm")
+        for data, seeds in seeds_of.items()
+        for seed in seeds
+        for k in range(3)
+        for metric in ("return_true", "success")
+        if (word, data) != ("lstm", results.NONE)
+    ]
+    value = {
+        (r["model"], r["configuration"], r["iteration"], r["seed"], r["metric"]): r["value"]
+        for r in rows
+    }
     lines = results.differences_table(tables.frame(rows)).splitlines()
     found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     expected = []
@@ -537,12 +783,17 @@ def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
         cells = []
         for metric, form in (("return_true", "{:+.2f} ± {:.2f}"), ("success", "{:+.1f} ± {:.1f}")):
             for data, then in ((results.PLANNED, 0), (results.NONE, k), (results.RANDOM, k)):
-                both = [seed for seed in seeds_of[data] if (word, data, then, seed, metric) in value]
+                both = [
+                    seed for seed in seeds_of[data] if (word, data, then, seed, metric) in value
+                ]
                 differences = [
-                    value[word, results.PLANNED, k, seed, metric] - value[word, data, then, seed, metric]
+                    value[word, results.PLANNED, k, seed, metric]
+                    - value[word, data, then, seed, metric]
                     for seed in both
                 ]
-                scaled = [(100 if metric == "success" else 1) * difference for difference in differences]
+                scaled = [
+                    (100 if metric == "success" else 1) * difference for difference in differences
+                ]
                 cells.append(form.format(*interval(scaled)) if both else "")
         expected.append([f"`{word}`", str(k), *cells, "2 to 3"])
     assert found[2:] == expected
@@ -551,13 +802,25 @@ def test_own_plans_are_compared_in_the_seeds_that_both_have() -> None:
 
 
 def test_loops_whose_plans_were_judged_otherwise_are_not_compared() -> None:
-    loop = dict(env=PUSH, model="rtsm", planner="cem", execution="closed loop", n=9, metric="return_true")
+    loop = dict(
+        env=PUSH, model="rtsm", planner="cem", execution="closed loop", n=9, metric="return_true"
+    )
     made_again = {(results.PLANNED, seed) for seed in range(3)} | {(results.RANDOM, 2)}
-    rows = tables.frame([
-        loop | dict(configuration=data, iteration=k, seed=seed, value=float(k * seed),
-                    samples=8 if (data, seed) in made_again else None)
-        for data in results.DATA for seed in range(3) for k in range(2)
-    ])  # fmt: skip
+    rows = tables.frame(
+        [
+            loop
+            | dict(
+                configuration=data,
+                iteration=k,
+                seed=seed,
+                value=float(k * seed),
+                samples=8 if (data, seed) in made_again else None,
+            )
+            for data in results.DATA
+            for seed in range(3)
+            for k in range(2)
+        ]
+    )
     found = results.paired(rows, 1)
     assert found.notna().sum().to_dict() == {"round 0": 3, results.NONE: 0, results.RANDOM: 1}
     assert found["round 0"].tolist() == [0, 1, 2]
@@ -568,7 +831,9 @@ def test_loops_whose_plans_were_judged_otherwise_are_not_compared() -> None:
 
 
 def test_published_loops_of_one_learner_and_seed_begin_alike_whatever_their_data() -> None:
-    rows = table.select(published("10_explore"), planner="cem", execution="closed loop", iteration=0)
+    rows = table.select(
+        published("10_explore"), planner="cem", execution="closed loop", iteration=0
+    )
     first = rows[rows["metric"].isin(["return_true", "success"])]
     learners = first.groupby(["env", "model", "seed", "metric"])["value"]
     assert (learners.count() > 1).sum() > 20
@@ -584,7 +849,9 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
         ends = {what: interval(values.dropna()) for what, values in results.paired(each, 5).items()}
         assert ends.keys() == {"round 0", results.NONE, results.RANDOM}
         assert all(mean - half > 0 for mean, half in ends.values())  # shown
-        own = table.select(each, configuration=results.PLANNED).pivot(index="iteration", columns="seed", values="value")
+        own = table.select(each, configuration=results.PLANNED).pivot(
+            index="iteration", columns="seed", values="value"
+        )
         means = own.mean(axis=1)
         assert means[1] - means[0] > means[5] - means[1]  # most of it comes with the first round
         if each is shares:
@@ -596,14 +863,27 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
                 for data in (results.RANDOM, results.NONE)
             }
             assert [f"{share:.0%}" for share in others.values()] == ["65%", "60%"]
-            assert min(mean - half for mean, half in ends.values()) > 0.1  # ten points more than any
+            assert (
+                min(mean - half for mean, half in ends.values()) > 0.1
+            )  # ten points more than any
             three = results.paired(each[each["seed"] < 3], 5)[results.NONE]
             mean, half = interval(100 * three)
-            assert [round(float(x), 1) for x in (mean, mean - half, mean + half)] == [21.3, 4.4, 38.2]
+            assert [round(float(x), 1) for x in (mean, mean - half, mean + half)] == [
+                21.3,
+                4.4,
+                38.2,
+            ]
     free = table.select(published("model_free"), env=PUSH, metric="return_true", subset="")
     ends = free[free["env_steps"] == 1_000_000].groupby("model")["value"].mean()
-    before = table.select(published("10_explore"), env=PUSH, execution="closed loop", metric="return_true", iteration=0,
-                          configuration=results.PLANNED, model=["rtsm", "lstm", "ensemble+mse"])  # fmt: skip
+    before = table.select(
+        published("10_explore"),
+        env=PUSH,
+        execution="closed loop",
+        metric="return_true",
+        iteration=0,
+        configuration=results.PLANNED,
+        model=["rtsm", "lstm", "ensemble+mse"],
+    )
     assert set(ends.index) == {"ppo", "trpo", "sac"}
     assert (before.groupby("model")["value"].mean() > ends.max()).tolist() == [True] * 3
     assert set(before["env_steps"]) == {20_000}
@@ -612,11 +892,24 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
     mean, half = interval(results.paired(gaps, 5)[results.NONE])
     assert mean - half > 0
     assert round(float(mean), 1) == 0.5
-    searched = table.select(published("10_explore"), env=PUSH, model="rtsm", configuration=results.PLANNED,
-                            metric="iterations_to_same_return", subset=results.LAST_PRIOR)  # fmt: skip
+    searched = table.select(
+        published("10_explore"),
+        env=PUSH,
+        model="rtsm",
+        configuration=results.PLANNED,
+        metric="iterations_to_same_return",
+        subset=results.LAST_PRIOR,
+    )
     assert sorted(searched["value"]) == [7, 9, 9]  # of five seeds
-    found = table.select(published("10_explore"), env=PUSH, model="rtsm", metric="return_true", execution="open loop",
-                         subset=results.LAST_PRIOR, iteration=10)  # fmt: skip
+    found = table.select(
+        published("10_explore"),
+        env=PUSH,
+        model="rtsm",
+        metric="return_true",
+        execution="open loop",
+        subset=results.LAST_PRIOR,
+        iteration=10,
+    )
     wide = found.pivot(index="seed", columns="configuration", values="value")
     mean, half = interval(wide[results.PLANNED] - wide[results.RANDOM])
     assert (round(float(mean), 2), mean - half > 0) == (0.18, True)
@@ -629,32 +922,60 @@ def test_the_notebook_says_of_pushing_what_the_published_rows_say() -> None:
 
 def test_the_notebook_says_of_contacts_what_the_published_rows_say() -> None:
     touched = table.select(
-        published("10_explore"), env=PUSH, model="rtsm", metric="contact_share", configuration=results.PLANNED
+        published("10_explore"),
+        env=PUSH,
+        model="rtsm",
+        metric="contact_share",
+        configuration=results.PLANNED,
     )
     means = touched.groupby("iteration")["value"].mean()
-    assert [f"{share:.0%}" for share in (means[0], means[1:].min(), means[1:].max())] == ["66%", "89%", "93%"]
+    assert [f"{share:.0%}" for share in (means[0], means[1:].min(), means[1:].max())] == [
+        "66%",
+        "89%",
+        "93%",
+    ]
 
 
 def test_the_notebook_says_of_the_loop_of_mbrl_lib_what_the_published_rows_say() -> None:
-    rows = table.select(published("10_explore"), execution="closed loop", metric="return_true", model=["pets", "rtsm"])
-    last = {env: own[own["iteration"] == own["iteration"].max()] for env, own in table.groups(rows, "env")}
-    own = {env: table.select(part, configuration=results.PLANNED) for env, part in last.items() if env in results.DRAWN}
-    wide = {env: part.pivot(index="seed", columns="model", values="value").dropna() for env, part in own.items()}
+    rows = table.select(
+        published("10_explore"),
+        execution="closed loop",
+        metric="return_true",
+        model=["pets", "rtsm"],
+    )
+    last = {
+        env: own[own["iteration"] == own["iteration"].max()]
+        for env, own in table.groups(rows, "env")
+    }
+    own = {
+        env: table.select(part, configuration=results.PLANNED)
+        for env, part in last.items()
+        if env in results.DRAWN
+    }
+    wide = {
+        env: part.pivot(index="seed", columns="model", values="value").dropna()
+        for env, part in own.items()
+    }
     assert (wide[PENDULUM]["pets"] > wide[PENDULUM]["rtsm"]).tolist() == [True] * 3
     assert (wide[PUSH]["pets"] < wide[PUSH]["rtsm"] - 7).tolist() == [True] * 3
-    plans = table.select(published("05_control"), env=PUSH, planner="zero", metric="return_true", seed=0)
+    plans = table.select(
+        published("05_control"), env=PUSH, planner="zero", metric="return_true", seed=0
+    )
     nothing = float(plans["value"].mean())
     assert ((wide[PUSH]["pets"] - nothing).abs() < 0.2).all()
 
 
 def test_the_notebook_says_of_other_models_that_push_what_the_published_rows_say() -> None:
-    rows = table.select(published("10_explore"), env=PUSH, execution="closed loop", configuration=results.PLANNED)
+    rows = table.select(
+        published("10_explore"), env=PUSH, execution="closed loop", configuration=results.PLANNED
+    )
     assert rows["env_steps"].max() == 95_000
     returns, shares = (
         table.select(rows, metric=metric, model=["lstm", "ensemble+mse", "rtsm"])
-        .pivot(index="seed", columns=["model", "iteration"], values="value").dropna()
+        .pivot(index="seed", columns=["model", "iteration"], values="value")
+        .dropna()
         for metric in ("return_true", "success")
-    )  # fmt: skip
+    )
     assert len(returns) == len(shares) == 3
     means = shares.mean()
     said = {word: [f"{means[word, k]:.0%}" for k in (0, 5)] for word in ("lstm", "ensemble+mse")}
@@ -667,12 +988,17 @@ def test_the_notebook_says_of_other_models_that_push_what_the_published_rows_say
     shown = {what for what, (mean, half) in ahead.items() if mean - half > 0}
     assert shown == {("returns", "ensemble+mse"), ("arrives", "lstm"), ("arrives", "ensemble+mse")}
     ends = [ahead["arrives", word] for word in ("lstm", "ensemble+mse")]
-    found = [[round(float(100 * end)) for end in (mean, mean - half, mean + half)] for mean, half in ends]
+    found = [
+        [round(float(100 * end)) for end in (mean, mean - half, mean + half)] for mean, half in ends
+    ]
     assert found == [[8, 5, 12], [16, 9, 23]]
     mean, half = ahead["returns", "lstm"]
     assert [round(float(end), 1) for end in (mean, mean - half, mean + half)] == [0.3, -0.7, 1.3]
     assert (returns["ensemble+mse", 5] < returns["rtsm", 1]).all()
-    first = {word: interval(100 * (shares["rtsm", 0] - shares[word, 0])) for word in ("lstm", "ensemble+mse")}
+    first = {
+        word: interval(100 * (shares["rtsm", 0] - shares[word, 0]))
+        for word in ("lstm", "ensemble+mse")
+    }
     assert [round(float(mean)) for mean, _ in first.values()] == [11, 17]
     gaps = table.select(rows, metric="gap_absolute", model=["lstm", "ensemble+mse"])
     wide = gaps.pivot(index="seed", columns=["model", "iteration"], values="value")
@@ -687,7 +1013,9 @@ def test_the_notebook_says_of_policies_of_the_pendulum_what_the_published_rows_s
     lines = results.steps_table(rows, published("model_free"), PENDULUM).splitlines()
     names, _, *found = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     compared = [dict(zip(names, line, strict=True)) for line in found]
-    assert len(compared) == 3 * 4  # and of rounds the segment model, the LSTM, the ensemble and PETS
+    assert (
+        len(compared) == 3 * 4
+    )  # and of rounds the segment model, the LSTM, the ensemble and PETS
     for one in compared:
         steps = int(one["policy's steps to that"].replace(",", ""))
         assert steps == 12_000 if one["policy"] == "SAC" else 48_000 <= steps <= 68_000
@@ -698,34 +1026,51 @@ def test_the_notebook_says_of_policies_of_the_pendulum_what_the_published_rows_s
 
 def test_the_notebook_says_of_torques_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), env=PUSH, model="rtsm", metric="torque_rms")
-    last = table.select(rows, subset=results.LAST_PRIOR).pivot(index="seed", columns="configuration", values="value")
+    last = table.select(rows, subset=results.LAST_PRIOR).pivot(
+        index="seed", columns="configuration", values="value"
+    )
     executed = table.select(rows, subset="data", configuration=results.PLANNED)
     plans = executed[executed["iteration"] > 0].groupby("seed")["value"].mean()
     assert (plans < last[results.PLANNED]).all()
     assert (last[results.PLANNED] < last[[results.RANDOM, results.NONE]].min(axis=1)).all()
     first = table.select(rows, subset=results.FIRST_PRIOR, configuration=results.PLANNED)["value"]
-    assert [round(float(part.mean()), 3) for part in (first, plans, last[results.PLANNED], last[results.RANDOM])] == [
-        0.067, 0.069, 0.075, 0.096,
-    ]  # fmt: skip
+    assert [
+        round(float(part.mean()), 3)
+        for part in (first, plans, last[results.PLANNED], last[results.RANDOM])
+    ] == [
+        0.067,
+        0.069,
+        0.075,
+        0.096,
+    ]
     sizes = worlds.world(PUSH).sizes["paper"]
-    assert sizes.prior * 6 == sizes.prior + sizes.rounds * sizes.prior  # updates of the first prior and of the last
+    assert (
+        sizes.prior * 6 == sizes.prior + sizes.rounds * sizes.prior
+    )  # updates of the first prior and of the last
 
 
 def test_the_notebook_says_of_gaps_and_priors_of_the_pendulum_what_the_published_rows_say() -> None:
-    rows = table.select(published("10_explore"), env=PENDULUM, model="rtsm", execution="closed loop")
+    rows = table.select(
+        published("10_explore"), env=PENDULUM, model="rtsm", execution="closed loop"
+    )
     gaps, heights = (
         table.select(rows, metric=metric).groupby(["configuration", "iteration"])["value"].mean()
         for metric in ("gap_open_loop", "highest")
     )
     assert gaps[results.RANDOM, 4] < gaps[results.PLANNED, 4] < gaps[results.PLANNED, 0]
-    assert heights[results.PLANNED, 0] < heights[results.PLANNED, 4] < heights[results.RANDOM, 4] + 0.01
+    assert (
+        heights[results.PLANNED, 0]
+        < heights[results.PLANNED, 4]
+        < heights[results.RANDOM, 4] + 0.01
+    )
 
 
 def test_the_notebook_says_of_rounds_of_the_pendulum_what_the_published_rows_say() -> None:
     rows = table.select(published("10_explore"), planner="cem", execution="closed loop")
     swung = table.select(rows, env=PENDULUM, model="rtsm", metric="success", iteration=4)
     own, random = (
-        table.select(swung, configuration=data).set_index("seed")["value"] for data in (results.PLANNED, results.RANDOM)
+        table.select(swung, configuration=data).set_index("seed")["value"]
+        for data in (results.PLANNED, results.RANDOM)
     )
     assert own.tolist() == [1, 1, 1]
     swings = table.select(rows, env=PENDULUM, metric="success")
@@ -733,12 +1078,19 @@ def test_the_notebook_says_of_rounds_of_the_pendulum_what_the_published_rows_say
     before = [means[word, results.PLANNED, 0] for word in ("rtsm", "lstm", "ensemble+mse")]
     assert [f"{share:.0%}" for share in before] == ["29%", "12%", "92%"]
     assert {means[word, results.PLANNED, 4] for word in ("rtsm", "lstm", "ensemble+mse")} == {1}
-    assert [f"{means['rtsm', data, 4]:.0%}" for data in (results.RANDOM, results.NONE)] == ["46%", "25%"]
-    ends = table.select(rows, env=PENDULUM, metric="return_true", iteration=4, configuration=results.PLANNED)
+    assert [f"{means['rtsm', data, 4]:.0%}" for data in (results.RANDOM, results.NONE)] == [
+        "46%",
+        "25%",
+    ]
+    ends = table.select(
+        rows, env=PENDULUM, metric="return_true", iteration=4, configuration=results.PLANNED
+    )
     means = ends.groupby("model")["value"].mean()
     assert [round(float(means[word])) for word in ("pets", "rtsm")] == [59, 50]
     assert (random.sort_index() < own.sort_index()).all()
-    returns = table.select(rows, env=PENDULUM, model="rtsm", metric="return_true", configuration=results.NONE)
+    returns = table.select(
+        rows, env=PENDULUM, model="rtsm", metric="return_true", configuration=results.NONE
+    )
     means = returns.groupby("iteration")["value"].mean()
     assert means[4] < means[0]
     swung = table.select(rows, env=PENDULUM, model="ensemble+mse", metric="success", iteration=0)
@@ -746,28 +1098,55 @@ def test_the_notebook_says_of_rounds_of_the_pendulum_what_the_published_rows_say
     assert set(swung["n"]) == {8}
     pushed = table.select(rows, env=PUSH, model="lstm", metric="return_true")
     own, alone = (
-        table.select(pushed, configuration=data).pivot(index="iteration", columns="seed", values="value")
+        table.select(pushed, configuration=data).pivot(
+            index="iteration", columns="seed", values="value"
+        )
         for data in (results.PLANNED, results.NONE)
     )
     assert own.columns.tolist() == alone.columns.tolist() == [0, 1, 2]
     assert (own.loc[5] - own.loc[0] > 2).all()
     assert ((alone.loc[5] - alone.loc[0]).abs() < 1).all()  # where it was
-    pushed = table.select(rows, env=PUSH, model="lstm", metric="success", configuration=results.NONE, iteration=5)
+    pushed = table.select(
+        rows, env=PUSH, model="lstm", metric="success", configuration=results.NONE, iteration=5
+    )
     assert f"{pushed['value'].mean():.0%}" == "46%"
 
 
 def test_rounds_are_drawn_with_their_task_their_units_and_single_seeds() -> None:
-    common = dict(env=PUSH, model="lstm", planner="cem", execution="closed loop", configuration=results.PLANNED, n=9)
-    rows = tables.frame([
-        common | dict(metric=metric, env_steps=20_000 * k, iteration=k, value=low + 0.01 * seed + k / 5, seed=seed,
-                      scale="paper")
-        for metric, low in (("return_true", -9.0), ("success", 0.5)) for k in range(3) for seed in range(3)
-    ]).assign(source=table.YOURS)  # fmt: skip
+    common = dict(
+        env=PUSH,
+        model="lstm",
+        planner="cem",
+        execution="closed loop",
+        configuration=results.PLANNED,
+        n=9,
+    )
+    rows = tables.frame(
+        [
+            common
+            | dict(
+                metric=metric,
+                env_steps=20_000 * k,
+                iteration=k,
+                value=low + 0.01 * seed + k / 5,
+                seed=seed,
+                scale="paper",
+            )
+            for metric, low in (("return_true", -9.0), ("success", 0.5))
+            for k in range(3)
+            for seed in range(3)
+        ]
+    ).assign(source=table.YOURS)
     (drawing,) = drawings.rounds(rows, PUSH, results.DRAWN[PUSH])
     first, second = drawing.figure.axes
     single = [line.get_ydata().tolist() for line in first.lines if line.get_lw() < 1]
-    assert single == [pytest.approx([-9 + 0.01 * seed + k / 5 for k in range(3)]) for seed in range(3)]
-    assert [ax.get_title(loc="left") for ax in (first, second)] == ["Push: executed return", "Push: share within 5 cm"]
+    assert single == [
+        pytest.approx([-9 + 0.01 * seed + k / 5 for k in range(3)]) for seed in range(3)
+    ]
+    assert [ax.get_title(loc="left") for ax in (first, second)] == [
+        "Push: executed return",
+        "Push: share within 5 cm",
+    ]
     assert [ax.get_ylabel() for ax in (first, second)] == ["return (m)", "share of targets"]
     assert first.xaxis.get_major_formatter()(20_000) == "20,000"
     mean = next(line.get_ydata() for line in first.lines if line.get_marker() == "v")
@@ -775,11 +1154,21 @@ def test_rounds_are_drawn_with_their_task_their_units_and_single_seeds() -> None
 
 
 def test_training_alone_and_the_oracle_are_lines_across_with_their_seeds() -> None:
-    plans = tables.frame([
-        dict(env=PUSH, model="oracle", search_space="latent", planner="cem", execution="open loop", seed=seed,
-             metric="return_true", value=-8.0 - seed)
-        for seed in range(2)
-    ]).assign(source=table.YOURS)  # fmt: skip
+    plans = tables.frame(
+        [
+            dict(
+                env=PUSH,
+                model="oracle",
+                search_space="latent",
+                planner="cem",
+                execution="open loop",
+                seed=seed,
+                metric="return_true",
+                value=-8.0 - seed,
+            )
+            for seed in range(2)
+        ]
+    ).assign(source=table.YOURS)
     (drawing,) = drawings.rounds(pushing_rows(-15.0), PUSH, results.DRAWN[PUSH], plans=plans)
     (ax,) = drawing.figure.axes
     level = sorted(float(line.get_ydata()[0]) for line in ax.lines if [*line.get_xdata()] == [0, 1])
@@ -787,22 +1176,44 @@ def test_training_alone_and_the_oracle_are_lines_across_with_their_seeds() -> No
     shades = sorted((patch.get_y(), patch.get_y() + patch.get_height()) for patch in ax.patches)
     assert shades == [pytest.approx((-13.0, -12.8)), pytest.approx((-9.0, -8.0))]
     told = {text.get_text() for text in drawing.figure.legends[0].texts}
-    assert {"recurrent TSM, no new episodes, round 2", "oracle, open loop, 2 seeds", "single seeds"} <= told
+    assert {
+        "recurrent TSM, no new episodes, round 2",
+        "oracle, open loop, 2 seeds",
+        "single seeds",
+    } <= told
 
 
 def pushing_rows(low: float) -> pd.DataFrame:
     """Rounds of three learners, of which the LSTM falls to ``low``."""
-    common = dict(env=PUSH, planner="cem", execution="closed loop", n=9, metric="return_true", scale="paper")
-    ends = {("rtsm", results.PLANNED): -10.0, ("rtsm", results.NONE): -13.0, ("lstm", results.PLANNED): low}
-    return tables.frame([
-        common | dict(model=word, configuration=data, iteration=k, seed=seed,
-                      value=-12 + (end + 12) * k / 2 + 0.1 * seed,
-                      env_steps=20_000 + 15_000 * k * (data != results.NONE))
-        for (word, data), end in ends.items() for k in range(3) for seed in range(3)
-    ]).assign(source=table.YOURS)  # fmt: skip
+    common = dict(
+        env=PUSH, planner="cem", execution="closed loop", n=9, metric="return_true", scale="paper"
+    )
+    ends = {
+        ("rtsm", results.PLANNED): -10.0,
+        ("rtsm", results.NONE): -13.0,
+        ("lstm", results.PLANNED): low,
+    }
+    return tables.frame(
+        [
+            common
+            | dict(
+                model=word,
+                configuration=data,
+                iteration=k,
+                seed=seed,
+                value=-12 + (end + 12) * k / 2 + 0.1 * seed,
+                env_steps=20_000 + 15_000 * k * (data != results.NONE),
+            )
+            for (word, data), end in ends.items()
+            for k in range(3)
+            for seed in range(3)
+        ]
+    ).assign(source=table.YOURS)
 
 
-def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> None:
+def test_a_learner_that_falls_far_below_where_it_began_squeezes_no_other_and_its_return_stands_in_words() -> (
+    None
+):
     (drawing,) = drawings.rounds(pushing_rows(-30.0), PUSH, results.DRAWN[PUSH])
     (ax,) = drawing.figure.axes
     low = results.axis_ends(pushing_rows(-30.0), PUSH)["executed return"]
@@ -825,15 +1236,20 @@ def test_a_learner_of_which_every_seed_lacks_a_round_is_not_drawn() -> None:
     assert results.round_panels(alone, ["executed return"], PUSH) == {}
 
 
-def test_training_alone_of_our_model_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> None:
+def test_training_alone_of_our_model_is_drawn_after_its_last_round_at_the_steps_of_the_first() -> (
+    None
+):
     rows = pushing_rows(-15.0)
     others = table.select(rows, model="rtsm", configuration=results.NONE).assign(model="lstm")
     rows = pd.concat([rows, others])
     panel = results.round_panels(rows, ["executed return"], PUSH, alone=True)["executed return"]
     drawn = {(method.model, method.variant): at.tolist() for method, (at, _) in panel.items()}
     alone = ("rtsm", "no new episodes, round 2")
-    assert drawn == {("rtsm", results.PLANNED): [20_000, 35_000, 50_000], alone: [20_000],
-                     ("lstm", results.PLANNED): [20_000, 35_000, 50_000]}  # fmt: skip
+    assert drawn == {
+        ("rtsm", results.PLANNED): [20_000, 35_000, 50_000],
+        alone: [20_000],
+        ("lstm", results.PLANNED): [20_000, 35_000, 50_000],
+    }
     ((_, values),) = (found for method, found in panel.items() if method.variant == alone[1])
     assert values.ravel().tolist() == pytest.approx([-13.0, -12.9, -12.8])
 

@@ -26,16 +26,21 @@ from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.storage import manifest
 from tsmlib.storage.files import StoreError
-from tsmlib.study import explorer, notebooks, papermill_plugin, parameters, runs
-from tsmlib.study.parameters import ParameterError
-from tsmlib.study.runs import RunError, resolve
+from reproduction import explorer, notebooks, papermill_plugin, parameters, runs
+from reproduction.parameters import ParameterError
+from reproduction.runs import RunError, resolve
 
-PARAMETERS = 'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
+PARAMETERS = (
+    'scale = ""\nseed = 0\nrun_dir = ""\nrate = 0.5\nname = "x"\nfast = False\nsizes = [1, 2]'
+)
 
 
 def write_notebook(path: Path, *cells: str, parameters: str = PARAMETERS) -> Path:
     notebook = nbformat.v4.new_notebook(
-        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}, "language_info": {"name": "python"}}
+        metadata={
+            "kernelspec": {"name": "python3", "display_name": "Python 3"},
+            "language_info": {"name": "python"},
+        }
     )
     notebook.cells = [nbformat.v4.new_code_cell(source) for source in (parameters, *cells)]
     notebook.cells[0].metadata["tags"] = ["parameters"]
@@ -49,14 +54,21 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with two notebooks, and a name for runs in which braces must survive."""
     monkeypatch.setattr(runs, "NOTEBOOKS", tmp_path / "notebooks")
     monkeypatch.setenv("TSM_RUN_DIR", str(tmp_path / "runs {x} ü"))
-    write_notebook(tmp_path / "notebooks" / "01_first.ipynb", "result = (scale, seed, rate, name, fast)", "result")
+    write_notebook(
+        tmp_path / "notebooks" / "01_first.ipynb",
+        "result = (scale, seed, rate, name, fast)",
+        "result",
+    )
     write_notebook(tmp_path / "notebooks" / "02_second.ipynb", "1 + 1")
     return tmp_path
 
 
 def status(place: Path, scale: str = "laptop", seed: int = 0) -> dict[str, Any]:
     folder = place / "runs {x} ü" / scale / f"seed{seed}"
-    return {path.name.partition(".")[0]: json.loads(path.read_text()) for path in folder.glob("*.status.json")}
+    return {
+        path.name.partition(".")[0]: json.loads(path.read_text())
+        for path in folder.glob("*.status.json")
+    }
 
 
 def untouched(place: Path) -> bool:
@@ -66,7 +78,9 @@ def untouched(place: Path) -> bool:
 # Where things live ---------------------------------------------------------------------------------------------------
 
 
-def test_a_parameter_beats_the_environment_which_beats_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parameter_beats_the_environment_which_beats_the_default(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert resolve("05_control").dir == runs.ROOT / "runs" / "laptop" / "seed0"
     monkeypatch.setenv("TSM_SCALE", "smoke")
     monkeypatch.setenv("TSM_RUN_DIR", "/elsewhere")
@@ -92,15 +106,23 @@ def test_folders_exist_when_they_are_asked_for_and_not_before(place: Path) -> No
 
 
 def test_a_run_picks_by_scale() -> None:
-    assert [resolve("x", scale=scale).pick(smoke=1, laptop=2, paper=3) for scale in parameters.SCALES] == [1, 2, 3]
+    assert [
+        resolve("x", scale=scale).pick(smoke=1, laptop=2, paper=3) for scale in parameters.SCALES
+    ] == [1, 2, 3]
 
 
 @pytest.mark.parametrize(
     "bad",
     [
-        *({"scale": value} for value in ("huge", "../../x", "smoke\n", 1, None, True, "x" * 300, "laptop/..")),
+        *(
+            {"scale": value}
+            for value in ("huge", "../../x", "smoke\n", 1, None, True, "x" * 300, "laptop/..")
+        ),
         *({"seed": value} for value in (-1, 2**31, 1.0, "1", True, None, float("nan"), 10**30)),
-        *({"run_dir": value} for value in ("../x", "a/../b", "~/x", "a\0b", "a\nb", 3, None, "x" * 2000, "a\u202eb")),
+        *(
+            {"run_dir": value}
+            for value in ("../x", "a/../b", "~/x", "a\0b", "a\nb", 3, None, "x" * 2000, "a\u202eb")
+        ),
         {"run_dir": str(Path(__file__))},
     ],
     ids=lambda bad: repr(bad)[:40],
@@ -112,7 +134,9 @@ def test_bad_settings_are_refused_naming_the_value(bad: dict[str, Any]) -> None:
 
 def test_a_bad_environment_is_refused_by_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TSM_SCALE", "huge")
-    with pytest.raises(ParameterError, match="TSM_SCALE is 'huge', expected one of smoke, laptop, paper"):
+    with pytest.raises(
+        ParameterError, match="TSM_SCALE is 'huge', expected one of smoke, laptop, paper"
+    ):
         resolve("05_control")
 
 
@@ -143,8 +167,34 @@ def test_the_schema_knows_every_environment_model_and_parameter() -> None:
 
 
 BAD_PARAMETERS = [
-    *("sed=7", "seed", "=3", "seed=3", "scale=smoke", "rate=", "name=a\nb", "name=a\0b", "sizes=[3]", "sizes=3"),
-    *(f"rate={text}" for text in ("nan", "inf", "-inf", "1e999", "true", "0x10", "1_000", "10**9", "[1]", "{}", "1,5")),
+    *(
+        "sed=7",
+        "seed",
+        "=3",
+        "seed=3",
+        "scale=smoke",
+        "rate=",
+        "name=a\nb",
+        "name=a\0b",
+        "sizes=[3]",
+        "sizes=3",
+    ),
+    *(
+        f"rate={text}"
+        for text in (
+            "nan",
+            "inf",
+            "-inf",
+            "1e999",
+            "true",
+            "0x10",
+            "1_000",
+            "10**9",
+            "[1]",
+            "{}",
+            "1,5",
+        )
+    ),
     *(f"fast={text}" for text in ("1", "yes", "", "None")),
     "seed=1; open('pwned.txt','w').write('x'); y=3",
     "__class__=3",
@@ -163,7 +213,9 @@ def test_bad_parameters_are_refused_before_any_file_exists(
     assert untouched(place)
 
 
-@pytest.mark.parametrize("seed", ["-1", "2147483648", "1.0", "x", "", "nan", "1e3", "0x10", "9" * 99])
+@pytest.mark.parametrize(
+    "seed", ["-1", "2147483648", "1.0", "x", "", "nan", "1e3", "0x10", "9" * 99]
+)
 def test_bad_seeds_are_refused_before_any_file_exists(place: Path, seed: str) -> None:
     assert main(["run", "first", f"--seed={seed}"]) == 2
     assert main(["run", "first", "--scale", "huge"]) == 2
@@ -177,7 +229,9 @@ def test_an_unknown_notebook_is_refused_listing_those_that_exist(
     assert "there are first, second, or all" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("source", ["x = 1 + y", "import os", "x, y = 1, 2", "x = open('f')", "x ="])
+@pytest.mark.parametrize(
+    "source", ["x = 1 + y", "import os", "x, y = 1, 2", "x = open('f')", "x ="]
+)
 def test_a_parameters_cell_holds_literals_only(place: Path, source: str) -> None:
     with pytest.raises(ParameterError, match="parameters cell"):
         parameters.declared(write_notebook(place / "03_bad.ipynb", parameters=source))
@@ -200,9 +254,14 @@ def test_help_of_a_notebook_lists_its_parameters_with_defaults_and_comments(
     assert untouched(place)
 
 
-def test_a_mistyped_parameter_is_refused_naming_the_closest(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistyped_parameter_is_refused_naming_the_closest(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["run", "first", "-p", "rat=1"]) == 2
-    assert "no parameter 'rat'; the closest is rate, and it has scale, seed, run_dir, rate," in capsys.readouterr().err
+    assert (
+        "no parameter 'rat'; the closest is rate, and it has scale, seed, run_dir, rate,"
+        in capsys.readouterr().err
+    )
     assert main(["run", "first", "-p", "xyzzy=1"]) == 2
     assert "no parameter 'xyzzy'; it has scale" in capsys.readouterr().err
 
@@ -214,7 +273,9 @@ def test_notebooks_are_copied_out_and_a_changed_copy_is_never_replaced(
     for _ in range(2):  # the second time there is nothing to do
         assert main(["notebooks", str(place / "mine")]) == 0
         assert capsys.readouterr().out.split() == list(map(str, copies))
-    assert [path.read_bytes() for path in copies] == [each.path.read_bytes() for each in runs.notebooks().values()]
+    assert [path.read_bytes() for path in copies] == [
+        each.path.read_bytes() for each in runs.notebooks().values()
+    ]
     copies[0].unlink()
     copies[1].write_text("{}")
     assert main(["notebooks", str(place / "mine")]) == 1
@@ -224,7 +285,9 @@ def test_notebooks_are_copied_out_and_a_changed_copy_is_never_replaced(
 
 
 def test_a_copy_is_named_by_its_path(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = write_notebook(place / "mine" / "01_first.ipynb", parameters="scale = ''\nseed = 0\nrun_dir = ''\nmine = 3")
+    copy = write_notebook(
+        place / "mine" / "01_first.ipynb", parameters="scale = ''\nseed = 0\nrun_dir = ''\nmine = 3"
+    )
     assert main(["run", str(copy), "--help"]) == 0
     assert "-p mine=3" in capsys.readouterr().out
     assert main(["run", str(copy.with_name("02_none.ipynb"))]) == 2
@@ -236,9 +299,14 @@ def test_what_a_changed_copy_made_counts_for_nothing_but_itself(place: Path) -> 
     assert main(["run", str(copy)]) == 0
     own = notebooks.prepare(runs.Notebook("first", copy))
     assert notebooks.outdated(own) == ""
-    with pytest.raises(RunError, match=r"a copy with other cells than 01_first.ipynb.*tsmlib run first"):
+    with pytest.raises(
+        RunError, match=r"a copy with other cells than 01_first.ipynb.*tsmlib run first"
+    ):
         notebooks.require(own.run, "01_first")
-    assert notebooks.require(own.run, "01_first", cells=notebooks.code_sha256(copy))["changed_copy"] is True
+    assert (
+        notebooks.require(own.run, "01_first", cells=notebooks.code_sha256(copy))["changed_copy"]
+        is True
+    )
     assert main(["run", "first"]) == 0
     assert notebooks.require(own.run, "01_first")["state"] == "complete"
     assert notebooks.outdated(own) == "its cells changed"
@@ -249,15 +317,35 @@ def test_without_the_tools_of_notebooks_a_run_names_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "papermill", None)
     assert main(["run", "first"]) == 1
-    assert re.search(r"notebooks need papermill, .*pip install 'tsmlib\[study\]'", capsys.readouterr().err)
+    assert re.search(
+        r"notebooks need papermill, .*pip install 'tsmlib\[study\]'", capsys.readouterr().err
+    )
     assert untouched(place)
 
 
 # Execution -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_notebook_runs_with_its_parameters_into_its_folder(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "first", "--scale", "smoke", "--seed", "3", "-p", "rate=0.25", "-p", "fast=true"]) == 0
+def test_a_notebook_runs_with_its_parameters_into_its_folder(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(
+            [
+                "run",
+                "first",
+                "--scale",
+                "smoke",
+                "--seed",
+                "3",
+                "-p",
+                "rate=0.25",
+                "-p",
+                "fast=true",
+            ]
+        )
+        == 0
+    )
     executed = place / "runs {x} ü" / "smoke" / "seed3" / "01_first.ipynb"
     assert capsys.readouterr().out.strip() == str(executed)
     notebook = nbformat.read(executed, 4)
@@ -270,8 +358,13 @@ def test_a_notebook_runs_with_its_parameters_into_its_folder(place: Path, capsys
     assert (entry["scale"], entry["seed"]) == ("smoke", 3)
 
 
-def test_what_a_notebook_prints_is_told_as_it_comes(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_notebook(place / "notebooks" / "01_first.ipynb", "print('no model;', 'training it now')\nprint('done')")
+def test_what_a_notebook_prints_is_told_as_it_comes(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_notebook(
+        place / "notebooks" / "01_first.ipynb",
+        "print('no model;', 'training it now')\nprint('done')",
+    )
     assert main(["run", "first"]) == 0
     told = capsys.readouterr()
     assert "no model; training it now\ndone\n" in told.err
@@ -289,13 +382,17 @@ UNFINISHED = {
 def test_a_notebook_that_does_not_reach_its_end_failed(place: Path, how: str) -> None:
     source, message = UNFINISHED[how]
     write_notebook(place / "notebooks" / "01_first.ipynb", source, "print('after')")
-    with pytest.raises(RunError, match=rf"01_first failed: [\s\S]*{message}[\s\S]*See .*01_first.ipynb"):
+    with pytest.raises(
+        RunError, match=rf"01_first failed: [\s\S]*{message}[\s\S]*See .*01_first.ipynb"
+    ):
         notebooks.execute(notebooks.prepare(runs.notebooks()["first"]), progress=False)
     assert status(place)["01_first"]["state"] == "failed"
     assert message in status(place)["01_first"]["error"]
 
 
-def test_running_all_stops_at_the_first_failure(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_running_all_stops_at_the_first_failure(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_notebook(place / "notebooks" / "01_first.ipynb", "1 / 0")
     assert main(["run", "all"]) == 1
     assert "ZeroDivisionError" in capsys.readouterr().err
@@ -312,10 +409,12 @@ def start(place: Path) -> subprocess.Popen[bytes]:
         # SIGINT would be ignored where the tests themselves run in the background.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "import sys; from pathlib import Path;"
-        "from tsmlib.study import runs; from tsmlib.__main__ import main;"
+        "from reproduction import runs; from tsmlib.__main__ import main;"
         f"runs.NOTEBOOKS = Path({str(place / 'notebooks')!r}); sys.exit(main(['run', 'first']))"
     )
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=runs.ROOT, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=runs.ROOT, stderr=subprocess.DEVNULL
+    )
     wait_for(lambda: (place / "inside").exists() and bool((place / "inside").read_text()))
     return process
 
@@ -336,7 +435,9 @@ def gone(pid: int) -> bool:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stopped_run_is_interrupted_and_its_kernel_goes(place: Path, number: signal.Signals) -> None:
+def test_a_stopped_run_is_interrupted_and_its_kernel_goes(
+    place: Path, number: signal.Signals
+) -> None:
     process = start(place)
     process.send_signal(number)
     assert process.wait(600) == 130
@@ -349,11 +450,16 @@ def test_a_notebook_of_a_run_has_one_writer_until_that_writer_is_gone(place: Pat
     process = start(place)
     again, second = (notebooks.prepare(runs.notebooks()[name]) for name in ("first", "second"))
     try:
-        with pytest.raises(RunError, match=rf"written by another process \(pid {process.pid} on .*, 01_first, since"):
+        with pytest.raises(
+            RunError,
+            match=rf"written by another process \(pid {process.pid} on .*, 01_first, since",
+        ):
             notebooks.execute(again, progress=False)
         notebooks.execute(second, progress=False)  # another notebook of the run does not wait
         assert status(place)["02_second"]["state"] == "complete"
-        with pytest.raises(RunError, match="01_first in .* is running, expected complete. Wait for it"):
+        with pytest.raises(
+            RunError, match="01_first in .* is running, expected complete. Wait for it"
+        ):
             notebooks.require(second.run, "01_first")
     finally:
         process.kill()
@@ -364,7 +470,9 @@ def test_a_notebook_of_a_run_has_one_writer_until_that_writer_is_gone(place: Pat
     write_notebook(place / "notebooks" / "01_first.ipynb", "1 + 1")
     notebooks.execute(again, progress=False)
     assert status(place)["01_first"]["state"] == "complete"
-    with contextlib.suppress(ProcessLookupError):  # a kernel also ends by itself once its parent is gone
+    with contextlib.suppress(
+        ProcessLookupError
+    ):  # a kernel also ends by itself once its parent is gone
         os.kill(int((place / "inside").read_text()), signal.SIGKILL)
 
 
@@ -375,20 +483,29 @@ def test_a_process_of_another_machine_is_not_looked_for_here(place: Path) -> Non
         notebooks.require(run, "01_first")
 
 
-WRITES = """from tsmlib.study.runs import resolve
+WRITES = """from reproduction.runs import resolve
 run = resolve('{stem}', scale=scale, seed=seed, run_dir=run_dir)
 for name, text in {files!r}.items():
     _ = (run.metrics / name).write_text(text)
 {more}"""
 
 
-def test_a_notebook_answers_for_the_files_that_it_wrote_last(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_answers_for_the_files_that_it_wrote_last(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
-    for stem, files in {"01_first": {"a": "1", "b": "1"}, "02_second": {"b": "2", "c": "2"}}.items():
-        write_notebook(place / "notebooks" / f"{stem}.ipynb", WRITES.format(stem=stem, files=files, more=""))
+    for stem, files in {
+        "01_first": {"a": "1", "b": "1"},
+        "02_second": {"b": "2", "c": "2"},
+    }.items():
+        write_notebook(
+            place / "notebooks" / f"{stem}.ipynb", WRITES.format(stem=stem, files=files, more="")
+        )
         execution = notebooks.prepare(runs.notebooks()[stem[3:]])
         notebooks.execute(execution, progress=False)
-        assert set(notebooks.require(execution.run, stem)["files"]) == {f"metrics/{name}" for name in files}
+        assert set(notebooks.require(execution.run, stem)["files"]) == {
+            f"metrics/{name}" for name in files
+        }
     run = execution.run
     notebooks.require(run, "01_first")  # b is the second's now
     assert len([path for path in manifest.verify(run.dir) if path.parent == run.metrics]) == 3
@@ -407,12 +524,20 @@ def test_notebooks_that_run_at_the_same_time_answer_for_their_own_files(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
-    until = f"import os, time\nwhile not os.path.exists({str(place / 'go')!r}):\n    time.sleep(0.05)"
-    for stem, more in {"01_first": until, "02_second": f"open({str(place / 'go')!r}, 'w').close()"}.items():
+    until = (
+        f"import os, time\nwhile not os.path.exists({str(place / 'go')!r}):\n    time.sleep(0.05)"
+    )
+    for stem, more in {
+        "01_first": until,
+        "02_second": f"open({str(place / 'go')!r}, 'w').close()",
+    }.items():
         source = WRITES.format(stem=stem, files={f"{stem}.csv": "x"}, more=more)
         write_notebook(place / "notebooks" / f"{stem}.ipynb", source)
     with multiprocessing.get_context("fork").Pool(2) as pool:
-        pool.map(partial(notebooks.execute, progress=False), map(notebooks.prepare, runs.notebooks().values()))
+        pool.map(
+            partial(notebooks.execute, progress=False),
+            map(notebooks.prepare, runs.notebooks().values()),
+        )
     for stem, entry in status(place).items():
         assert set(entry["files"]) == {f"metrics/{stem}.csv"}
 
@@ -457,13 +582,15 @@ def in_terminal(command: list[str], cwd: Path, environment: dict[str, str]) -> t
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
     """A small copy of the repository whose package and entry point come before the installed ones."""
-    shutil.copytree(runs.ROOT / "tsmlib", tmp_path / "tsmlib", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        runs.ROOT / "tsmlib", tmp_path / "tsmlib", ignore=shutil.ignore_patterns("__pycache__")
+    )
     write_notebook(tmp_path / "notebooks" / "01_tiny.ipynb", "1 + 1")
     info = tmp_path / "tsmlib-9.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tsmlib\nVersion: 9\n")
     (info / "entry_points.txt").write_text(
-        "[papermill.io]\ntsmlib-default-output = tsmlib.study.papermill_plugin:handler\n"
+        "[papermill.io]\ntsmlib-default-output = reproduction.papermill_plugin:handler\n"
     )
     return tmp_path
 
@@ -521,7 +648,9 @@ def test_papermill_puts_a_notebook_where_run_would(place: Path) -> None:
     papermill_plugin.check(argv := ["/bin/papermill", here], terminal=True)
     assert argv[2].endswith("laptop/seed0/01_first.ipynb")
     assert "{{x}}" in argv[2]
-    papermill_plugin.check(argv := ["papermill", here, "-p", "scale", "smoke", "-p", "seed", "3"], terminal=True)
+    papermill_plugin.check(
+        argv := ["papermill", here, "-p", "scale", "smoke", "-p", "seed", "3"], terminal=True
+    )
     assert argv[-1].endswith("smoke/seed3/01_first.ipynb")
     copy = write_notebook(place / "mine" / "01_first.ipynb", "import tsmlib")
     papermill_plugin.check(argv := ["papermill", str(copy)], terminal=True)
@@ -544,7 +673,9 @@ def test_papermill_refuses_a_parameter_that_the_notebook_does_not_have(
     place: Path, words: list[str], terminal: bool
 ) -> None:
     argv = ["papermill", str(place / "notebooks" / "01_first.ipynb"), *words]
-    with pytest.raises(ParameterError, match="01_first has no parameter 'scal'; the closest is scale, and it has"):
+    with pytest.raises(
+        ParameterError, match="01_first has no parameter 'scal'; the closest is scale, and it has"
+    ):
         papermill_plugin.check(argv, terminal=terminal)
     assert untouched(place)
 
@@ -552,10 +683,16 @@ def test_papermill_refuses_a_parameter_that_the_notebook_does_not_have(
 def test_papermill_itself_refuses_before_it_runs_anything(clone: Path) -> None:
     done = subprocess.run(
         [PAPERMILL, "notebooks/01_tiny.ipynb", "out.ipynb", "-p", "scal", "smoke"],
-        cwd=clone, env={**os.environ, "PYTHONPATH": str(clone)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=clone,
+        env={**os.environ, "PYTHONPATH": str(clone)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 1
-    assert done.stderr.strip().startswith("error: 01_tiny has no parameter 'scal'; the closest is scale,")
+    assert done.stderr.strip().startswith(
+        "error: 01_tiny has no parameter 'scal'; the closest is scale,"
+    )
     assert not (clone / "out.ipynb").exists()
 
 
@@ -566,11 +703,16 @@ def test_papermill_in_python_is_refused_the_same_by_the_notebook(
     import papermill
 
     monkeypatch.setenv("PYTHONPATH", str(runs.ROOT))
-    own = "from tsmlib.study.runs import resolve\nresolve('01_x', scale=scale, seed=seed)"
+    own = "from reproduction.runs import resolve\nresolve('01_x', scale=scale, seed=seed)"
     path = write_notebook(place / "01_x.ipynb", own)
     if "sed" in given:
-        with pytest.raises(papermill.PapermillExecutionError, match="01_x has no parameter 'sed'; the closest is seed"):
-            papermill.execute_notebook(path, place / "out.ipynb", parameters=given, progress_bar=False)
+        with pytest.raises(
+            papermill.PapermillExecutionError,
+            match="01_x has no parameter 'sed'; the closest is seed",
+        ):
+            papermill.execute_notebook(
+                path, place / "out.ipynb", parameters=given, progress_bar=False
+            )
         assert not list(place.glob("runs*"))
     else:
         papermill.execute_notebook(path, place / "out.ipynb", parameters=given, progress_bar=False)
@@ -579,12 +721,20 @@ def test_papermill_in_python_is_refused_the_same_by_the_notebook(
 
 def test_cells_that_only_begin_like_papermills_are_left_alone() -> None:
     ours, injected = 'scale = ""\nseed = 0', "# Parameters\nfoo = 1\n"
-    others = [], ["", injected], ["", "data = 3", injected], ["", ours, "# Parameters\nseed = 3"], ["", ours, "1 +"]
+    others = (
+        [],
+        ["", injected],
+        ["", "data = 3", injected],
+        ["", ours, "# Parameters\nseed = 3"],
+        ["", ours, "1 +"],
+    )
     for cells in others:
         parameters.require_declared(cells, "01_x")
     with pytest.raises(ParameterError, match="01_x has no parameter 'foo'; it has scale, seed."):
         parameters.require_declared(["", ours, injected, "1 +"], "01_x")
-    parameters.require_declared(["", ours, injected, "# Parameters\nseed = 3"], "01_x")  # mended, in the same kernel
+    parameters.require_declared(
+        ["", ours, injected, "# Parameters\nseed = 3"], "01_x"
+    )  # mended, in the same kernel
 
 
 def test_the_installed_package_registers_the_entry_point() -> None:
@@ -596,6 +746,12 @@ def test_a_port_that_is_taken_or_none_is_named_with_what_to_type(tmp_path: Path)
     for name in ("index.html", "manifest.json"):
         (tmp_path / name).write_text("{}")
     with explorer.server(tmp_path, port=0) as running:
-        for port, why in ((running.server_port, ".+"), (99999, "ports are 0 to 65535"), (-1, "ports are 0 to 65535")):
-            with pytest.raises(RunError, match=rf"port {port} of 127.0.0.1 cannot be used \({why}\).*--port 0"):
+        for port, why in (
+            (running.server_port, ".+"),
+            (99999, "ports are 0 to 65535"),
+            (-1, "ports are 0 to 65535"),
+        ):
+            with pytest.raises(
+                RunError, match=rf"port {port} of 127.0.0.1 cannot be used \({why}\).*--port 0"
+            ):
                 explorer.server(tmp_path, port=port)

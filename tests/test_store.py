@@ -29,8 +29,8 @@ from filelock import FileLock
 from tsmlib.storage import artifacts, files, tables
 from tsmlib.storage import manifest as manifest_storage
 from tsmlib.storage.files import Json, StoreError
-from tsmlib.study.notebooks import _note, require
-from tsmlib.study.runs import Run, RunError
+from reproduction.notebooks import _note, require
+from reproduction.runs import Run, RunError
 from tsmlib.trajectory import Trajectories
 
 NAMES = ("joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y")
@@ -74,8 +74,17 @@ def saved(tmp_path: Path) -> Path:
 
 def test_arrays_and_header_come_back_as_they_were(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "er" / "x.safetensors"
-    header = {"seed": 7, "text": 'quotes " and "tsmlib":"{\\"sha256\\":\\"', "nested": {"list": [1, 2.5, None]}}
-    tensors = {"a": torch.randn(3, 4), "b": np.arange(5), "c": np.float32(2.0) * np.ones((2, 0)), "d": torch.ones(())}
+    header = {
+        "seed": 7,
+        "text": 'quotes " and "tsmlib":"{\\"sha256\\":\\"',
+        "nested": {"list": [1, 2.5, None]},
+    }
+    tensors = {
+        "a": torch.randn(3, 4),
+        "b": np.arange(5),
+        "c": np.float32(2.0) * np.ones((2, 0)),
+        "d": torch.ones(()),
+    }
     artifacts.save(path, tensors, kind="thing", header=header)
     found, found_header = artifacts.load(path, kind="thing")
     assert found_header == header == artifacts.read_header(path)
@@ -99,14 +108,20 @@ def test_any_safetensors_reader_opens_an_artefact(saved: Path) -> None:
 
 def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("x", "y"):
-        artifacts.save_trajectories(tmp_path / f"{name}.safetensors", some_trajectories(), {"seed": 1})
-    assert manifest_storage.sha256(tmp_path / "x.safetensors") == manifest_storage.sha256(tmp_path / "y.safetensors")
+        artifacts.save_trajectories(
+            tmp_path / f"{name}.safetensors", some_trajectories(), {"seed": 1}
+        )
+    assert manifest_storage.sha256(tmp_path / "x.safetensors") == manifest_storage.sha256(
+        tmp_path / "y.safetensors"
+    )
 
 
 def test_trajectories_come_back_as_they_were(tmp_path: Path) -> None:
     before = some_trajectories()
     artifacts.save_trajectories(tmp_path / "x.safetensors", before, {"seed": 1})
-    after = artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/Reacher-v0"})
+    after = artifacts.load_trajectories(
+        tmp_path / "x.safetensors", expect={"env": "tsm/Reacher-v0"}
+    )
     np.testing.assert_array_equal(after.states, before.states)
     np.testing.assert_array_equal(after.actions, before.actions)
     assert after.states.dtype == after.actions.dtype == np.float32
@@ -121,21 +136,34 @@ def test_episodes_of_different_length_come_back_with_their_ends(tmp_path: Path) 
         [t.states[0], t.states[1, :3], t.states[2, :5]],
         [t.actions[0], t.actions[1, :2], t.actions[2, :4]],
     )
-    before = Trajectories.ragged(states, actions, t.env, t.dt, NAMES, UNITS, terminated=(False, True, False))
+    before = Trajectories.ragged(
+        states, actions, t.env, t.dt, NAMES, UNITS, terminated=(False, True, False)
+    )
     artifacts.save_trajectories(tmp_path / "x.safetensors", before)
     after = artifacts.load_trajectories(tmp_path / "x.safetensors")
     np.testing.assert_array_equal(after.states, before.states)
     assert (after.lengths, after.terminated) == ((5, 2, 4), (False, True, False))
     artifacts.save_trajectories(tmp_path / "y.safetensors", t)
-    assert {"lengths", "terminated"}.isdisjoint(artifacts.read_header(tmp_path / "y.safetensors")["trajectories"])
+    assert {"lengths", "terminated"}.isdisjoint(
+        artifacts.read_header(tmp_path / "y.safetensors")["trajectories"]
+    )
 
 
 @pytest.mark.parametrize("lengths", [[5, 2], [5, 2, 99], [5, 2, "4"], "abc", 7, [5, 1, 4]])
 def test_a_file_whose_ends_do_not_fit_is_refused(tmp_path: Path, lengths: Json) -> None:
     t = some_trajectories()
-    fields = {"env": t.env, "dt": t.dt, "names": NAMES, "units": UNITS, "angles": [], "lengths": lengths}
+    fields = {
+        "env": t.env,
+        "dt": t.dt,
+        "names": NAMES,
+        "units": UNITS,
+        "angles": [],
+        "lengths": lengths,
+    }
     arrays = {"states": t.states, "actions": t.actions}
-    artifacts.save(tmp_path / "x.safetensors", arrays, kind="trajectories", header={"trajectories": fields})
+    artifacts.save(
+        tmp_path / "x.safetensors", arrays, kind="trajectories", header={"trajectories": fields}
+    )
     with pytest.raises(StoreError, match="holds no usable trajectories"):
         artifacts.load_trajectories(tmp_path / "x.safetensors")
 
@@ -150,7 +178,13 @@ def test_a_loaded_model_computes_the_same(tmp_path: Path) -> None:
 
 def test_a_table_comes_back_with_numbers_as_numbers(tmp_path: Path) -> None:
     rows = [
-        {"env": "tsm/Reacher-v0", "metric": "success", "value": np.float32(0.5), "n": 100, "seed": np.int64(0)},
+        {
+            "env": "tsm/Reacher-v0",
+            "metric": "success",
+            "value": np.float32(0.5),
+            "n": 100,
+            "seed": np.int64(0),
+        },
         {"env": 'a "b", c', "metric": "return_true", "value": -1e-30, "target": 3},
     ]
     tables.save(tmp_path / "t.csv", rows, extra=("target",))
@@ -180,7 +214,9 @@ def damage_is_refused(path: Path, damaged: bytes, load: Callable[[Path], Any]) -
 
 def loaders(tmp_path: Path) -> dict[Path, Callable[[Path], Any]]:
     """One artefact of each kind, and what loads it."""
-    trajectories, model, table = (tmp_path / name for name in ("t.safetensors", "m.safetensors", "shipped/x.csv"))
+    trajectories, model, table = (
+        tmp_path / name for name in ("t.safetensors", "m.safetensors", "shipped/x.csv")
+    )
     artifacts.save_trajectories(trajectories, some_trajectories(), {"seed": 1})
     artifacts.save_model(model, Line(inputs=3), {"fingerprint": FINGERPRINT})
     tables.save(table, [{"metric": "success", "value": 0.5}])
@@ -252,7 +288,9 @@ def test_loading_starts_no_process_and_opens_no_connection(tmp_path: Path) -> No
     listening = True
 
     def hook(event: str, _: tuple[Any, ...]) -> None:
-        if listening and event.startswith(("pickle.", "os.system", "subprocess.", "socket.", "exec", "compile")):
+        if listening and event.startswith(
+            ("pickle.", "os.system", "subprocess.", "socket.", "exec", "compile")
+        ):
             seen.append(event)
 
     sys.addaudithook(hook)
@@ -266,7 +304,9 @@ def test_loading_starts_no_process_and_opens_no_connection(tmp_path: Path) -> No
 
 
 def test_a_missing_file_is_named_with_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"none\.safetensors does not exist.*run the notebook that makes it"):
+    with pytest.raises(
+        StoreError, match=r"none\.safetensors does not exist.*run the notebook that makes it"
+    ):
         artifacts.load_trajectories(tmp_path / "none.safetensors")
 
 
@@ -277,8 +317,12 @@ def test_another_kind_is_refused(saved: Path) -> None:
 
 def test_trajectories_of_another_environment_are_refused(tmp_path: Path) -> None:
     artifacts.save_trajectories(tmp_path / "x.safetensors", some_trajectories())
-    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'"):
-        artifacts.load_trajectories(tmp_path / "x.safetensors", expect={"env": "tsm/ReacherPush-v1"})
+    with pytest.raises(
+        StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/ReacherPush-v1'"
+    ):
+        artifacts.load_trajectories(
+            tmp_path / "x.safetensors", expect={"env": "tsm/ReacherPush-v1"}
+        )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -331,7 +375,9 @@ def test_numbers_that_json_does_not_have_are_spelled_and_read_again() -> None:
         "n": 3,
         "none": None,
     }
-    again = files.decode_nonfinite(files.loads(json.dumps(files.encode_nonfinite(given), allow_nan=False)))
+    again = files.decode_nonfinite(
+        files.loads(json.dumps(files.encode_nonfinite(given), allow_nan=False))
+    )
     assert again.keys() == given.keys()
     assert str(again) == str({**given, "curve": [[1.5, -math.inf], [math.nan]]})
 
@@ -363,7 +409,10 @@ def test_a_compressed_table_is_the_same_table_and_the_same_bytes_at_any_time(
 def test_a_table_ships_in_one_form_alone_whichever_its_size_asks_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, rows = tmp_path / "t.csv", [{"metric": "success", "value": 0.1, "seed": seed} for seed in range(50)]
+    path, rows = (
+        tmp_path / "t.csv",
+        [{"metric": "success", "value": 0.1, "seed": seed} for seed in range(50)],
+    )
     for large, name in ((100, "t.csv.gz"), (10_000, "t.csv"), (100, "t.csv.gz")):
         monkeypatch.setattr(tables, "LARGE", large)
         assert tables.ship(path, rows).equals(tables.load(path))
@@ -405,7 +454,12 @@ def test_a_table_with_a_wrong_column_or_number_is_refused(tmp_path: Path) -> Non
 
 
 def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
-    for text in ("", "a,b\n1,2\n", ",".join(tables.COLUMNS) + "\n1,2\n", ",".join(tables.COLUMNS) + '\n"1'):
+    for text in (
+        "",
+        "a,b\n1,2\n",
+        ",".join(tables.COLUMNS) + "\n1,2\n",
+        ",".join(tables.COLUMNS) + '\n"1',
+    ):
         (tmp_path / "t.csv").write_text(text)
         with pytest.raises(StoreError, match=r"t\.csv"):
             tables.records(tables.load(tmp_path / "t.csv"))
@@ -424,7 +478,9 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(saved: Path) -> None:
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        with pytest.raises(StoreError, match=r"cannot write .*thing\.safetensors \(\d+ bytes\): File too large"):
+        with pytest.raises(
+            StoreError, match=r"cannot write .*thing\.safetensors \(\d+ bytes\): File too large"
+        ):
             artifacts.save(saved, {"a": torch.zeros(10_000)}, kind="thing", header={})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -434,7 +490,9 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(saved: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    "fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+)
 def test_a_fault_while_writing_leaves_the_old_file_and_nothing_else(
     saved: Path, monkeypatch: pytest.MonkeyPatch, call: str, fault: BaseException
 ) -> None:
@@ -452,7 +510,9 @@ def test_a_fault_while_writing_leaves_the_old_file_and_nothing_else(
     assert only(saved.parent) == [saved.name]
 
 
-def test_threads_that_write_one_file_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_that_write_one_file_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, both, replace = tmp_path / "x.json", threading.Barrier(2, timeout=30), os.replace
 
     def together(source: Path, target: Path) -> None:
@@ -467,18 +527,24 @@ def test_threads_that_write_one_file_do_not_mix(tmp_path: Path, monkeypatch: pyt
     assert os.listdir(tmp_path) == ["x.json"]
 
 
-def test_data_reaches_the_disk_before_its_name_does(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_reaches_the_disk_before_its_name_does(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[str] = []
     for name in ("fsync", "replace"):
         real = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a))[1])
+        monkeypatch.setattr(
+            os, name, lambda *a, name=name, real=real: (calls.append(name), real(*a))[1]
+        )
     artifacts.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
     assert calls == ["fsync", "replace", "fsync"]
 
 
 def test_an_unwritable_folder_is_one_clear_message(saved: Path) -> None:
     with pytest.raises(StoreError, match="cannot write .*TSM_RUN_DIR"):
-        artifacts.save(saved / "inside" / "x.safetensors", {"a": torch.ones(1)}, kind="thing", header={})
+        artifacts.save(
+            saved / "inside" / "x.safetensors", {"a": torch.ones(1)}, kind="thing", header={}
+        )
     with pytest.raises(StoreError, match="cannot write"):
         manifest_storage.write_json("/proc/nowhere/x.json", {})
 
@@ -488,11 +554,16 @@ def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
     if child == 0:
         os._exit(0)
     os.waitpid(child, 0)
-    left, elsewhere = (f".{saved.name}.tmp-{host}-{child}" for host in (socket.gethostname(), "another"))
+    left, elsewhere = (
+        f".{saved.name}.tmp-{host}-{child}" for host in (socket.gethostname(), "another")
+    )
     for name in (left, elsewhere):
         saved.with_name(name).write_bytes(b"half")
     artifacts.save(saved, {"a": torch.zeros(3)}, kind="thing", header={})
-    assert sorted(only(saved.parent)) == [elsewhere, saved.name]  # whether that one goes on, nobody here knows
+    assert sorted(only(saved.parent)) == [
+        elsewhere,
+        saved.name,
+    ]  # whether that one goes on, nobody here knows
 
 
 # Verification --------------------------------------------------------------------------------------------------------
@@ -501,8 +572,13 @@ def test_leftovers_of_a_killed_writer_are_removed(saved: Path) -> None:
 def test_verify_follows_an_artefact_to_what_it_was_made_from(tmp_path: Path) -> None:
     data, model = tmp_path / "data.safetensors", tmp_path / "models" / "m.safetensors"
     artifacts.save_trajectories(data, some_trajectories())
-    artifacts.save_model(model, Line(inputs=3), {"inputs": {"../data.safetensors": manifest_storage.sha256(data)}})
-    assert {path.name for path in manifest_storage.verify(model)} == {"m.safetensors", "data.safetensors"}
+    artifacts.save_model(
+        model, Line(inputs=3), {"inputs": {"../data.safetensors": manifest_storage.sha256(data)}}
+    )
+    assert {path.name for path in manifest_storage.verify(model)} == {
+        "m.safetensors",
+        "data.safetensors",
+    }
     artifacts.save_trajectories(data, some_trajectories(n=4))
     with pytest.raises(StoreError, match="data.safetensors is damaged, or was changed"):
         manifest_storage.verify(model)
@@ -536,7 +612,9 @@ def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> No
     table.write_text(table.read_text().replace("0.5", "0.9"))
     with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed"):
         manifest_storage.verify(tmp_path)
-    with pytest.raises(StoreError, match="05_control.csv is damaged, or was changed after its run was complete"):
+    with pytest.raises(
+        StoreError, match="05_control.csv is damaged, or was changed after its run was complete"
+    ):
         tables.records(tables.load(table))
     with pytest.raises(RunError, match="python -m tsmlib run control --scale smoke --seed 0"):
         require(run, "05_control")
@@ -544,7 +622,9 @@ def test_verify_and_load_know_the_tables_of_a_complete_run(tmp_path: Path) -> No
         require(run, "02_train")
 
 
-def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_the_first_format_is_held_to_what_it_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "m.safetensors"
     expect = {**FINGERPRINT, "noise": 0.0}
     artifacts.save_model(path, Line(inputs=3), {"fingerprint": FINGERPRINT})
@@ -561,7 +641,9 @@ def test_a_file_of_the_first_format_is_held_to_what_it_states(tmp_path: Path, mo
 def test_an_artefact_states_what_made_it(saved: Path) -> None:
     with safetensors.safe_open(saved, "np") as file:
         found = json.loads(file.metadata()["tsmlib"])["provenance"]
-    assert found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
+    assert (
+        found["torch"] == torch.__version__.partition("+")[0] or found["torch"] == torch.__version__
+    )
     assert found["threads"] == torch.get_num_threads()
     assert {"code", "commit", "cpu", "mujoco", "numpy"} <= set(found)
 
@@ -627,13 +709,17 @@ def test_a_lock_of_one_part_leaves_the_others_alone_and_may_be_waited_for(
     with files.writer_lock(tmp_path, "a test", name="two"):
         pass
     with files.writer_lock(tmp_path, "a test", name="one", wait=True):
-        assert f"waiting for pid {child} on {socket.gethostname()}, a child" in capsys.readouterr().err
+        assert (
+            f"waiting for pid {child} on {socket.gethostname()}, a child" in capsys.readouterr().err
+        )
     os.waitpid(child, 0)
 
 
 def test_a_manifest_cannot_point_outside_its_folder(tmp_path: Path) -> None:
     entries = {"../../etc/passwd": {"bytes": 1, "sha256": "0" * 64}}
-    manifest_storage.write_json(tmp_path / files.MANIFEST, manifest_storage.sealed({"files": entries}))
+    manifest_storage.write_json(
+        tmp_path / files.MANIFEST, manifest_storage.sealed({"files": entries})
+    )
     with pytest.raises(StoreError, match="outside its own folder"):
         manifest_storage.verify(tmp_path)
 

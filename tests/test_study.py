@@ -23,10 +23,10 @@ from tsmlib.planning.predictors import expected_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import StoreError
-from tsmlib.study import runs
-from tsmlib.study import tasks as study_tasks
-from tsmlib.study.parameters import ParameterError
-from tsmlib.study.runs import Run
+from reproduction import runs
+from reproduction import tasks as study_tasks
+from reproduction.parameters import ParameterError
+from reproduction.runs import Run
 
 REACHER = "tsm/Reacher-v0"
 
@@ -65,7 +65,9 @@ def test_data_are_collected_once(made: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert (len(data), data.horizon, data.env) == (20, 100, REACHER)
 
 
-def test_data_are_a_function_of_the_seed_and_held_out_data_of_none(made: Run, tmp_path: Path) -> None:
+def test_data_are_a_function_of_the_seed_and_held_out_data_of_none(
+    made: Run, tmp_path: Path
+) -> None:
     again, other = (new_run(tmp_path, seed=seed) for seed in (1, 2))
     for split in study.SPLITS:
         first, second, third = (study.dataset(run, REACHER, split) for run in (made, again, other))
@@ -79,16 +81,22 @@ def test_data_are_a_function_of_the_seed_and_held_out_data_of_none(made: Run, tm
 
 @pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
 @pytest.mark.parametrize("split", study.SPLITS)
-def test_data_of_an_imperfect_arm_are_the_plain_arms_episodes(made: Run, how: dict[str, Any], split: str) -> None:
+def test_data_of_an_imperfect_arm_are_the_plain_arms_episodes(
+    made: Run, how: dict[str, Any], split: str
+) -> None:
     env = imperfect(REACHER, **how)
     plain, data = study.dataset(made, REACHER, split), study.dataset(made, env, split)
     assert data.env == env
     np.testing.assert_array_equal(data.actions, plain.actions)
     if "noise" in how:
         assert (data.states != plain.states).all()
-        assert np.corrcoef(data.states[..., 4].ravel(), plain.states[..., 4].ravel())[0, 1] > 0.8  # of the same motion
+        assert (
+            np.corrcoef(data.states[..., 4].ravel(), plain.states[..., 4].ravel())[0, 1] > 0.8
+        )  # of the same motion
     else:
-        np.testing.assert_array_equal(data.states[:, : DELAY + 1, :2].std(1) < 0.2, True)  # nothing pushes yet
+        np.testing.assert_array_equal(
+            data.states[:, : DELAY + 1, :2].std(1) < 0.2, True
+        )  # nothing pushes yet
         assert (data.states[:, 0] == plain.states[:, 0]).all()
 
 
@@ -102,11 +110,15 @@ def test_the_papers_sizes() -> None:
 # Models --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_trained_model_is_found_again_with_the_same_weights(made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trained_model_is_found_again_with_the_same_weights(
+    made: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(study.models, "fit", no_training)
     (model, header), (again, _) = (study.load_or_train(made, REACHER, "tsm") for _ in range(2))
     assert isinstance(model, TSM)
-    assert all(torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(model.parameters(), again.parameters(), strict=True)
+    )
     assert header["fingerprint"]["env"] == REACHER
     assert list(header["curves"]) == ["teacher_forced_loss", "loss"]
     assert header["seconds"] > 0
@@ -115,11 +127,17 @@ def test_a_trained_model_is_found_again_with_the_same_weights(made: Run, monkeyp
 
 
 def test_nothing_but_models_is_left_behind(made: Run) -> None:
-    assert sorted(p.name for p in (made.models / "Reacher").iterdir()) == ["prior.safetensors", "tsm.safetensors"]
+    assert sorted(p.name for p in (made.models / "Reacher").iterdir()) == [
+        "prior.safetensors",
+        "tsm.safetensors",
+    ]
 
 
 def test_a_model_knows_the_scale_of_its_data(made: Run) -> None:
-    data, (model, _) = study.dataset(made, REACHER, "train"), study.load_or_train(made, REACHER, "tsm")
+    data, (model, _) = (
+        study.dataset(made, REACHER, "train"),
+        study.load_or_train(made, REACHER, "tsm"),
+    )
     seen = model.features(torch.from_numpy(data.states)).flatten(0, 1)
     torch.testing.assert_close(seen.std(0), torch.ones(8), rtol=0.01, atol=0.01)
     torch.testing.assert_close(seen.mean(0), torch.zeros(8), rtol=0, atol=0.01)
@@ -130,7 +148,9 @@ def test_models_with_contacts_are_wider(env: str) -> None:
     run = runs.resolve("02_train", scale="smoke")
     config = study.initialise(run, "tsm", study.random_data(env, 2, seed=0, horizon=10)).config()
     wide = "Push" in env
-    assert (config["channels"], config["head_channels"]) == ((64, 128) if wide else (32, 0))  # appendix A.1
+    assert (config["channels"], config["head_channels"]) == (
+        (64, 128) if wide else (32, 0)
+    )  # appendix A.1
     assert (config["segment_len"], config["latent_dim"]) == (10, 8)  # section 5.1
 
 
@@ -142,12 +162,18 @@ def test_an_imperfect_arm_is_trained_as_long_as_the_plain_one_and_shares_its_pri
     for env in (imperfect(REACHER, noise=0.1), imperfect(REACHER, delay=DELAY)):
         for scale in ("smoke", "paper"):
             run = runs.resolve("02_train", scale=scale)
-            assert study.models.schedule(run, env, "tsm") == study.models.schedule(run, REACHER, "tsm")
+            assert study.models.schedule(run, env, "tsm") == study.models.schedule(
+                run, REACHER, "tsm"
+            )
         shared, _ = study.load_or_train(made, env, "prior")
-        assert all(torch.equal(a, b) for a, b in zip(prior.parameters(), shared.parameters(), strict=True))
+        assert all(
+            torch.equal(a, b) for a, b in zip(prior.parameters(), shared.parameters(), strict=True)
+        )
 
 
-def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_training_continues(
+    run: Run, made: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = run.models / "Reacher" / "prior.safetensors"
     path.unlink()
     fit = study.models.fit
@@ -163,7 +189,9 @@ def test_an_interrupted_training_continues(run: Run, made: Run, monkeypatch: pyt
     monkeypatch.setattr(study.models, "fit", fit)
     again, _ = study.load_or_train(run, REACHER, "prior")
     whole, _ = study.load_or_train(made, REACHER, "prior")
-    assert all(torch.equal(a, b) for a, b in zip(again.parameters(), whole.parameters(), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(again.parameters(), whole.parameters(), strict=True)
+    )
     assert [p.name for p in path.parent.glob("prior*")] == ["prior.safetensors"]
 
 
@@ -197,17 +225,23 @@ def test_trials_of_several_tasks_and_methods_are_made_in_one_call(made: Run) -> 
     found = study.trials(made, [some_task()], methods)
     assert list(found) == [REACHER]
     assert list(found[REACHER]) == methods["reach"]
-    assert torch.equal(found[REACHER][LATENT].actions, study.plan(made, some_task(), LATENT).actions)
+    assert torch.equal(
+        found[REACHER][LATENT].actions, study.plan(made, some_task(), LATENT).actions
+    )
     assert (found[REACHER][study.method("zero")].actions == 0).all()
 
 
 def test_the_oracles_executed_return_is_the_predicted_one(run: Run) -> None:
     trial = study.trial(run, some_task(), study.method("oracle", "direct", "cem"))
     assert trial.plan is not None
-    torch.testing.assert_close(trial.plan.predicted_return, trial.executed_return, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        trial.plan.predicted_return, trial.executed_return, rtol=1e-4, atol=1e-4
+    )
 
 
-def test_a_plan_is_kept_for_its_task_and_models_alone(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_is_kept_for_its_task_and_models_alone(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = study.plan(run, some_task(), LATENT)
     before = stored(run)
     again = study.plan(run, some_task(), LATENT)
@@ -215,7 +249,9 @@ def test_a_plan_is_kept_for_its_task_and_models_alone(run: Run, monkeypatch: pyt
     assert again.seconds == first.seconds
     assert stored(run) == before
     study.plan(run, some_task(3), LATENT)  # other targets
-    assert study.plan(run, some_task(), LATENT, iterations=1).seconds != first.seconds  # another budget
+    assert (
+        study.plan(run, some_task(), LATENT, iterations=1).seconds != first.seconds
+    )  # another budget
     second = study.plan(run, some_task(), LATENT)  # of three targets, the first two
     monkeypatch.setattr(study.plans, "VERSION", study.plans.VERSION + 1)
     third = study.plan(run, some_task(), LATENT)  # another planner by the same name
@@ -235,7 +271,9 @@ def test_a_task_with_a_reward_of_its_own_is_planned_for_each_time(made: Run) -> 
     plain = study.plan(made, some_task(), LATENT)
     before = stored(made)
     for height in (0.1, -0.1):
-        own = some_task().with_reward("reach", lambda states, actions, h=height: -(states[..., 5] - h).abs())
+        own = some_task().with_reward(
+            "reach", lambda states, actions, h=height: -(states[..., 5] - h).abs()
+        )
         plan = study.plan(made, own, LATENT)
         assert not torch.equal(plan.predicted_return, plain.predicted_return)
         torch.testing.assert_close(study.trial(made, own, LATENT).actions, plan.actions)
@@ -285,7 +323,9 @@ def test_at_laptop_the_oracles_plans_are_the_shipped_ones_if_they_are_of_this_ve
     assert stored(asked)
 
 
-def test_plans_judged_by_other_samples_are_made_again(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plans_judged_by_other_samples_are_made_again(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = study.plan(run, some_task(), LATENT)
     monkeypatch.setattr(study.plans, "JUDGING", 2)
     second = study.plan(run, some_task(), LATENT)
@@ -293,7 +333,10 @@ def test_plans_judged_by_other_samples_are_made_again(run: Run, monkeypatch: pyt
 
 
 def test_a_plan_is_chosen_by_mode_and_samples(made: Run) -> None:
-    plan, net = study.plan(made, some_task(), LATENT), study.load_or_train(made, some_task().env, LATENT.model).model
+    plan, net = (
+        study.plan(made, some_task(), LATENT),
+        study.load_or_train(made, some_task().env, LATENT.model).model,
+    )
     judge = expected_predictor(net, some_task().past(net.past_len), seed=made.seed)
     judged = expected_return(judge(plan.actions[None]), plan.actions[None], some_task().reward)[0]
     torch.testing.assert_close(judged, plan.curve[-1], rtol=1e-4, atol=1e-4)
@@ -311,7 +354,9 @@ def test_a_film_shows_the_mode_of_a_plan(made: Run) -> None:
     assert torch.equal(seen.plan.predicted_return, trial.plan.predicted_return)
 
 
-def test_the_return_is_not_predicted_with_the_samples_that_the_planner_searched_with(made: Run) -> None:
+def test_the_return_is_not_predicted_with_the_samples_that_the_planner_searched_with(
+    made: Run,
+) -> None:
     plan = study.plan(made, some_task(), LATENT)
     assert not torch.equal(plan.predicted_return, plan.curve[-1])
 
@@ -323,7 +368,9 @@ def test_an_unknown_method_is_refused_before_anything_is_trained(
     tmp_path: Path, bad: tuple[str, str, str, int]
 ) -> None:
     *words, iterations = bad
-    with pytest.raises(ValueError, match="expected adam, adam\\+starts, cem or mppi, latent or direct, and 0"):
+    with pytest.raises(
+        ValueError, match="expected adam, adam\\+starts, cem or mppi, latent or direct, and 0"
+    ):
         study.plan(new_run(tmp_path), some_task(), study.method(*words), iterations=iterations)
     assert not any(tmp_path.iterdir())
 
@@ -339,9 +386,15 @@ def flipped(data: bytes) -> bytes:
     return data[:-9] + bytes([data[-9] ^ 1]) + data[-8:]
 
 
-@pytest.mark.parametrize("damage", [cut, flipped, lambda data: b""], ids=["cut", "flipped bit", "empty"])
-@pytest.mark.parametrize("what", ["models/Reacher/tsm", "models/Reacher/prior", "data/Reacher/train"])
-def test_a_damaged_file_is_named_and_left_alone(run: Run, what: str, damage: Callable[[bytes], bytes]) -> None:
+@pytest.mark.parametrize(
+    "damage", [cut, flipped, lambda data: b""], ids=["cut", "flipped bit", "empty"]
+)
+@pytest.mark.parametrize(
+    "what", ["models/Reacher/tsm", "models/Reacher/prior", "data/Reacher/train"]
+)
+def test_a_damaged_file_is_named_and_left_alone(
+    run: Run, what: str, damage: Callable[[bytes], bytes]
+) -> None:
     path = run.dir / f"{what}.safetensors"
     path.write_bytes(damaged := damage(path.read_bytes()))
     with pytest.raises(StoreError, match=rf"{path.name} is damaged.*(Delete it and|Restore)"):
@@ -356,15 +409,22 @@ def test_a_model_of_another_environment_is_refused_naming_both(run: Run) -> None
     there = run.folder("models/PymunkReacher") / "tsm.safetensors"
     shutil.copy(run.models / "Reacher" / "tsm.safetensors", there)
     before = there.read_bytes()
-    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"):
+    with pytest.raises(
+        StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"
+    ):
         study.load_or_train(run, "tsm/PymunkReacher-v0", "tsm")
     assert there.read_bytes() == before
 
 
 @pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
-def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place(run: Run, how: dict[str, Any]) -> None:
+def test_models_of_a_plain_and_of_an_imperfect_arm_do_not_take_each_others_place(
+    run: Run, how: dict[str, Any]
+) -> None:
     env = imperfect(REACHER, **how)
-    (model, header), there = study.load_or_train(run, REACHER, "tsm"), run.models / "Reacher" / "tsm.safetensors"
+    (model, header), there = (
+        study.load_or_train(run, REACHER, "tsm"),
+        run.models / "Reacher" / "tsm.safetensors",
+    )
     other = run.folder(f"models/{EnvSpec.parse(env).name}") / "tsm.safetensors"
     shutil.copy(there, other)
     with pytest.raises(StoreError, match=f"env is '{REACHER}' in the file, expected '{env}'"):
@@ -393,14 +453,18 @@ def test_data_of_version_0_are_refused_with_the_command_that_makes_new_ones(run:
     there = run.folder("data/ReacherPush") / "train.safetensors"
     old = replace(study.random_data(V1, 2, seed=0), env=V0)
     artifacts.save_trajectories(there, old, {"fingerprint": {**fingerprint(V1), "env": V0}})
-    with pytest.raises(StoreError, match=rf"train.safetensors does not fit: {GONE}python -m tsmlib run collect"):
+    with pytest.raises(
+        StoreError, match=rf"train.safetensors does not fit: {GONE}python -m tsmlib run collect"
+    ):
         study.dataset(run, V1, "train")
 
 
 def test_a_model_of_version_0_is_refused_with_the_command_that_makes_a_new_one(run: Run) -> None:
     there = run.folder("models/ReacherPush") / "onestep.safetensors"
     net = study.initialise(run, "onestep", study.random_data(V1, 2, seed=0))
-    artifacts.save_model(there, net, {"model": "onestep", "fingerprint": {"env": V0}, "schedule": []})
+    artifacts.save_model(
+        there, net, {"model": "onestep", "fingerprint": {"env": V0}, "schedule": []}
+    )
     command = rf"python -m tsmlib run train -p env={V1} -p models=onestep"
     with pytest.raises(StoreError, match=rf"onestep.safetensors does not fit: {GONE}{command}"):
         study.load_or_train(run, V1, "onestep")
@@ -411,7 +475,10 @@ def test_a_task_of_version_0_is_refused_with_the_command_that_makes_a_new_one(
 ) -> None:
     task, path = study.load_task(V1), tmp_path / "ReacherPush.safetensors"
     monkeypatch.setattr(study_tasks, "FROZEN", tmp_path)
-    for env, message in ((V0, f"{GONE}python benchmarks/settings/freeze_tasks.py"), (REACHER, f"env is '{REACHER}'")):
+    for env, message in (
+        (V0, f"{GONE}python benchmarks/settings/freeze_tasks.py"),
+        (REACHER, f"env is '{REACHER}'"),
+    ):
         arrays = {"start": task.start, "target": task.target}
         artifacts.save(path, arrays, kind="task", header={"task": "push", "env": env, "seed": 0})
         with pytest.raises(StoreError, match=message):
@@ -426,13 +493,13 @@ def test_a_model_in_the_place_of_another_is_refused(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("scale", "seed"), [("smoke", 5), ("paper", 1)])
-def test_a_model_of_another_seed_or_scale_is_refused_naming_both(run: Run, scale: str, seed: int) -> None:
+def test_a_model_of_another_seed_or_scale_is_refused_naming_both(
+    run: Run, scale: str, seed: int
+) -> None:
     other = runs.resolve("05_control", scale=scale, seed=seed, run_dir=str(run.dir.parents[1]))
     there = other.folder("models/Reacher") / "tsm.safetensors"
     shutil.copy(run.models / "Reacher" / "tsm.safetensors", there)
-    said = (
-        f"{there} was trained with seed 1 at scale smoke, expected seed {seed} at scale {scale}. Move it .* delete it"
-    )
+    said = f"{there} was trained with seed 1 at scale smoke, expected seed {seed} at scale {scale}. Move it .* delete it"
     with pytest.raises(StoreError, match=said):
         study.load_or_train(other, REACHER, "tsm")
 
@@ -446,14 +513,17 @@ def test_shipped_models_are_those_of_scale_laptop_and_seed_0_whatever_scale_they
 
 
 @pytest.mark.parametrize(("taken", "seed"), [("train", 5), ("test", 1)])
-def test_training_data_of_another_seed_or_split_are_refused_naming_both(run: Run, taken: str, seed: int) -> None:
+def test_training_data_of_another_seed_or_split_are_refused_naming_both(
+    run: Run, taken: str, seed: int
+) -> None:
     other = new_run(run.dir.parents[1], seed=seed)
     drawn = study.data.HELD_OUT_SEED.get(taken, run.seed)
     study.dataset(run, REACHER, taken)
     there = other.folder("data/Reacher") / "train.safetensors"
     shutil.copy(run.data / "Reacher" / f"{taken}.safetensors", there)
     with pytest.raises(
-        StoreError, match=f"holds split '{taken}' drawn with seed {drawn}, expected 'train' with seed {seed}"
+        StoreError,
+        match=f"holds split '{taken}' drawn with seed {drawn}, expected 'train' with seed {seed}",
     ):
         study.dataset(other, REACHER, "train")
 
@@ -461,7 +531,9 @@ def test_training_data_of_another_seed_or_split_are_refused_naming_both(run: Run
 def test_data_of_another_environment_are_refused(run: Run) -> None:
     there = run.folder("data/PymunkReacher") / "train.safetensors"
     shutil.copy(run.data / "Reacher" / "train.safetensors", there)
-    with pytest.raises(StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"):
+    with pytest.raises(
+        StoreError, match="env is 'tsm/Reacher-v0' in the file, expected 'tsm/PymunkReacher-v0'"
+    ):
         study.dataset(run, "tsm/PymunkReacher-v0", "train")
 
 
@@ -475,7 +547,9 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(
     monkeypatch.setattr(study.models, "fit", no_training)
     with pytest.raises(ParameterError, match=r"cannot make the folder .*data/Reacher.*TSM_RUN_DIR"):
         study.dataset(run, REACHER, "train")
-    with pytest.raises(ParameterError, match=r"cannot make the folder .*models/Reacher.*TSM_RUN_DIR"):
+    with pytest.raises(
+        ParameterError, match=r"cannot make the folder .*models/Reacher.*TSM_RUN_DIR"
+    ):
         study.load_or_train(run, REACHER, "tsm")
 
 
@@ -489,7 +563,10 @@ def test_a_number_of_episodes_that_is_not_positive_is_refused(n: int) -> None:
 
 @pytest.mark.parametrize("horizon", [0, -3])
 def test_episodes_without_steps_are_refused(horizon: int) -> None:
-    with pytest.raises(ValueError, match=rf"horizon is {horizon}, expected a positive number of episodes and of steps"):
+    with pytest.raises(
+        ValueError,
+        match=rf"horizon is {horizon}, expected a positive number of episodes and of steps",
+    ):
         study.random_data(REACHER, 2, seed=0, horizon=horizon)
 
 
@@ -520,7 +597,8 @@ def test_planners_refuse_sizes_that_make_no_sense() -> None:
 @pytest.mark.parametrize("text", ["tsm/Nothing-v0", "", "tsm/Reacher-v0,,", "ALL"])
 def test_a_parameter_that_names_something_unknown_lists_what_there_is(text: str) -> None:
     with pytest.raises(
-        ParameterError, match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v1; or all"
+        ParameterError,
+        match="envs names .*, expected some of tsm/Reacher-v0, tsm/ReacherPush-v1; or all",
     ):
         study.parse_choice("envs", text, [REACHER, "tsm/ReacherPush-v1"])
     assert study.parse_choice("envs", f" {REACHER} ", [REACHER]) == [REACHER]

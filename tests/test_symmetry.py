@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tsmlib.envs.symmetry import COPIES, mirrored, symmetric, turned
-from tsmlib.study.data import random_data
+from reproduction.data import random_data
 
 PUSH = ("tsm/ReacherPush-v1", "tsm/PymunkPush-v1")
 
@@ -21,7 +21,9 @@ def test_what_a_turned_or_mirrored_arm_does_is_the_turned_or_mirrored_episode(en
     moved = np.abs(data.states[:, -1, 6:8] - data.states[:, 0, 6:8]).max(-1) > 0.01
     assert moved.sum() >= 6  # contacts are among them
     off = np.abs(found - copies.states[:, 1:])[..., [0, 1, 4, 5, 6, 7]].max((1, 2))
-    assert np.quantile(off, 0.9) < 1e-3  # m or rad; from rounded starts, and a collision multiplies what is off
+    assert (
+        np.quantile(off, 0.9) < 1e-3
+    )  # m or rad; from rounded starts, and a collision multiplies what is off
     assert np.median(off) < 1e-4
 
 

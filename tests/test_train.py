@@ -25,21 +25,38 @@ from tsmlib.storage import files
 from tsmlib.training import checkpoint as checkpoints
 from tsmlib.training.callbacks import Callback, CsvCallback, Progress, TensorBoardCallback
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
-from tsmlib.training.fit import TrainingHistory, TrainingOptions, fit, fixed_windows, optimizers, schedule
+from tsmlib.training.fit import (
+    TrainingHistory,
+    TrainingOptions,
+    fit,
+    fixed_windows,
+    optimizers,
+    schedule,
+)
 from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, initial_past
 
 H = 4
-SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3)
+SIZES: dict[str, Any] = dict(
+    past_len=H, future_len=H, steps=20, batch_size=8, validate_every=5, warmup=3
+)
 
 
 def episodes(n: int, seed: int) -> Trajectories:
     """States that drift with the actions and with some noise."""
     rng = np.random.default_rng(seed)
     actions = np.repeat(rng.uniform(-1, 1, (n, 6, 2)), 5, axis=1)
-    steps = 0.2 * actions @ np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.4]]) + 0.05 * rng.normal(size=(n, 30, 3))
+    steps = 0.2 * actions @ np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.4]]) + 0.05 * rng.normal(
+        size=(n, 30, 3)
+    )
     states = np.concatenate([np.zeros((n, 1, 3)), steps.cumsum(1)], 1)
     return Trajectories(
-        states.astype(np.float32), actions.astype(np.float32), "tsm/Made-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (0,)
+        states.astype(np.float32),
+        actions.astype(np.float32),
+        "tsm/Made-v0",
+        0.02,
+        ("a", "b", "c"),
+        ("m",) * 3,
+        (0,),
     )
 
 
@@ -55,18 +72,24 @@ def new_tsm(seed: int = 0, **given: float) -> TSM:
 
 def new_prior(seed: int = 0) -> ActionPrior:
     torch.manual_seed(seed)
-    return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(torch.from_numpy(TRAIN.actions))
+    return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(
+        torch.from_numpy(TRAIN.actions)
+    )
 
 
 def new_rtsm(seed: int = 0) -> RecurrentTSM:
     torch.manual_seed(seed)
-    model = RecurrentTSM(3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5)
+    model = RecurrentTSM(
+        3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5
+    )
     model.features.fit(torch.from_numpy(TRAIN.states))
     return model
 
 
 @pytest.mark.parametrize("made_for", [TSM, RecurrentTSM, OneStep, LSTM, Ensemble, ActionPrior])
-def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_decides(made_for: Any) -> None:
+def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_decides(
+    made_for: Any,
+) -> None:
     torch.manual_seed(5)
     one, later, other = (made_for.for_data(TRAIN, seed=seed) for seed in (0, 0, 1))
     assert torch.initial_seed() == 5  # the global generator is left alone
@@ -84,17 +107,28 @@ def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_d
 def test_a_clock_goes_on_and_the_statistics_of_all_else_are_as_without_it(dt: float) -> None:
     clock = np.broadcast_to(dt * np.arange(31)[:, None], (30, 31, 1)).astype(np.float32)
     timed = replace(
-        TRAIN, states=np.concatenate([TRAIN.states, clock], 2), names=("a", "b", "c", "time"), units=("",) * 4
+        TRAIN,
+        states=np.concatenate([TRAIN.states, clock], 2),
+        names=("a", "b", "c", "time"),
+        units=("",) * 4,
     )
     model, plain = OneStep.for_data(timed, hidden=8), OneStep.for_data(TRAIN, hidden=8)
     assert model.features.moving.all()
     assert torch.equal(model.features.step_std[:3], plain.features.step_std)
     torch.testing.assert_close(model.features.step_std[3], torch.tensor(dt), rtol=1e-3, atol=0)
-    fit(model, model.loss, timed, timed, TrainingOptions(1, 4, steps=60, batch_size=32, lr=1e-2, warmup=3))
+    fit(
+        model,
+        model.loss,
+        timed,
+        timed,
+        TrainingOptions(1, 4, steps=60, batch_size=32, lr=1e-2, warmup=3),
+    )
     states = torch.from_numpy(timed.states)
     past = initial_past(states[:, 0], 1, 2)
     reached = rollout(model, past, torch.from_numpy(timed.actions[:, :10]))[:, -1, 3].detach()
-    assert 7 * dt < float(reached.mean()) < 13 * dt, reached.mean() / dt  # it stood still, or ran away
+    assert 7 * dt < float(reached.mean()) < 13 * dt, (
+        reached.mean() / dt
+    )  # it stood still, or ran away
 
 
 def test_an_action_that_is_never_used_does_not_stop_the_training_of_the_prior() -> None:
@@ -106,8 +140,12 @@ def test_an_action_that_is_never_used_does_not_stop_the_training_of_the_prior() 
     assert math.isfinite(history.validation[-1])
 
 
-def train(model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any) -> TrainingHistory:
-    schedule = SIZES | {name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings}
+def train(
+    model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any
+) -> TrainingHistory:
+    schedule = SIZES | {
+        name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings
+    }
     return fit(model, loss or model.loss, TRAIN, HELD_OUT, TrainingOptions(**schedule), **settings)
 
 
@@ -195,7 +233,11 @@ def test_validation_uses_the_same_windows_every_time_from_all_over_the_data() ->
     first, second = (fixed_windows(HELD_OUT, H, H, n_windows=40) for _ in range(2))
     assert torch.equal(first.future.states, second.future.states)
     assert first.future.states.shape == (40, H, 3)
-    assert fixed_windows(HELD_OUT, H, H).future.states.shape == (5 * 27, H, 3)  # every window there is
+    assert fixed_windows(HELD_OUT, H, H).future.states.shape == (
+        5 * 27,
+        H,
+        3,
+    )  # every window there is
     assert torch.equal(first.past.states[0, 0], torch.from_numpy(HELD_OUT.states[0, 0]))
     assert torch.equal(first.future.states[-1, -1], torch.from_numpy(HELD_OUT.states[-1, -1]))
 
@@ -213,7 +255,9 @@ def test_the_learning_rate_warms_up_and_ends_at_its_final_value() -> None:
 def test_trainings_that_follow_each_other_share_one_schedule() -> None:
     whole = [schedule(step, 1000, 1e-3, 1e-5, 0) for step in range(1001)]
     first = [schedule(step, 600, 1e-3, 1e-5, 0, (0.0, 0.6)) for step in range(600)]
-    second = [schedule(step, 400, 1e-3, 1e-5, 50, (0.6, 1.0)) for step in range(401)]  # no second warm-up
+    second = [
+        schedule(step, 400, 1e-3, 1e-5, 50, (0.6, 1.0)) for step in range(401)
+    ]  # no second warm-up
     assert first + second == pytest.approx(whole)
     warm = [schedule(step, 600, 1e-3, 1e-5, 100, (0.0, 0.6)) for step in range(601)]
     assert warm[99] == warm[100] == pytest.approx(1e-3)
@@ -265,7 +309,10 @@ def test_without_muon_and_decay_it_is_adam() -> None:
 
 def test_muon_lowers_the_loss_and_leaves_adam_what_is_not_its_own() -> None:
     made = optimizers(new_tsm(), TrainingOptions(**SIZES, muon=0.02, weight_decay=0.1))
-    held = {name: [p for group in optimizer.param_groups for p in group["params"]] for name, optimizer in made.items()}
+    held = {
+        name: [p for group in optimizer.param_groups for p in group["params"]]
+        for name, optimizer in made.items()
+    }
     assert held.keys() == {"adam", "muon"}
     assert len(held["adam"]) + len(held["muon"]) == len(list(new_tsm().parameters()))
     assert min(p.ndim for p in held["muon"]) == 2
@@ -284,12 +331,19 @@ def interrupt(_: Tensor) -> Tensor:
     raise Interrupted
 
 
-GENERATIONS = {3: [], 6: ["000000005"], 13: ["000000005", "000000010"], 17: ["000000010", "000000015"]}
+GENERATIONS = {
+    3: [],
+    6: ["000000005"],
+    13: ["000000005", "000000010"],
+    17: ["000000010", "000000015"],
+}
 
 
 @pytest.mark.parametrize("new", [new_tsm, new_prior, new_rtsm])
 @pytest.mark.parametrize("at", GENERATIONS)
-@pytest.mark.parametrize("settings", [{}, {"muon": 0.02, "weight_decay": 0.1}, {"span": (0.6, 1.0)}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"muon": 0.02, "weight_decay": 0.1}, {"span": (0.6, 1.0)}], ids=str
+)
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     tmp_path: Path, new: Callable[..., Any], settings: dict[str, Any], at: int
 ) -> None:
@@ -301,10 +355,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert [path.stem for path in sorted(checkpoint.glob("*.safetensors"))] == GENERATIONS[at]
     counted = Faulty(resumed, 0, interrupt)
     curve = train(resumed, counted, checkpoint=checkpoint, **settings)
-    assert counted.calls == 20 - max(map(int, GENERATIONS[at]), default=0)  # what was done is not done again
+    assert counted.calls == 20 - max(
+        map(int, GENERATIONS[at]), default=0
+    )  # what was done is not done again
     assert same(weights(resumed), weights(whole))
-    assert (curve.step, curve.train, curve.validation) == (expected.step, expected.train, expected.validation)
-    assert asdict(train(again, checkpoint=checkpoint, **settings)) == asdict(curve)  # finished: nothing is left to do
+    assert (curve.step, curve.train, curve.validation) == (
+        expected.step,
+        expected.train,
+        expected.validation,
+    )
+    assert asdict(train(again, checkpoint=checkpoint, **settings)) == asdict(
+        curve
+    )  # finished: nothing is left to do
     assert same(weights(again), weights(whole))
 
 
@@ -312,7 +374,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
 
 
 def lines(path: Path) -> list[dict[str, float]]:
-    return [{name: float(text) for name, text in line.items()} for line in csv.DictReader(path.open(newline=""))]
+    return [
+        {name: float(text) for name, text in line.items()}
+        for line in csv.DictReader(path.open(newline=""))
+    ]
 
 
 def test_a_callback_sees_every_record_and_leaves_the_bits_alone() -> None:
@@ -325,14 +390,20 @@ def test_a_callback_sees_every_record_and_leaves_the_bits_alone() -> None:
     expected, curve = train(alone), train(watched, callback=watch)
     assert same(weights(watched), weights(alone))
     assert (curve.train, curve.validation) == (expected.train, expected.validation)
-    assert [(one.step, one.seconds) for one in seen] == list(zip(curve.step, curve.seconds, strict=True))
+    assert [(one.step, one.seconds) for one in seen] == list(
+        zip(curve.step, curve.seconds, strict=True)
+    )
     assert [one.values["train"] for one in seen] == curve.train
     assert [one.values["validation"] for one in seen] == curve.validation
 
 
 @pytest.mark.parametrize("at", [3, 6, 13])
 def test_a_resumed_training_has_every_step_once_in_its_table(tmp_path: Path, at: int) -> None:
-    table, model, checkpoint = CsvCallback(tmp_path / "logs" / "losses.csv"), new_tsm(), tmp_path / "run"
+    table, model, checkpoint = (
+        CsvCallback(tmp_path / "logs" / "losses.csv"),
+        new_tsm(),
+        tmp_path / "run",
+    )
     with pytest.raises(Interrupted):
         train(model, Faulty(model, at, interrupt), checkpoint=checkpoint, callback=table)
     curve = train(new_tsm(), checkpoint=checkpoint, callback=CsvCallback(table.path))
@@ -365,7 +436,10 @@ def test_a_record_made_again_takes_the_place_of_the_first(tmp_path: Path) -> Non
 
 def test_a_table_of_other_columns_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.csv").write_text("name,value\na,1\n")
-    with pytest.raises(files.StoreError, match=r"mine.csv has the columns name, value; expected step, seconds, train"):
+    with pytest.raises(
+        files.StoreError,
+        match=r"mine.csv has the columns name, value; expected step, seconds, train",
+    ):
         train(new_tsm(), callback=CsvCallback(tmp_path / "mine.csv"))
     assert (tmp_path / "mine.csv").read_text() == "name,value\na,1\n"
 
@@ -375,28 +449,36 @@ def test_tensorboard_shows_every_step_of_a_resumed_training_once(tmp_path: Path)
     board, checkpoint = TensorBoardCallback(tmp_path / "board"), tmp_path / "run"
 
     interrupted_after(board, checkpoint)
-    curve = train(new_tsm(), checkpoint=checkpoint, callback=TensorBoardCallback(tmp_path / "board"))
+    curve = train(
+        new_tsm(), checkpoint=checkpoint, callback=TensorBoardCallback(tmp_path / "board")
+    )
     shown = accumulator.EventAccumulator(str(tmp_path / "board")).Reload()
     assert set(shown.Tags()["scalars"]) == {"train", "validation", "seconds"}
     assert [event.step for event in shown.Scalars("validation")] == curve.step
     assert np.allclose([event.value for event in shown.Scalars("validation")], curve.validation)
 
 
-def test_without_tensorboard_its_callback_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_tensorboard_its_callback_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.delitem(sys.modules, "torch.utils.tensorboard", raising=False)
     with pytest.raises(ImportError, match=r'pip install "tsmlib\[tensorboard\]"'):
         TensorBoardCallback("board")
 
 
-def test_a_run_that_never_clips_goes_on_from_its_checkpoint_and_is_not_one_that_clips(tmp_path: Path) -> None:
+def test_a_run_that_never_clips_goes_on_from_its_checkpoint_and_is_not_one_that_clips(
+    tmp_path: Path,
+) -> None:
     whole, stopped, again = new_tsm(), new_tsm(), new_tsm()
     train(whole, clip=math.inf)
     with pytest.raises(Interrupted):
         train(stopped, Faulty(stopped, 13, interrupt), clip=math.inf, checkpoint=tmp_path / "run")
     train(again, clip=math.inf, checkpoint=tmp_path / "run")
     assert same(weights(again), weights(whole))
-    with pytest.raises(files.StoreError, match="another run: clip is 'inf' in the file, expected 1.0"):
+    with pytest.raises(
+        files.StoreError, match="another run: clip is 'inf' in the file, expected 1.0"
+    ):
         train(new_tsm(), checkpoint=tmp_path / "run")
 
 
@@ -422,21 +504,30 @@ def test_a_checkpoint_of_another_run_is_refused_naming_what_differs(
     content, model = folder_bytes(checkpoint), new_tsm()
     before = weights(model)
     with pytest.raises(
-        files.StoreError, match=f"run/.*safetensors is the checkpoint of another run: {message}. Delete"
+        files.StoreError,
+        match=f"run/.*safetensors is the checkpoint of another run: {message}. Delete",
     ):
         train(model, checkpoint=checkpoint, **other)
     assert folder_bytes(checkpoint) == content
     assert same(weights(model), before)
 
 
-@pytest.mark.parametrize(("other", "message"), [
-    (lambda: new_tsm(seed=7), "began with"), (lambda: new_tsm(beta=0.5), "configuration"),
-])  # fmt: skip
-def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path, other: Callable[[], TSM], message: str) -> None:
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (lambda: new_tsm(seed=7), "began with"),
+        (lambda: new_tsm(beta=0.5), "configuration"),
+    ],
+)
+def test_a_checkpoint_of_another_model_is_refused(
+    tmp_path: Path, other: Callable[[], TSM], message: str
+) -> None:
     train(new_tsm(), checkpoint=tmp_path / "run")
     model = other()
     before = weights(model)
-    with pytest.raises(files.StoreError, match=f"is the checkpoint of another run: .*{message} is "):
+    with pytest.raises(
+        files.StoreError, match=f"is the checkpoint of another run: .*{message} is "
+    ):
         train(model, checkpoint=tmp_path / "run")
     assert same(weights(model), before)
 
@@ -448,7 +539,9 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
 def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -> None:
     checkpoint, model = tmp_path / "run", new_tsm()
     train(model, checkpoint=checkpoint)
-    with pytest.raises(files.StoreError, match="loss is 'loss' in the file, expected 'teacher_forced_loss'"):
+    with pytest.raises(
+        files.StoreError, match="loss is 'loss' in the file, expected 'teacher_forced_loss'"
+    ):
         train(model, model.teacher_forced_loss, checkpoint=checkpoint)
     elsewhere = replace(TRAIN, env="tsm/Other-v0").take(slice(0, 20))
     with pytest.raises(
@@ -461,11 +554,17 @@ def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -
 def test_an_older_checkpoint_with_weights_of_another_shape_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoints, "_differences", lambda stated, identity: [])  # it says nothing of its model
-    folder, wider = tmp_path / "run", TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2))
+    monkeypatch.setattr(
+        checkpoints, "_differences", lambda stated, identity: []
+    )  # it says nothing of its model
+    folder, wider = (
+        tmp_path / "run",
+        TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2)),
+    )
     train(new_tsm(), checkpoint=folder)
     with pytest.raises(
-        files.StoreError, match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew"
+        files.StoreError,
+        match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew",
     ):
         train(wider, checkpoint=folder)
 
@@ -483,7 +582,9 @@ def test_the_first_loss_that_is_not_finite_stops_training_and_keeps_the_best_wei
     found = load_generation(tmp_path / "kept")
     assert found is not None
     _, tensors, header = found
-    best = {name.removeprefix("best."): t for name, t in tensors.items() if name.startswith("best.")}
+    best = {
+        name.removeprefix("best."): t for name, t in tensors.items() if name.startswith("best.")
+    }
     faulty, kept_step = Faulty(model, 14, lambda loss: loss * value), header["best_step"]
     message = rf"training loss became {value} at step 13 of 20; the weights of step {kept_step} are kept.*smaller lr"
     with pytest.raises(TrainingStopped, match=message):
@@ -496,7 +597,10 @@ def test_the_first_loss_that_is_not_finite_stops_training_and_keeps_the_best_wei
 def test_a_gradient_that_is_not_finite_never_reaches_the_weights(tmp_path: Path, at: int) -> None:
     model, checkpoint = new_tsm(), tmp_path / "run"
     first = next(model.parameters())
-    with pytest.raises(TrainingStopped, match=f"the gradient became nan at step {at - 1} of 20; the weights of step"):
+    with pytest.raises(
+        TrainingStopped,
+        match=f"the gradient became nan at step {at - 1} of 20; the weights of step",
+    ):
         train(model, Faulty(model, at, lambda loss: loss + _cliff(first)), checkpoint=checkpoint)
     assert all(torch.isfinite(p).all() for p in model.parameters())
     assert load_generation(checkpoint) is not None  # the last good one is still there
@@ -522,7 +626,10 @@ def test_numbers_that_are_not_positive_are_refused() -> None:
         ({"weight_decay": math.nan}, "weight_decay nan: expected zero or above"),
         ({"patience": -1}, "patience -1: expected zero or above"),
         ({"lr": 0.0}, "lr 0.0, lr_final 1e-05: expected lr above zero"),
-        ({"span": (0.6, 0.6)}, r"span \(0.6, 0.6\): expected two numbers from 0 to 1, the first below the second"),
+        (
+            {"span": (0.6, 0.6)},
+            r"span \(0.6, 0.6\): expected two numbers from 0 to 1, the first below the second",
+        ),
         ({"span": (0.0, 1.5)}, r"span \(0.0, 1.5\): expected two numbers from 0 to 1"),
     ],
 )
@@ -531,39 +638,61 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: st
         TrainingOptions(**{**SIZES, **settings})
 
 
-@pytest.mark.parametrize(("new", "future_len", "better"), [(new_tsm, 6, 4), (new_tsm, 3, 4), (new_prior, 6, 4)])
-def test_a_future_of_no_whole_number_of_segments_is_refused(new: Any, future_len: int, better: int) -> None:
+@pytest.mark.parametrize(
+    ("new", "future_len", "better"), [(new_tsm, 6, 4), (new_tsm, 3, 4), (new_prior, 6, 4)]
+)
+def test_a_future_of_no_whole_number_of_segments_is_refused(
+    new: Any, future_len: int, better: int
+) -> None:
     with pytest.raises(
-        ValueError, match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or"
+        ValueError,
+        match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or",
     ):
         train(new(), future_len=future_len)
 
 
 @pytest.mark.parametrize("past_len", [H - 1, H + 1])
 def test_windows_of_another_past_than_the_model_has_in_a_rollout_are_refused(past_len: int) -> None:
-    with pytest.raises(ValueError, match=rf"past_len is {past_len}, but TSM is given 4 .*past_len=model.past_len"):
+    with pytest.raises(
+        ValueError, match=rf"past_len is {past_len}, but TSM is given 4 .*past_len=model.past_len"
+    ):
         train(new_tsm(), past_len=past_len)
     with pytest.raises(ValueError, match=f"past_len is {past_len}, but ActionPrior is given 4"):
         train(new_prior(), past_len=past_len)
 
 
 def test_episodes_shorter_than_the_windows_are_refused() -> None:
-    with pytest.raises(TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"):
+    with pytest.raises(
+        TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"
+    ):
         train(new_tsm(), future_len=36)
 
 
-def test_a_model_that_knows_no_statistics_takes_those_of_its_training_data_and_until_then_does_not_predict() -> None:
+def test_a_model_that_knows_no_statistics_takes_those_of_its_training_data_and_until_then_does_not_predict() -> (
+    None
+):
     torch.manual_seed(0)
     model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
     past = initial_past(torch.from_numpy(HELD_OUT.states[:4, 0]), H, 2)
-    with pytest.raises(ValueError, match=r"features of this TSM were never fitted.*TSM\.for_data\(trajectories\)"):
+    with pytest.raises(
+        ValueError, match=r"features of this TSM were never fitted.*TSM\.for_data\(trajectories\)"
+    ):
         rollout(model, past, torch.zeros(4, H, 2))
-    fit(model, model.loss, TRAIN, HELD_OUT, TrainingOptions(past_len=H, future_len=H, steps=2, batch_size=4))
+    fit(
+        model,
+        model.loss,
+        TRAIN,
+        HELD_OUT,
+        TrainingOptions(past_len=H, future_len=H, steps=2, batch_size=4),
+    )
     found = TSM.for_data(TRAIN, segment_len=H, channels=8, dilations=(1, 2)).features.state_dict()
     torch.testing.assert_close(model.features.state_dict(), found)
     assert rollout(model, past, torch.zeros(4, H, 2)).isfinite().all()
 
 
 def test_actions_beyond_their_bounds_are_refused_with_what_to_do() -> None:
-    with pytest.raises(TrajectoryError, match=r"go up to 2; expected them within \[-1, 1\]. Divide them by the bound"):
+    with pytest.raises(
+        TrajectoryError,
+        match=r"go up to 2; expected them within \[-1, 1\]. Divide them by the bound",
+    ):
         replace(TRAIN, actions=np.full_like(TRAIN.actions, 2.0))

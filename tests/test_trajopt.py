@@ -63,13 +63,17 @@ class Cart:
     def loss(self, window: Window, generator: Noise) -> Tensor:
         raise NotImplementedError
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         position, velocity = past.states[:, -1].unbind(-1)
         states = []
         for u in actions.unbind(1):
             velocity = velocity + DT * u[:, 0]
             if generator is not None:
-                velocity = velocity + self.noise * standard_normal(velocity.shape, generator, velocity)
+                velocity = velocity + self.noise * standard_normal(
+                    velocity.shape, generator, velocity
+                )
             position = position + DT * velocity
             states.append(torch.stack([position, velocity], -1))
         return torch.stack(states, 1)
@@ -99,7 +103,9 @@ def optimum() -> tuple[Tensor, Tensor]:
         m = effect[:, b]
         best.append(torch.linalg.solve(m @ m.T + 0.3 * torch.eye(T), m @ (TARGET[b] - free[b])))
     forces = torch.stack(best)
-    assert forces.abs().max() < 0.95  # within the bounds, so that it is the optimum of the bounded problem too
+    assert (
+        forces.abs().max() < 0.95
+    )  # within the bounds, so that it is the optimum of the bounded problem too
     actions = forces[None, ..., None]
     return forces, expected_return(predict(actions), actions, reward)[0]
 
@@ -111,10 +117,16 @@ class Rough(DirectActions):
         return torch.randn(n, n_targets, *self.shape, generator=generator)
 
 
-def plan_by(planner: str, predict: Predictor, reward: Reward, iterations: int, **settings: Any) -> Plan:
+def plan_by(
+    planner: str, predict: Predictor, reward: Reward, iterations: int, **settings: Any
+) -> Plan:
     space, start = settings.pop("space", DirectActions(T, 1, rms=0.5)), settings.pop("start", B)
     plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner]
-    usual = {"adam": {"lr": 0.05}, "cem": {"candidates": 64, "elites": 8}, "mppi": {"candidates": 64}}[planner]
+    usual = {
+        "adam": {"lr": 0.05},
+        "cem": {"candidates": 64, "elites": 8},
+        "mppi": {"candidates": 64},
+    }[planner]
     return plan(predict, reward, space, start, iterations=iterations, **{**usual, **settings})  # type: ignore[operator]
 
 
@@ -126,16 +138,28 @@ def plan_by(planner: str, predict: Predictor, reward: Reward, iterations: int, *
     [
         ("adam", {"iterations": 100, "lr": 0.1}, 0.01),
         ("cem", {"iterations": 20, "space": Rough(T, 1, rms=0.5)}, 0.01),
-        ("cem", {"iterations": 10, "candidates": 256, "elites": 24}, 0.1),  # smooth noise finds no abrupt start
-        ("mppi", {"iterations": 40, "candidates": 128, "shrink": 0.9, "space": Rough(T, 1, rms=0.5)}, 0.01),
+        (
+            "cem",
+            {"iterations": 10, "candidates": 256, "elites": 24},
+            0.1,
+        ),  # smooth noise finds no abrupt start
+        (
+            "mppi",
+            {"iterations": 40, "candidates": 128, "shrink": 0.9, "space": Rough(T, 1, rms=0.5)},
+            0.01,
+        ),
         ("mppi", {"iterations": 20, "candidates": 256}, 0.1),
     ],
     ids=["adam", "cem", "cem, smooth", "mppi", "mppi, smooth"],
 )
-def test_the_planner_finds_the_known_optimum(planner: str, settings: dict[str, Any], missed: float) -> None:
+def test_the_planner_finds_the_known_optimum(
+    planner: str, settings: dict[str, Any], missed: float
+) -> None:
     forces, value = optimum()
     plan = plan_by(planner, predictor(), reward, **settings)
-    nothing = expected_return(predictor()(torch.zeros(1, B, T, 1)), torch.zeros(1, B, T, 1), reward)[0]
+    nothing = expected_return(
+        predictor()(torch.zeros(1, B, T, 1)), torch.zeros(1, B, T, 1), reward
+    )[0]
     assert (plan.predicted_return <= value + 1e-5).all()
     assert (value - plan.predicted_return < missed * (value - nothing)).all()
     if missed < 0.05:
@@ -160,16 +184,22 @@ def test_a_plan_returns_what_it_predicts(planner: str) -> None:
     assert plan.parameters.shape == (B, T, 1)
     assert plan.seconds > 0
     torch.testing.assert_close(space.decode(plan.parameters[None])[0], plan.actions)
-    torch.testing.assert_close(evaluate(predict, reward, space, plan.parameters[None])[0], plan.predicted_return)
+    torch.testing.assert_close(
+        evaluate(predict, reward, space, plan.parameters[None])[0], plan.predicted_return
+    )
     torch.testing.assert_close(plan.curve[-1], plan.predicted_return)
-    torch.testing.assert_close(reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted_return)
+    torch.testing.assert_close(
+        reward(plan.states, plan.actions).sum(-1).mean(0), plan.predicted_return
+    )
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_targets_are_planned_for_independently(planner: str) -> None:
     def greedy(states: Tensor, actions: Tensor) -> Tensor:
         """The first target's reward is as before; the others' is huge and means nothing."""
-        return torch.cat([reward(states, actions)[..., :1, :], 1e3 * reward(states, actions)[..., 1:, :]], -2)
+        return torch.cat(
+            [reward(states, actions)[..., :1, :], 1e3 * reward(states, actions)[..., 1:, :]], -2
+        )
 
     usual, odd = (plan_by(planner, predictor(), r, 8) for r in (reward, greedy))
     torch.testing.assert_close(usual.actions[0], odd.actions[0])
@@ -201,7 +231,9 @@ def test_sampled_starts_are_the_best_of_the_candidates() -> None:
     assert starts.shape == (4, B, T, 1)
     assert (returns.diff(dim=0) <= 0).all()
     drawn = space.scale * space.noise(100, B, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(evaluate(predictor(), reward, space, drawn).topk(4, dim=0).values, returns)
+    torch.testing.assert_close(
+        evaluate(predictor(), reward, space, drawn).topk(4, dim=0).values, returns
+    )
 
 
 @pytest.mark.parametrize("spoilt", [float("nan"), float("inf")])
@@ -218,7 +250,9 @@ def test_a_candidate_on_which_the_model_diverges_is_no_start(spoilt: float) -> N
 def test_a_large_evaluation_is_that_of_its_parts() -> None:
     space, predict = DirectActions(T, 1), predictor(0.1, 2)
     parameters = torch.randn(11, B, T, 1, generator=torch.Generator().manual_seed(0))
-    whole, parts = (evaluate(predict, reward, space, parameters, rows=rows) for rows in (6400, 2 * B))
+    whole, parts = (
+        evaluate(predict, reward, space, parameters, rows=rows) for rows in (6400, 2 * B)
+    )
     torch.testing.assert_close(whole, parts)
 
 
@@ -227,7 +261,9 @@ def test_a_model_that_diverges_on_everything_stops_the_planner(planner: str) -> 
     def diverging(actions: Tensor) -> Tensor:
         return predictor()(actions) / 0.0
 
-    with pytest.raises(FloatingPointError, match=r"no candidate for target 0 has a predicted return that is finite"):
+    with pytest.raises(
+        FloatingPointError, match=r"no candidate for target 0 has a predicted return that is finite"
+    ):
         plan_by(planner, diverging, reward, 2)
 
 
@@ -235,7 +271,11 @@ def test_planning_by_gradients_leaves_none_in_the_weights() -> None:
     model, prior = OneStep(2, 1, hidden=8), ActionPrior(1, channels=8)
     model.features.fit(torch.randn(4, 9, 2))
     predict = model_predictor(model, initial_past(START, model.past_len, 1))
-    assert adam(predict, reward, LatentActions(prior, T), B, iterations=2).actions.shape == (B, T, 1)
+    assert adam(predict, reward, LatentActions(prior, T), B, iterations=2).actions.shape == (
+        B,
+        T,
+        1,
+    )
     assert all(weight.grad is None for weight in (*model.parameters(), *prior.parameters()))
 
 
@@ -306,7 +346,9 @@ def test_a_plan_can_be_had_as_it_was_along_the_way(planner: str) -> None:
 
 
 def test_a_curve_is_nearly_done_when_it_has_95_of_100_of_its_gain() -> None:
-    curve = torch.tensor([[-10.0, -5.0, -1.0], [-2.0, -5.0, -1.0], [-0.4, -5.0, -1.0], [0.0, -5.0, 4.0]])
+    curve = torch.tensor(
+        [[-10.0, -5.0, -1.0], [-2.0, -5.0, -1.0], [-0.4, -5.0, -1.0], [0.0, -5.0, 4.0]]
+    )
     assert iterations_to(curve).tolist() == [2, 0, 3]
     assert iterations_to(curve, 0.5).tolist() == [1, 0, 3]
     late = torch.tensor([[-math.inf], [-5.0], [-3.0], [-1.0]])  # of a start without a finite return
@@ -331,10 +373,13 @@ def test_mppi_at_a_low_temperature_takes_the_best_candidate_and_at_a_high_one_th
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"candidates": 1}, {"iterations": 0}, {"temperature": 0.0}, {"shrink": 0.0}, {"shrink": 1.1}]
+    "wrong",
+    [{"candidates": 1}, {"iterations": 0}, {"temperature": 0.0}, {"shrink": 0.0}, {"shrink": 1.1}],
 )
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="expected 2 or more, 1 or more, above 0, and above 0 to 1"):
+    with pytest.raises(
+        ValueError, match="expected 2 or more, 1 or more, above 0, and above 0 to 1"
+    ):
         mppi(predictor(), reward, DirectActions(T, 1), B, **wrong)
 
 
@@ -351,13 +396,28 @@ def counted(asked: list[int], predict: Predictor) -> Predictor:
     return predicted
 
 
-def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_likes_best() -> None:
+def test_members_after_the_first_judge_only_the_share_of_the_candidates_that_it_likes_best() -> (
+    None
+):
     first, second = list[int](), list[int]()
     judge = EnsemblePredictor((counted(first, predictor()), counted(second, predictor())))
-    planned = {share: cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=2,
-                          screened=share) for share in (1.0, 0.25)}  # fmt: skip
+    planned = {
+        share: cem(
+            judge,
+            reward,
+            DirectActions(T, 1, rms=0.5),
+            B,
+            candidates=40,
+            elites=4,
+            iterations=2,
+            screened=share,
+        )
+        for share in (1.0, 0.25)
+    }
     assert (first.count(40), second.count(40), second.count(10)) == (4, 2, 2)
-    torch.testing.assert_close(planned[0.25].actions, planned[1.0].actions)  # since they are of one opinion
+    torch.testing.assert_close(
+        planned[0.25].actions, planned[1.0].actions
+    )  # since they are of one opinion
 
 
 def test_a_candidate_that_only_the_first_member_judged_is_never_an_elite() -> None:
@@ -373,37 +433,59 @@ def test_a_candidate_that_only_the_first_member_judged_is_never_an_elite() -> No
 
     space = Spread(1, 1, rms=0.3)
     judge = EnsemblePredictor((predict, predict))
-    cem(judge, lambda x, u: x[..., 0], space, 1, candidates=64, elites=4, iterations=1, screened=0.0)
+    cem(
+        judge, lambda x, u: x[..., 0], space, 1, candidates=64, elites=4, iterations=1, screened=0.0
+    )
     best = 0.3 * torch.linspace(-1, 1, 64)[-4:].mean()
-    torch.testing.assert_close(alone[2].flatten(), (0.9 * best).tanh()[None])  # 2, since two members see the start
+    torch.testing.assert_close(
+        alone[2].flatten(), (0.9 * best).tanh()[None]
+    )  # 2, since two members see the start
 
 
 def test_the_return_of_a_screened_plan_is_the_mean_of_what_all_members_predict() -> None:
     judge = EnsemblePredictor((predictor(), lambda actions: 0.9 * predictor()(actions)))
-    plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
+    plan = cem(
+        judge,
+        reward,
+        DirectActions(T, 1, rms=0.5),
+        B,
+        candidates=40,
+        elites=4,
+        iterations=4,
+        screened=0.25,
+    )
     predicted = expected_return(judge(plan.actions[None]), plan.actions[None], reward)[0]
     torch.testing.assert_close(plan.curve[-1], predicted)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_a_share_that_is_none_is_refused(share: float) -> None:
-    with pytest.raises(ValueError, match="expected 2 <= elites <= candidates, at least one iteration and a share"):
+    with pytest.raises(
+        ValueError, match="expected 2 <= elites <= candidates, at least one iteration and a share"
+    ):
         cem(predictor(), reward, DirectActions(T, 1), B, screened=share)
 
 
 @pytest.mark.parametrize("gaussian", [True, False])
 def test_the_mode_of_a_member_alone_is_its_part_of_the_ensembles_modes(gaussian: bool) -> None:
-    model, past = in_units(Ensemble(6, 2, hidden=16, gaussian=gaussian)), initial_past(torch.randn(B, 6), 1, 2)
+    model, past = (
+        in_units(Ensemble(6, 2, hidden=16, gaussian=gaussian)),
+        initial_past(torch.randn(B, 6), 1, 2),
+    )
     actions = 0.5 * torch.randn(4, B, 12, 2)
     rows = Segment(*(part.repeat(4 * model.members, 1, 1) for part in past))
-    at_once = rollout(model, rows, actions.flatten(0, 1).repeat(model.members, 1, 1), generator=NoNoise(4 * B))
+    at_once = rollout(
+        model, rows, actions.flatten(0, 1).repeat(model.members, 1, 1), generator=NoNoise(4 * B)
+    )
     modes = model_predictor(model, past)(actions)
     torch.testing.assert_close(modes, at_once.unflatten(0, (model.members, 4, B)))
 
 
 @pytest.mark.parametrize("planner", [cem, mppi])
 @pytest.mark.parametrize("spoilt", [float("nan"), float("inf")])
-def test_a_candidate_on_which_the_model_diverges_is_never_the_plan(planner: Planner, spoilt: float) -> None:
+def test_a_candidate_on_which_the_model_diverges_is_never_the_plan(
+    planner: Planner, spoilt: float
+) -> None:
     def predict(actions: Tensor) -> Tensor:
         states = predictor()(actions)
         return states.where(actions[None].abs().amax((-2, -1), keepdim=True) == 0, spoilt)
@@ -421,7 +503,16 @@ def test_a_candidate_that_the_first_member_finds_infinitely_good_is_sorted_out()
         return predictor()(actions) + 1e6 * (actions[None].amax((-2, -1), keepdim=True) > 0.9)
 
     judge = EnsemblePredictor((diverging, predictor()))
-    plan = cem(judge, infinite, DirectActions(T, 1, rms=0.9), B, candidates=40, elites=4, iterations=2, screened=0.5)
+    plan = cem(
+        judge,
+        infinite,
+        DirectActions(T, 1, rms=0.9),
+        B,
+        candidates=40,
+        elites=4,
+        iterations=2,
+        screened=0.5,
+    )
     assert plan.curve[-1].abs().max() < 1e6
 
 
@@ -435,7 +526,9 @@ def test_candidates_and_calls_meet_the_same_futures() -> None:
     assert states.shape == (4, 5, B, T, 2)
     torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 4, -1, -1, -1))
     torch.testing.assert_close(predict(actions)[:, 0], states[:, 0])
-    assert (states[0] - states[1]).abs().min(dim=-1).values.max() > 0.01  # the samples themselves differ
+    assert (states[0] - states[1]).abs().min(
+        dim=-1
+    ).values.max() > 0.01  # the samples themselves differ
     other = model_predictor(Cart(0.3), initial_past(START, 1, 1), samples=4, seed=1)
     assert not torch.equal(other(actions), predict(actions))
 
@@ -452,7 +545,9 @@ def test_a_finished_plan_meets_futures_that_its_planner_did_not_see() -> None:
     fresh = fresh_predictor(Cart(0.3), past, seed=1)
     assert fresh(actions).shape == (32, 1, B, T, 2)
     judged = reevaluate(plan, fresh, reward)
-    torch.testing.assert_close(judged.predicted_return, expected_return(fresh(actions), actions, reward)[0])
+    torch.testing.assert_close(
+        judged.predicted_return, expected_return(fresh(actions), actions, reward)[0]
+    )
     assert not torch.isclose(judged.predicted_return, plan.predicted_return).any()
 
 
@@ -470,31 +565,50 @@ def test_an_expectation_is_over_the_mode_and_common_samples() -> None:
 def test_each_judging_sample_is_drawn_as_one_alone_would_be() -> None:
     past, actions = initial_past(START, 1, 1), torch.full((2, B, T, 1), 0.3)
     together = expected_predictor(Cart(0.3), past, samples=3, seed=1)(actions)[1:]
-    alone = [model_predictor(Cart(0.3), past, samples=1, seed=seed)(actions)[0] for seed in (3, 4, 5)]
+    alone = [
+        model_predictor(Cart(0.3), past, samples=1, seed=seed)(actions)[0] for seed in (3, 4, 5)
+    ]
     assert torch.equal(together, torch.stack(alone))
 
 
 def test_in_screening_every_judging_sample_counts_as_much_as_the_mode() -> None:
     judge = expected_predictor(Cart(0.3), initial_past(START, 1, 1), samples=3)
-    plan = cem(judge, reward, DirectActions(T, 1, rms=0.5), B, candidates=40, elites=4, iterations=4, screened=0.25)
-    torch.testing.assert_close(plan.curve[-1], plan.predicted_return)  # of the mode and three samples at once
+    plan = cem(
+        judge,
+        reward,
+        DirectActions(T, 1, rms=0.5),
+        B,
+        candidates=40,
+        elites=4,
+        iterations=4,
+        screened=0.25,
+    )
+    torch.testing.assert_close(
+        plan.curve[-1], plan.predicted_return
+    )  # of the mode and three samples at once
 
 
 def test_samples_by_which_plans_are_judged_are_none_of_the_fresh_ones() -> None:
     start = torch.zeros(20, 2)  # of fewer numbers torch draws in another order
     past, actions = initial_past(start, 1, 1), torch.zeros(1, 20, 4, 1)
-    judged = expected_predictor(Cart(0.3), past, samples=3, seed=1)(actions)[1:, 0, :, 0]  # the first step
+    judged = expected_predictor(Cart(0.3), past, samples=3, seed=1)(actions)[
+        1:, 0, :, 0
+    ]  # the first step
     others = [expected_predictor(Cart(0.3), past, samples=3, seed=2)(actions)[1:]]
     others += [fresh_predictor(Cart(0.3), past, seed=seed)(actions) for seed in (0, 1, 2, 6, 7, 8)]
     assert not (torch.cat(others)[:, None, 0, :, 0] == judged).any()
-    assert (fresh_predictor(Cart(0.3), past, seed=4)(actions)[:, None, 0, :, 0] == judged).any()  # as it is said
+    assert (
+        fresh_predictor(Cart(0.3), past, seed=4)(actions)[:, None, 0, :, 0] == judged
+    ).any()  # as it is said
 
 
 def test_a_plan_by_expectation_keeps_away_from_an_edge_and_one_by_the_mode_does_not() -> None:
     def edge(states: Tensor, actions: Tensor) -> Tensor:
         """The nearer to 0.5 at the end the better, but 10 less beyond it."""
         end = states[..., -1:, 0]
-        return (end.minimum(torch.tensor(0.5)) - 10.0 * (end > 0.5)) / states.shape[-2] + 0 * states[..., 0]
+        return (end.minimum(torch.tensor(0.5)) - 10.0 * (end > 0.5)) / states.shape[
+            -2
+        ] + 0 * states[..., 0]
 
     past, space = initial_past(START, 1, 1), DirectActions(T, 1, rms=0.5)
     found = []
@@ -510,11 +624,15 @@ def test_without_samples_an_expectation_is_that_of_model_predictor(build: Any) -
     torch.manual_seed(0)
     model, past = in_units(build(6, 2, hidden=16)), initial_past(torch.zeros(B, 6), 10, 2)
     actions = torch.full((1, B, T, 2), 0.3)
-    assert torch.equal(expected_predictor(model, past)(actions), model_predictor(model, past)(actions))
+    assert torch.equal(
+        expected_predictor(model, past)(actions), model_predictor(model, past)(actions)
+    )
 
 
 def test_an_expectation_over_no_sample_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"samples is 0, expected at least 1; the mode alone is model_predictor"):
+    with pytest.raises(
+        ValueError, match=r"samples is 0, expected at least 1; the mode alone is model_predictor"
+    ):
         expected_predictor(Cart(), initial_past(START, 1, 1), samples=0)
 
 
@@ -522,15 +640,21 @@ def test_an_expectation_over_no_sample_is_refused() -> None:
 def test_a_deterministic_model_has_no_samples_and_says_so(build: Any) -> None:
     torch.manual_seed(0)
     model, past = in_units(build(6, 2, hidden=16)), initial_past(torch.zeros(B, 6), 10, 2)
-    with pytest.raises(ValueError, match=f"2 samples of {build.__name__} asked for, but it is deterministic"):
+    with pytest.raises(
+        ValueError, match=f"2 samples of {build.__name__} asked for, but it is deterministic"
+    ):
         model_predictor(model, past, samples=2)
     actions = torch.full((1, B, T, 2), 0.3)
     fresh = fresh_predictor(model, past, seed=1)(actions)
-    assert torch.equal(fresh, model_predictor(model, past)(actions))  # one rollout, not 32 times the same
+    assert torch.equal(
+        fresh, model_predictor(model, past)(actions)
+    )  # one rollout, not 32 times the same
 
 
 def test_a_negative_number_of_samples_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"samples is -1, expected 0 \(the mode\) or a positive number"):
+    with pytest.raises(
+        ValueError, match=r"samples is -1, expected 0 \(the mode\) or a positive number"
+    ):
         model_predictor(Cart(), initial_past(START, 1, 1), samples=-1)
 
 
@@ -565,13 +689,18 @@ def test_codes_decode_segment_by_segment_from_no_torque(prior: ActionPrior) -> N
         past = torch.zeros(1, 10, 2)
         for k in range(3):
             past = prior.decode(past, codes[c, b, k][None])
-            torch.testing.assert_close(actions[c, b, 10 * k : 10 * k + 10], past[0], rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(
+                actions[c, b, 10 * k : 10 * k + 10], past[0], rtol=1e-4, atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("horizon", [0, -10, 5, 25])
-def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(prior: ActionPrior, horizon: int) -> None:
+def test_a_horizon_that_is_no_whole_number_of_segments_is_refused(
+    prior: ActionPrior, horizon: int
+) -> None:
     with pytest.raises(
-        ValueError, match=rf"horizon of {horizon} steps is not a whole number of segments of 10; choose"
+        ValueError,
+        match=rf"horizon of {horizon} steps is not a whole number of segments of 10; choose",
     ):
         LatentActions(prior, horizon)
 
@@ -595,11 +724,16 @@ def test_a_plan_over_codes_gets_better_within_the_bounds(prior: ActionPrior, pla
 
 
 def test_what_is_left_of_a_plan_over_codes_is_the_same_actions(prior: ActionPrior) -> None:
-    space, codes = LatentActions(prior, 30), torch.randn(B, 3, 8, generator=torch.Generator().manual_seed(0))
+    space, codes = (
+        LatentActions(prior, 30),
+        torch.randn(B, 3, 8, generator=torch.Generator().manual_seed(0)),
+    )
     actions = space.decode(codes[None])[0]
     for steps in (10, 20):
         rest, left = space.after(codes, steps)
-        torch.testing.assert_close(rest.decode(left[None])[0], actions[:, steps:], rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(
+            rest.decode(left[None])[0], actions[:, steps:], rtol=1e-4, atol=1e-6
+        )
     rest, left = rest.after(left, 4)  # not where a segment ends: the codes are those of the encoder
     assert left.shape == (B, *rest.shape)
     assert rest.decode(left[None]).shape == (1, B, 6, 2)
@@ -618,25 +752,35 @@ def test_what_is_left_of_a_plan_over_actions_is_the_rest() -> None:
 # Every model ---------------------------------------------------------------------------------------------------------
 
 MODELS = {
-    "tsm": partial(TSM, channels=8), "tsm, with contacts": partial(TSM, channels=8, head_channels=8),
-    "onestep": partial(OneStep, hidden=16), "lstm": partial(LSTM, hidden=16),
-    "ensemble": partial(Ensemble, hidden=16), "ensemble+mse": partial(Ensemble, hidden=16, gaussian=False),
-}  # fmt: skip
+    "tsm": partial(TSM, channels=8),
+    "tsm, with contacts": partial(TSM, channels=8, head_channels=8),
+    "onestep": partial(OneStep, hidden=16),
+    "lstm": partial(LSTM, hidden=16),
+    "ensemble": partial(Ensemble, hidden=16),
+    "ensemble+mse": partial(Ensemble, hidden=16, gaussian=False),
+}
 
 
 @pytest.mark.parametrize("over", ["actions", "codes"])
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize("name", MODELS)
-def test_every_planner_plans_through_every_model(prior: ActionPrior, name: str, planner: str, over: str) -> None:
+def test_every_planner_plans_through_every_model(
+    prior: ActionPrior, name: str, planner: str, over: str
+) -> None:
     torch.manual_seed(0)
     model = MODELS[name](6, 2).requires_grad_(False)
     model.features.step_std.fill_(0.05)  # a tame world
     space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
     samples = 2 if model.stochastic else 0
-    predict = model_predictor(model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=samples)
+    predict = model_predictor(
+        model, initial_past(torch.randn(B, 6), model.past_len, 2), samples=samples
+    )
     task = rewards.reach(torch.tensor([[5.0, 0.0], [0.0, 5.0], [-5.0, 0.0]]), torque_weight=0)
-    settings = {"adam": {"iterations": 5, "lr": 0.1}, "cem": {"iterations": 3, "candidates": 12, "elites": 3},
-                "mppi": {"iterations": 3, "candidates": 12}}[planner]  # fmt: skip
+    settings = {
+        "adam": {"iterations": 5, "lr": 0.1},
+        "cem": {"iterations": 3, "candidates": 12, "elites": 3},
+        "mppi": {"iterations": 3, "candidates": 12},
+    }[planner]
     plan = {"adam": adam, "cem": cem, "mppi": mppi}[planner](predict, task, space, B, **settings)  # type: ignore[operator]
     assert plan.states.shape == (max(samples, 1), B, 20, 6)
     assert plan.actions.abs().max() <= 1
@@ -650,9 +794,13 @@ def test_a_rollout_keeps_one_member_of_the_ensemble_and_candidates_share_it() ->
     actions = torch.full((3, n, 12, 2), 0.5)
     states = model_predictor(model, past, samples=2)(actions)  # (2, 3, n, 12, 6)
     torch.testing.assert_close(states[:, 1:], states[:, :1].expand(-1, 2, -1, -1, -1))
-    apart = (states[:, 0].flatten(0, 1)[:, None] - states[:, 0].flatten(0, 1)[None]).abs().amax((2, 3)) > 1e-3
+    apart = (states[:, 0].flatten(0, 1)[:, None] - states[:, 0].flatten(0, 1)[None]).abs().amax(
+        (2, 3)
+    ) > 1e-3
     futures = {tuple(row) for row in (~apart).tolist()}
-    assert len(futures) == 5  # as many as there are members: none is mixed with another along the way
+    assert (
+        len(futures) == 5
+    )  # as many as there are members: none is mixed with another along the way
 
 
 # Through the true simulator ------------------------------------------------------------------------------------------
@@ -669,21 +817,27 @@ def test_cem_through_the_simulator_beats_doing_nothing() -> None:
     assert (plan.predicted_return > expected_return(predict(nothing), nothing, task)[0] + 0.1).all()
     env.reset(options={"states": start})
     by_hand = torch.from_numpy(env.unwrapped.rollout(plan.actions.numpy())).float()
-    torch.testing.assert_close(plan.states[0], by_hand, rtol=0, atol=0)  # what it predicted is what happens
+    torch.testing.assert_close(
+        plan.states[0], by_hand, rtol=0, atol=0
+    )  # what it predicted is what happens
     env.close()
 
 
 def test_candidates_in_the_simulator_do_not_mix() -> None:
     start = gymnasium.make_vec("tsm/ReacherPush-v1", num_envs=2).reset(seed=0)[0]
     predict = simulator_predictor("tsm/ReacherPush-v1", start)
-    actions = 0.2 * torch.randn(3, 2, 12, 2, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
+    actions = 0.2 * torch.randn(3, 2, 12, 2, generator=torch.Generator().manual_seed(0)).clamp(
+        -1, 1
+    )
     states = predict(actions)
     assert states.shape == (1, 3, 2, 12, 10)
     for c in range(3):
         assert torch.equal(predict(actions[c : c + 1])[0, 0], states[0, c])
 
 
-@pytest.mark.parametrize(("env_id", "off"), [("tsm/ReacherPush-v1", 1e-3), ("tsm/PymunkPush-v1", 5e-2)])
+@pytest.mark.parametrize(
+    ("env_id", "off"), [("tsm/ReacherPush-v1", 1e-3), ("tsm/PymunkPush-v1", 5e-2)]
+)
 def test_the_simulator_can_go_on_from_what_was_observed(env_id: str, off: float) -> None:
     env: Any = gymnasium.make_vec(env_id, num_envs=30).unwrapped
     env.reset(seed=0)
@@ -698,14 +852,20 @@ def test_the_simulator_of_an_arms_task_goes_on_after_what_was_done() -> None:
     task = Task.from_env("tsm/Reacher-v0", n=2, horizon=15, reward=lambda x, u: x[..., 0], seed=0)
     done, rest = 0.3 * torch.ones(2, 10, 2), torch.zeros(2, 5, 2)
     states = simulator_predictor(task, done=done)(rest[None])[0, 0]
-    torch.testing.assert_close(states, execute(task, torch.cat([done, rest], 1)).states[:, 11:], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        states, execute(task, torch.cat([done, rest], 1)).states[:, 11:], rtol=1e-4, atol=1e-5
+    )
     at_start = simulator_predictor(task)(rest[None])
     assert torch.equal(simulator_predictor(task, done=done[:, :0])(rest[None]), at_start)
-    assert torch.equal(simulator_predictor(task, task.start, done=done)(rest[None]), at_start)  # it is where it is
+    assert torch.equal(
+        simulator_predictor(task, task.start, done=done)(rest[None]), at_start
+    )  # it is where it is
 
 
 def test_the_true_simulator_of_an_arm_predicts_from_a_start_alone() -> None:
-    with pytest.raises(ValueError, match=r"candidates in tsm/Reacher-v0 have no common start; give start \(B, dx\)"):
+    with pytest.raises(
+        ValueError, match=r"candidates in tsm/Reacher-v0 have no common start; give start \(B, dx\)"
+    ):
         simulator_predictor("tsm/Reacher-v0")
 
 

@@ -19,7 +19,17 @@ import tsmlib as tsm
 from tsmlib import study
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import fingerprint, imperfect, variant
-from tsmlib.envs.geometry import BLOCK_CLEARANCE, DT, GEAR, WALL, closest_gap, fingertip, room, slide_time, target_ring
+from tsmlib.envs.geometry import (
+    BLOCK_CLEARANCE,
+    DT,
+    GEAR,
+    WALL,
+    closest_gap,
+    fingertip,
+    room,
+    slide_time,
+    target_ring,
+)
 from tsmlib.envs.mujoco_arm import load_model
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.pymunk_arm import ELBOW_MASS
@@ -30,9 +40,9 @@ from tsmlib.evaluation.exploitation import violations
 from tsmlib.planning.tasks import Task
 from tsmlib.storage.artifacts import load_trajectories, save_trajectories
 from tsmlib.storage.files import StoreError
-from tsmlib.study.data import random_data
-from tsmlib.study.results.table import place
-from tsmlib.study.runs import Run
+from reproduction.data import random_data
+from reproduction.results.table import place
+from reproduction.runs import Run
 
 REACH, PUSH, PYMUNK_PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 NAMED: dict[str, dict[str, Any]] = {
@@ -46,12 +56,31 @@ NAMED: dict[str, dict[str, Any]] = {
     "gain0.7": {"torque_gain": 0.7},
 }
 EXTREME: list[dict[str, Any]] = [
-    {"mass": 0.25}, {"mass": 4}, {"damping": 0.5}, {"damping": 4}, {"link_lengths": (0.06, 0.18)},
-    {"link_lengths": (0.18, 0.06)}, {"object_radius": 0.02}, {"object_radius": 0.05}, {"torque_gain": 1.25},
-]  # fmt: skip
+    {"mass": 0.25},
+    {"mass": 4},
+    {"damping": 0.5},
+    {"damping": 4},
+    {"link_lengths": (0.06, 0.18)},
+    {"link_lengths": (0.18, 0.06)},
+    {"object_radius": 0.02},
+    {"object_radius": 0.05},
+    {"torque_gain": 1.25},
+]
 ALL = [
-    {"mass": 0.25, "damping": 0.5, "link_lengths": (0.12, 0.12), "object_radius": 0.02, "torque_gain": 1.25},
-    {"mass": 4, "damping": 0.5, "link_lengths": (0.12, 0.12), "object_radius": 0.05, "torque_gain": 1.25},
+    {
+        "mass": 0.25,
+        "damping": 0.5,
+        "link_lengths": (0.12, 0.12),
+        "object_radius": 0.02,
+        "torque_gain": 1.25,
+    },
+    {
+        "mass": 4,
+        "damping": 0.5,
+        "link_lengths": (0.12, 0.12),
+        "object_radius": 0.05,
+        "torque_gain": 1.25,
+    },
 ]
 
 
@@ -97,9 +126,9 @@ def test_a_variant_is_made_by_keyword_or_by_its_id_and_is_the_same(env_id: str, 
     one.reset(options={"states": start[0]})
     np.testing.assert_array_equal([one.step(action)[0] for action in torques(4)[0]], moved[0])
     standard, _ = arms(env_id, 4)
-    standard.reset(options={"states": start}) if "radius" not in word and "links" not in word else standard.reset(
-        seed=0
-    )
+    standard.reset(
+        options={"states": start}
+    ) if "radius" not in word and "links" not in word else standard.reset(seed=0)
     assert not np.array_equal(standard.rollout(torques(4, rms=0.3)), moved)
 
 
@@ -107,13 +136,25 @@ def test_a_variant_is_made_by_keyword_or_by_its_id_and_is_the_same(env_id: str, 
 def test_standard_values_name_the_standard_arm(env_id: str) -> None:
     assert variant(env_id, damping=1, link_lengths=[0.1, 0.11], torque_gain=1.0) == env_id
     assert EnvSpec.parse(env_id).physics == Physics()
-    assert not set(fingerprint(env_id)) & {"mass", "damping", "link_lengths", "object_radius", "torque_gain"}
+    assert not set(fingerprint(env_id)) & {
+        "mass",
+        "damping",
+        "link_lengths",
+        "object_radius",
+        "torque_gain",
+    }
 
 
 def test_any_value_survives_its_spelling() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
-        drawn = Physics(rng.uniform(0.25, 4), rng.uniform(0.5, 4), tuple(rng.uniform(0.06, 0.12, 2)), 1 / 30, 2 / 3)
+        drawn = Physics(
+            rng.uniform(0.25, 4),
+            rng.uniform(0.5, 4),
+            tuple(rng.uniform(0.06, 0.12, 2)),
+            1 / 30,
+            2 / 3,
+        )
         spec = EnvSpec("pymunk", "push", noise=0.25, delay=5, physics=drawn)
         assert EnvSpec.parse(spec.id) == spec
         assert spec.id in gymnasium.registry
@@ -128,10 +169,16 @@ def test_noise_and_delay_join_a_variant() -> None:
     by_keyword = gymnasium.make_vec(imperfect(REACH, noise=0.25, delay=5), num_envs=3, damping=2)
     assert by_keyword.unwrapped.spec is not None
     assert by_keyword.unwrapped.spec.id == name
-    seen = [collect(env, open_loop(torch.from_numpy(torques(3))), horizon=60, seed=1) for env in (by_name, by_keyword)]
+    seen = [
+        collect(env, open_loop(torch.from_numpy(torques(3))), horizon=60, seed=1)
+        for env in (by_name, by_keyword)
+    ]
     np.testing.assert_array_equal(seen[0].states, seen[1].states)
     assert {data.env for data in seen} == {name}
-    assert gymnasium.make(imperfect(REACH, noise=0.25), damping=2).spec.id == "tsm/Reacher-damping2-noise0.25-v0"  # type: ignore[union-attr]
+    assert (
+        gymnasium.make(imperfect(REACH, noise=0.25), damping=2).spec.id
+        == "tsm/Reacher-damping2-noise0.25-v0"
+    )  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -146,12 +193,24 @@ def test_noise_and_delay_join_a_variant() -> None:
         (PUSH, {"link_lengths": (0.2, 0.2)}, r"link_lengths are \(0.2, 0.2\) m; .*at most 0.24 m"),
         (PUSH, {"link_lengths": (0.1,)}, "link_lengths are .*expected two lengths"),
         (PUSH, {"link_lengths": 0.1}, "link_lengths is 0.1; expected two numbers"),
-        (REACH, {"mass": 2}, "mass of tsm/Reacher-v0 cannot be chosen: it has no object. It takes damping, link_len"),
+        (
+            REACH,
+            {"mass": 2},
+            "mass of tsm/Reacher-v0 cannot be chosen: it has no object. It takes damping, link_len",
+        ),
         (REACH, {"object_radius": 0.04}, "object_radius of tsm/Reacher-v0 cannot be chosen"),
-        ("tsm/PymunkObstacle-v0", {"mass": 2}, "its obstacle does not move. It takes damping, .*object_radius"),
-        (PUSH, {"friction": 1}, "friction of tsm/ReacherPush-v1 cannot be chosen: there is no such.*takes mass, dam"),
+        (
+            "tsm/PymunkObstacle-v0",
+            {"mass": 2},
+            "its obstacle does not move. It takes damping, .*object_radius",
+        ),
+        (
+            PUSH,
+            {"friction": 1},
+            "friction of tsm/ReacherPush-v1 cannot be chosen: there is no such.*takes mass, dam",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_value_that_makes_no_sense_is_refused_with_what_is_allowed(
     env_id: str, changes: dict[str, Any], message: str
 ) -> None:
@@ -184,7 +243,9 @@ def test_another_spelling_is_refused(name: str, message: str) -> None:
 
 @pytest.mark.parametrize("env_id", ENV_IDS[1:3] + ENV_IDS[4:])
 @pytest.mark.parametrize("changes", [*EXTREME, *ALL], ids=str)
-def test_nothing_penetrates_except_in_the_instant_of_impact(env_id: str, changes: dict[str, Any]) -> None:
+def test_nothing_penetrates_except_in_the_instant_of_impact(
+    env_id: str, changes: dict[str, Any]
+) -> None:
     if EnvSpec.parse(env_id).task == "obstacle":
         changes = {name: value for name, value in changes.items() if name != "mass"}
     name = variant(env_id, **changes)
@@ -192,13 +253,19 @@ def test_nothing_penetrates_except_in_the_instant_of_impact(env_id: str, changes
     physics = EnvSpec.parse(name).physics
     assert closest_gap(start, name).min() > BLOCK_CLEARANCE
     states = env.rollout(torques(30, rms=0.05))
-    np.testing.assert_allclose(states[..., 4:6], fingertip(states[..., :2], physics.link_lengths), atol=1e-12)
-    deep = depth(states, name) if EnvSpec.parse(env_id).task == "push" else -closest_gap(states, name)
+    np.testing.assert_allclose(
+        states[..., 4:6], fingertip(states[..., :2], physics.link_lengths), atol=1e-12
+    )
+    deep = (
+        depth(states, name) if EnvSpec.parse(env_id).task == "push" else -closest_gap(states, name)
+    )
     assert deep.max() < 4e-3
     assert not (deep[:, 1:] > 1e-3)[deep[:, :-1] > 1e-3].any()
     away = (closest_gap(states, name) > 0.03).all(1)
     assert away.any()
-    np.testing.assert_allclose(states[away, :, 6:], np.repeat(start[away, None, 6:], 60, axis=1), atol=1e-9)
+    np.testing.assert_allclose(
+        states[away, :, 6:], np.repeat(start[away, None, 6:], 60, axis=1), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("env_id", [PUSH, PYMUNK_PUSH])
@@ -207,7 +274,9 @@ def test_nothing_tunnels_at_full_torque(env_id: str, changes: dict[str, Any]) ->
     name = variant(env_id, **changes)
     env, _ = arms(name, 40)
     states, physics = env.rollout(full_torques(40)), EnvSpec.parse(name).physics
-    assert -closest_gap(states, name).min() < physics.object_radius + 0.01  # the centres never cross
+    assert (
+        -closest_gap(states, name).min() < physics.object_radius + 0.01
+    )  # the centres never cross
     assert np.abs(states[..., 6:8]).max() < WALL + 2 * physics.object_radius
     assert np.abs(states[..., 2:4]).max() < 2 * GEAR * physics.torque_gain / physics.damping
 
@@ -221,7 +290,9 @@ def test_a_heavier_object_slides_further_against_the_same_drag(env_id: str) -> N
         speed = env.rollout(np.zeros((1, 10, 2)))[0, :, 9]
         decay = slide_time(Physics(mass=mass))
         assert decay == pytest.approx(0.05 * mass)
-        np.testing.assert_allclose(speed, 0.3 * np.exp(-DT * np.arange(1, 11) / decay), rtol=0.3 if mass < 1 else 0.05)
+        np.testing.assert_allclose(
+            speed, 0.3 * np.exp(-DT * np.arange(1, 11) / decay), rtol=0.3 if mass < 1 else 0.05
+        )
 
 
 def test_the_shoulder_in_mujoco_obeys_its_equation_of_motion() -> None:
@@ -236,7 +307,9 @@ def test_the_shoulder_in_mujoco_obeys_its_equation_of_motion() -> None:
 
 def test_the_arm_in_pymunk_obeys_its_equation_of_motion() -> None:
     damping, gain, length = 2.0, 0.7, 0.12
-    env, _ = arms("tsm/PymunkReacher-v0", 1, damping=damping, torque_gain=gain, link_lengths=(length, 0.1))
+    env, _ = arms(
+        "tsm/PymunkReacher-v0", 1, damping=damping, torque_gain=gain, link_lengths=(length, 0.1)
+    )
     env.reset(options={"states": np.zeros((1, 6))})
     states = env.rollout(0.02 * np.ones((1, 20, 2)) * [1.0, 0.5])[0]
     w, q = np.zeros(2), np.zeros(2)  # speeds and angles in the world
@@ -245,7 +318,9 @@ def test_the_arm_in_pymunk_obeys_its_equation_of_motion() -> None:
         first = (tau[0] - tau[1] - damping * (joint[0] - joint[1])) / (1 + ELBOW_MASS * length**2)
         w = w + DT / 200 * np.array([first, tau[1] - damping * joint[1]])
         q = q + DT / 200 * w
-    np.testing.assert_allclose(states[-1, :4], [q[0], q[1] - q[0], w[0], w[1] - w[0]], rtol=0.02, atol=1e-3)
+    np.testing.assert_allclose(
+        states[-1, :4], [q[0], q[1] - q[0], w[0], w[1] - w[0]], rtol=0.02, atol=1e-3
+    )
 
 
 def test_the_geometry_of_a_variant_is_that_of_its_model() -> None:
@@ -256,9 +331,14 @@ def test_the_geometry_of_a_variant_is_that_of_its_model() -> None:
     for state, gap in zip(states, closest_gap(states, name), strict=True):
         data.qpos[:] = np.r_[state[:2], state[6:8]]
         mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.body("fingertip").xpos[:2], fingertip(state[:2], (0.12, 0.1)), atol=1e-12)
+        np.testing.assert_allclose(
+            data.body("fingertip").xpos[:2], fingertip(state[:2], (0.12, 0.1)), atol=1e-12
+        )
         links = [model.geom(link).id for link in ("link0", "link1", "fingertip")]
-        distance = min(mujoco.mj_geomDistance(model, data, link, model.geom("block").id, 1.0, None) for link in links)
+        distance = min(
+            mujoco.mj_geomDistance(model, data, link, model.geom("block").id, 1.0, None)
+            for link in links
+        )
         assert gap == pytest.approx(distance, abs=1e-9)
 
 
@@ -270,31 +350,45 @@ def test_an_episode_replays_bit_for_bit(changes: dict[str, Any]) -> None:
         env.reset(seed=9, options={"states": start})
         first = env.rollout(torques(8)[:, :30])
         snapshot = env.get_state() if env_id == PUSH else None
-        np.testing.assert_array_equal(np.concatenate([first, env.rollout(torques(8)[:, 30:])], 1), states)
+        np.testing.assert_array_equal(
+            np.concatenate([first, env.rollout(torques(8)[:, 30:])], 1), states
+        )
         if snapshot is not None:
             env.set_state(snapshot)
             np.testing.assert_array_equal(env.rollout(torques(8)[:, 30:]), states[:, 30:])
 
 
 @pytest.mark.parametrize("env_id", [PUSH, PYMUNK_PUSH])
-@pytest.mark.parametrize("changes", [{"mass": 2.0}, {"link_lengths": (0.12, 0.11)}, {"object_radius": 0.04}], ids=str)
+@pytest.mark.parametrize(
+    "changes", [{"mass": 2.0}, {"link_lengths": (0.12, 0.11)}, {"object_radius": 0.04}], ids=str
+)
 def test_symmetric_copies_stay_true_of_a_variant(env_id: str, changes: dict[str, Any]) -> None:
     data = random_data(variant(env_id, **changes), 10, seed=3, horizon=40)
     copies = symmetric(data)
     env, _ = arms(data.env, len(copies))
     env.reset(seed=0, options={"states": copies.states[:, 0].astype(float)})
-    off = np.abs(env.rollout(copies.actions) - copies.states[:, 1:])[..., [0, 1, 4, 5, 6, 7]].max((1, 2))
+    off = np.abs(env.rollout(copies.actions) - copies.states[:, 1:])[..., [0, 1, 4, 5, 6, 7]].max(
+        (1, 2)
+    )
     assert np.quantile(off, 0.9) < 1e-3
 
 
 def test_true_episodes_of_a_variant_violate_no_physics() -> None:
-    for changes in ({"mass": 2.0}, {"mass": 0.5}, {"link_lengths": (0.12, 0.11)}, {"object_radius": 0.05}):
+    for changes in (
+        {"mass": 2.0},
+        {"mass": 0.5},
+        {"link_lengths": (0.12, 0.11)},
+        {"object_radius": 0.05},
+    ):
         data = random_data(variant(PUSH, **changes), 40, seed=1, horizon=60)
         assert violations(data.states, data.env)["violations"].mean() < 1e-3
-    assert violations(data.states, PUSH)["violations"].mean() > 0.1  # a smaller object would have been left alone
+    assert (
+        violations(data.states, PUSH)["violations"].mean() > 0.1
+    )  # a smaller object would have been left alone
     heavy = random_data(variant(PUSH, mass=4.0), 60, seed=1, horizon=60)
     assert (
-        violations(heavy.states, heavy.env)["violations"].mean() < violations(heavy.states, PUSH)["violations"].mean()
+        violations(heavy.states, heavy.env)["violations"].mean()
+        < violations(heavy.states, PUSH)["violations"].mean()
     )
 
 
@@ -303,21 +397,35 @@ def test_true_episodes_of_a_variant_violate_no_physics() -> None:
 
 def test_a_picture_shows_the_lengths_and_the_radius() -> None:
     state = np.array([0.5, 1.0, 0.0, 0.0, 0.0, 0.0, -0.1, -0.15, 0.0, 0.0])
-    pictures = [render_array(state, name, size=120) for name in
-                (PUSH, variant(PUSH, link_lengths=(0.12, 0.11)), variant(PUSH, object_radius=0.05))]  # fmt: skip
+    pictures = [
+        render_array(state, name, size=120)
+        for name in (
+            PUSH,
+            variant(PUSH, link_lengths=(0.12, 0.11)),
+            variant(PUSH, object_radius=0.05),
+        )
+    ]
     assert all((pictures[0] != other).any() for other in pictures[1:])
-    np.testing.assert_array_equal(pictures[0], render_array(state, variant(PUSH, mass=2.0), size=120))
+    np.testing.assert_array_equal(
+        pictures[0], render_array(state, variant(PUSH, mass=2.0), size=120)
+    )
     env = gymnasium.make(PYMUNK_PUSH, render_mode="rgb_array", object_radius=0.05)
     env.reset(seed=0)
     assert env.render().shape == (480, 480, 3)
 
 
 def test_targets_are_drawn_and_allowed_as_far_as_the_variant_gets() -> None:
-    for changes in ({"object_radius": 0.05}, {"link_lengths": (0.06, 0.07)}, {"link_lengths": (0.12, 0.12)}):
+    for changes in (
+        {"object_radius": 0.05},
+        {"link_lengths": (0.06, 0.07)},
+        {"link_lengths": (0.12, 0.12)},
+    ):
         for env_id in (PUSH, REACH):
             if env_id == REACH and "object_radius" in changes:
                 continue
-            task = study.draw_task(variant(env_id, **changes), seed=0, n=50)  # Task checks that they are within reach
+            task = study.draw_task(
+                variant(env_id, **changes), seed=0, n=50
+            )  # Task checks that they are within reach
             inner, outer = target_ring(EnvSpec.parse(task.env))
             distance = task.target.norm(dim=1)
             assert inner - 1e-6 <= distance.min()
@@ -338,7 +446,10 @@ def test_the_task_of_a_variant_with_the_same_shape_is_the_frozen_one() -> None:
     large = study.load_task(variant(PUSH, object_radius=0.05))
     assert len(large) == 100
     assert closest_gap(large.start.astype(float), large.env).min() > 0
-    trial, same = (tsm.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3))) for task in (heavy, standard))
+    trial, same = (
+        tsm.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3)))
+        for task in (heavy, standard)
+    )
     assert not torch.equal(trial.states, same.states)
 
 
@@ -355,7 +466,11 @@ def test_a_file_of_another_variant_is_refused_with_the_values_that_differ(tmp_pa
         ("mass2", "", "mass is 2.0 in the file, expected 1.0"),
         ("mass2", "mass0.5", "mass is 2.0 in the file, expected 0.5"),
         ("mass2", "mass2", ""),
-        ("links0.12x0.11", "", r"link_lengths is \[0.12, 0.11\] in the file, expected \[0.1, 0.11\]"),
+        (
+            "links0.12x0.11",
+            "",
+            r"link_lengths is \[0.12, 0.11\] in the file, expected \[0.1, 0.11\]",
+        ),
         ("mass2", "gain0.7", "torque_gain is 1.0 in the file, expected 0.7"),
     ):
         if not message:
@@ -369,7 +484,9 @@ def test_a_file_of_another_variant_is_refused_with_the_values_that_differ(tmp_pa
 def test_values_of_ones_own_that_are_called_like_an_arms_are_left_alone(tmp_path: Path) -> None:
     data = replace(random_data(REACH, 2, seed=0, horizon=5), env="my-cart")
     save_trajectories(tmp_path / "cart.safetensors", data, {"fingerprint": {"mass": 30.0}})
-    assert load_trajectories(tmp_path / "cart.safetensors", expect={"env": "my-cart"}).env == "my-cart"
+    assert (
+        load_trajectories(tmp_path / "cart.safetensors", expect={"env": "my-cart"}).env == "my-cart"
+    )
 
 
 def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
@@ -381,7 +498,9 @@ def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
         "trial = tsm.execute(task, torch.full((2, 50, 2), 0.01))\n"
         "print(json.dumps([trial.states[:, -1, 0].tolist(), fingerprint(task.env)]))"
     )
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
     states, printed = json.loads(found)
     name = variant(REACH, damping=2)
     here = tsm.execute(tsm.load_task(name).take(2), torch.full((2, 50, 2), 0.01)).states
@@ -402,9 +521,16 @@ def test_the_study_collects_trains_and_plans_on_a_variant_by_its_id(tmp_path: Pa
     assert (row["env"], row["sim"], row["delay"]) == (env, "mujoco", 5)
 
 
-@pytest.mark.parametrize(("changes", "label"), [
-    ({}, ""), ({"torque_gain": 0.7}, "torque × 0.7"), ({"link_lengths": (0.12, 0.11)}, "upper link × 1.2"),
-    ({"object_radius": 0.045, "mass": 2.0}, "mass × 2, object × 1.5"),
-])  # fmt: skip
-def test_a_figure_names_an_arm_by_factors_of_what_the_standard_one_has(changes: Any, label: str) -> None:
+@pytest.mark.parametrize(
+    ("changes", "label"),
+    [
+        ({}, ""),
+        ({"torque_gain": 0.7}, "torque × 0.7"),
+        ({"link_lengths": (0.12, 0.11)}, "upper link × 1.2"),
+        ({"object_radius": 0.045, "mass": 2.0}, "mass × 2, object × 1.5"),
+    ],
+)
+def test_a_figure_names_an_arm_by_factors_of_what_the_standard_one_has(
+    changes: Any, label: str
+) -> None:
     assert Physics(**changes).label == label

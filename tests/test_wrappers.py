@@ -16,7 +16,9 @@ SCALE = np.array([3.0, 2.0, 8.0, 6.0, 0.2, 0.2, 0.25, 0.25, 1.0, 1.0])
 STEPS = 60
 
 
-def episode(env: gymnasium.Env, actions: np.ndarray, seed: int = 7) -> tuple[np.ndarray, np.ndarray, list[dict]]:
+def episode(
+    env: gymnasium.Env, actions: np.ndarray, seed: int = 7
+) -> tuple[np.ndarray, np.ndarray, list[dict]]:
     """States (T + 1, dx), rewards (T,) and infos (T + 1) of one episode."""
     state, info = env.reset(seed=seed)
     states, rewards, infos = [state], [], [info]
@@ -64,7 +66,9 @@ def test_an_array_changed_after_it_was_sent_does_not_change_the_action() -> None
 
 
 def test_noise_does_not_alter_the_world(actions: np.ndarray) -> None:
-    noisy_states, noisy_rewards, infos = episode(SensorNoise(gymnasium.make(ENV), 0.25, SCALE), actions)
+    noisy_states, noisy_rewards, infos = episode(
+        SensorNoise(gymnasium.make(ENV), 0.25, SCALE), actions
+    )
     states, rewards, _ = episode(gymnasium.make(ENV), actions)
     np.testing.assert_array_equal([info["state"] for info in infos], states)
     np.testing.assert_array_equal(noisy_rewards, rewards)
@@ -114,17 +118,22 @@ def test_noise_repeats_with_the_seed_and_differs_between_episodes(actions: np.nd
 
 def test_no_noise_is_no_change(actions: np.ndarray) -> None:
     np.testing.assert_array_equal(
-        episode(SensorNoise(gymnasium.make(ENV), 0.0, SCALE), actions)[0], episode(gymnasium.make(ENV), actions)[0]
+        episode(SensorNoise(gymnasium.make(ENV), 0.0, SCALE), actions)[0],
+        episode(gymnasium.make(ENV), actions)[0],
     )
 
 
-@pytest.mark.parametrize("wrap", [lambda env: SensorNoise(env, 0.25, SCALE), lambda env: ActionDelay(env, 3)])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: SensorNoise(env, 0.25, SCALE), lambda env: ActionDelay(env, 3)]
+)
 def test_gymnasium_finds_no_fault_with_a_wrapped_environment(wrap) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Said of every wrapped environment, and of every unbounded one.
         warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
-        warnings.filterwarnings("ignore", message=".*Box observation space (minimum|maximum) value is.*")
+        warnings.filterwarnings(
+            "ignore", message=".*Box observation space (minimum|maximum) value is.*"
+        )
         check_env(wrap(gymnasium.make(ENV)), skip_render_check=True)
 
 
@@ -177,7 +186,10 @@ def at_once(env: ImperfectArms, actions: np.ndarray) -> np.ndarray:
 def in_pieces(env: ImperfectArms, actions: np.ndarray) -> np.ndarray:
     """Pieces shorter and longer than the delay, and an empty one."""
     start, _ = env.reset(seed=7)
-    parts = [env.rollout(actions[:, a:b]) for a, b in ((0, 1), (1, 1), (1, 4), (4, 9), (9, 40), (40, STEPS))]
+    parts = [
+        env.rollout(actions[:, a:b])
+        for a, b in ((0, 1), (1, 1), (1, 4), (4, 9), (9, 40), (40, STEPS))
+    ]
     return np.concatenate([start[:, None], *parts], axis=1)
 
 
@@ -189,7 +201,9 @@ def step_by_step(env: ImperfectArms, actions: np.ndarray) -> np.ndarray:
 @bulk
 @pytest.mark.parametrize("tau", [0, 1, TAU])
 @pytest.mark.parametrize("played", [at_once, in_pieces, step_by_step])
-def test_in_bulk_a_delay_shifts_the_actions_by_exactly_tau_steps(played: Any, tau: int, env_id: str) -> None:
+def test_in_bulk_a_delay_shifts_the_actions_by_exactly_tau_steps(
+    played: Any, tau: int, env_id: str
+) -> None:
     env = many(env_id, tau=tau)
     expected = plain(env_id, shifted(torques(), tau))
     np.testing.assert_array_equal(played(env, torques()), expected)
@@ -235,7 +249,9 @@ def test_rewards_are_those_of_the_true_states_and_of_the_torques_that_arrive(env
     env, clear = many(env_id, sigma=0.25, tau=TAU), gymnasium.make_vec(env_id, num_envs=N)
     env.reset(seed=7)
     clear.reset(seed=7)
-    for late, now in zip(torques().swapaxes(0, 1), shifted(torques(), TAU).swapaxes(0, 1), strict=True):
+    for late, now in zip(
+        torques().swapaxes(0, 1), shifted(torques(), TAU).swapaxes(0, 1), strict=True
+    ):
         np.testing.assert_array_equal(env.step(late)[1], clear.step(now)[1])
 
 
@@ -245,13 +261,20 @@ def test_in_bulk_too_noise_has_mean_zero_and_the_given_size_in_every_dimension()
     n = error[..., 0].size
     assert np.abs(error.mean((0, 1))).max() < 3 / np.sqrt(n)
     assert np.abs(error.std((0, 1)) - 1).max() < 3 / np.sqrt(2 * n)
-    for one, other in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1]), (error[..., 1:], error[..., :-1])):
-        assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 3 / np.sqrt(one.size)  # one draw for each number
+    for one, other in (
+        (error[1:], error[:-1]),
+        (error[:, 1:], error[:, :-1]),
+        (error[..., 1:], error[..., :-1]),
+    ):
+        assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 3 / np.sqrt(
+            one.size
+        )  # one draw for each number
 
 
 def test_the_noise_of_an_episode_does_not_depend_on_how_many_there_are() -> None:
-    np.testing.assert_array_equal(at_once(many(n=2, sigma=0.25), torques(2)),
-                                  at_once(many(n=9, sigma=0.25), torques(9))[:2])  # fmt: skip
+    np.testing.assert_array_equal(
+        at_once(many(n=2, sigma=0.25), torques(2)), at_once(many(n=9, sigma=0.25), torques(9))[:2]
+    )
 
 
 def test_a_reset_forgets_torques_and_states_and_draws_other_noise() -> None:
@@ -272,17 +295,25 @@ def test_what_an_observer_does_to_its_observation_does_not_reach_the_truth() -> 
     np.testing.assert_array_equal(env.truth, plain(ENV, torques()))
 
 
-def test_torques_that_cannot_be_simulated_are_refused_when_they_are_sent_and_not_when_they_arrive() -> None:
+def test_torques_that_cannot_be_simulated_are_refused_when_they_are_sent_and_not_when_they_arrive() -> (
+    None
+):
     env = many(tau=TAU)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.rollout(torques())
     env.reset(seed=7)
     bad = torques()
     bad[1, STEPS - 2, 0] = np.nan
-    with pytest.raises(ValueError, match=f"episode 1, step {STEPS - 2}, joint 0: nan. Nothing was simulated"):
+    with pytest.raises(
+        ValueError, match=f"episode 1, step {STEPS - 2}, joint 0: nan. Nothing was simulated"
+    ):
         env.rollout(bad)
-    with pytest.raises(ValueError, match=rf"actions are \(2, {STEPS}, 2\); {ENV} expected \(N=3, T, 2\)"):
+    with pytest.raises(
+        ValueError, match=rf"actions are \(2, {STEPS}, 2\); {ENV} expected \(N=3, T, 2\)"
+    ):
         env.rollout(torques(2))
     with pytest.raises(ValueError, match=r"expected \(N=3, T, 2\)"):
         env.step(torques()[:2, 0])
-    np.testing.assert_array_equal(env.rollout(torques()), plain(ENV, shifted(torques(), TAU))[:, 1:])
+    np.testing.assert_array_equal(
+        env.rollout(torques()), plain(ENV, shifted(torques(), TAU))[:, 1:]
+    )

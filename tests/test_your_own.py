@@ -21,10 +21,10 @@ import tsmlib
 from tsmlib.envs import drawing
 from tsmlib.envs.snapshots import restore, save
 from tsmlib.storage import tables
-from tsmlib.study import publish, robots, runs
-from tsmlib.study.media import film
-from tsmlib.study.results import robots as results
-from tsmlib.study.runs import ROOT, Run
+from reproduction import publish, robots, runs
+from reproduction.media import film
+from reproduction.results import robots as results
+from reproduction.runs import ROOT, Run
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 PENDULUM, HOPPER, CHEETAH = results.ENVS
@@ -42,22 +42,34 @@ def pendulum(**options: Any) -> Trajectories:
 def robot_cells() -> dict[str, str]:
     """Environment -> the cell of the notebook that goes from its id to a film."""
     cells = [cell.source for cell in nbformat.read(runs.notebooks()["your_own"].path, 4).cells]
-    return {env: next(cell for cell in cells if f'collect_random("{env}"' in cell) for env in results.ENVS}
+    return {
+        env: next(cell for cell in cells if f'collect_random("{env}"' in cell)
+        for env in results.ENVS
+    }
 
 
 @pytest.mark.parametrize(("env", "most"), [(PENDULUM, 13), (HOPPER, 15), (CHEETAH, 15)])
 def test_from_an_id_to_a_film_it_is_a_cell_of_the_public_interface(env: str, most: int) -> None:
     cell = robot_cells()[env]
-    assert len(cell.splitlines()) <= most  # that of the pendulum has one of the film beyond twelve to the executed plan
+    assert (
+        len(cell.splitlines()) <= most
+    )  # that of the pendulum has one of the film beyond twelve to the executed plan
     assert set(re.findall(r"tsmlib\.(\w+)", cell)) <= set(tsmlib.__all__)
     assert cell.splitlines()[-1].startswith("figures.embed(tsmlib.film(task, trial, ")
-    assert all(word in cell for word in ("tsmlib.fit(", "tsmlib.Task.from_env(", "tsmlib.mpc(", 'progress="'))
+    assert all(
+        word in cell
+        for word in ("tsmlib.fit(", "tsmlib.Task.from_env(", "tsmlib.mpc(", 'progress="')
+    )
 
 
 def test_from_an_id_to_an_executed_plan_the_pendulum_of_the_guide_takes_twelve_lines() -> None:
     text = (ROOT / "docs" / "howto" / "own_robot.md").read_text()  # whose programs test_docs runs
-    block = next(block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if PENDULUM in block)
-    lines = [line for line in block.splitlines() if line and not line.startswith(("import ", "print("))]
+    block = next(
+        block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if PENDULUM in block
+    )
+    lines = [
+        line for line in block.splitlines() if line and not line.startswith(("import ", "print("))
+    ]
     assert len(lines) <= 12
     assert lines[-1].startswith("trial = tsmlib.execute(")
 
@@ -68,8 +80,12 @@ def test_from_an_id_to_an_executed_plan_the_pendulum_of_the_guide_takes_twelve_l
 def test_robots_are_drawn_from_what_they_observe_and_others_are_named() -> None:
     drawn = [PENDULUM, HOPPER, CHEETAH, "Walker2d-v5", "InvertedPendulum-v5"]
     others = ["Ant-v5", "Swimmer-v5", "Reacher-v5", "MountainCarContinuous-v0"]
-    assert [drawing.drawable(env) for env in drawn + others] == [True] * len(drawn) + [False] * len(others)
-    with pytest.raises(ValueError, match="Ant-v5 cannot be drawn from its observations; film it by its own render"):
+    assert [drawing.drawable(env) for env in drawn + others] == [True] * len(drawn) + [False] * len(
+        others
+    )
+    with pytest.raises(
+        ValueError, match="Ant-v5 cannot be drawn from its observations; film it by its own render"
+    ):
         drawing.frames("Ant-v5", np.zeros((2, 105)))
 
 
@@ -122,7 +138,11 @@ def made() -> Iterator[Callable[..., str]]:
 
     def make(**how: Any) -> str:
         names.append(f"tests/Pictured{len(names)}-v0")
-        register(names[-1], entry_point=lambda **options: Pictured(**how, **options), max_episode_steps=200)
+        register(
+            names[-1],
+            entry_point=lambda **options: Pictured(**how, **options),
+            max_episode_steps=200,
+        )
         return names[-1]
 
     yield make
@@ -135,7 +155,9 @@ def executed(env: str, horizon: int = 4) -> tuple[tsmlib.Task, tsmlib.Trial]:
     task = tsmlib.Task.from_env(env, n=2, horizon=horizon, reward=still)
     space = tsmlib.DirectActions(horizon, task.action_dim, rms=0.5)
     model = tsmlib.OneStep.for_data(tsmlib.collect_random(env, episodes=2, horizon=10), hidden=8)
-    return task, tsmlib.mpc(task, model, space, partial(tsmlib.cem, candidates=4, elites=2, iterations=1), every=4)
+    return task, tsmlib.mpc(
+        task, model, space, partial(tsmlib.cem, candidates=4, elites=2, iterations=1), every=4
+    )
 
 
 def test_a_film_shows_prediction_and_execution_to_the_end_of_the_episode() -> None:
@@ -146,11 +168,15 @@ def test_a_film_shows_prediction_and_execution_to_the_end_of_the_episode() -> No
     assert found.shape[2] == 2 * drawing.WIDTH
 
 
-def test_a_robot_that_cannot_be_drawn_films_itself_or_says_what_is_missing(made: Callable[..., str]) -> None:
+def test_a_robot_that_cannot_be_drawn_films_itself_or_says_what_is_missing(
+    made: Callable[..., str],
+) -> None:
     task, trial = executed(made())
     assert [frame[-1, -1, 0] for frame in film(task, trial, 1)] == [1, 2, 3, 4]
     task, trial = executed(made(broken=True))
-    with pytest.raises(RuntimeError, match=r"tests/Pictured1-v0 gives no pictures here: no screen.*MUJOCO_GL=egl"):
+    with pytest.raises(
+        RuntimeError, match=r"tests/Pictured1-v0 gives no pictures here: no screen.*MUJOCO_GL=egl"
+    ):
         film(task, trial, 0)
 
 
@@ -165,30 +191,58 @@ def test_a_model_is_trained_for_about_as_long_as_was_asked() -> None:
 
 
 def test_the_oracle_is_the_same_planner_and_beats_doing_nothing() -> None:
-    task = tsmlib.Task.from_env(PENDULUM, n=3, horizon=10, seed=5, reward=lambda x, u: -x[..., 2].square())
+    task = tsmlib.Task.from_env(
+        PENDULUM, n=3, horizon=10, seed=5, reward=lambda x, u: -x[..., 2].square()
+    )
     space = tsmlib.DirectActions(10, 1, rms=0.5)
     planner = partial(tsmlib.cem, candidates=12, elites=3, iterations=2)
     trial = tsmlib.execute(task, torch.zeros(3, 10, 1))
-    rows = tables.frame(robots.reference_rows(RUN, task, "rtsm", trial, space, planner, every=5, n=2))
+    rows = tables.frame(
+        robots.reference_rows(RUN, task, "rtsm", trial, space, planner, every=5, n=2)
+    )
     found = rows[rows["metric"] == "return_true"].set_index(["model", "planner"])
-    assert set(found.index) == {("rtsm", "cem"), ("oracle", "cem"), ("none", "zero"), ("none", "random")}
+    assert set(found.index) == {
+        ("rtsm", "cem"),
+        ("oracle", "cem"),
+        ("none", "zero"),
+        ("none", "random"),
+    }
     assert found["n"].tolist() == [3, 2, 3, 3]
     nothing = tsmlib.execute(task.take(2), torch.zeros(2, 10, 1)).executed_return.mean()
     assert found.loc[("oracle", "cem"), "value"] > nothing
-    assert found.loc[("rtsm", "cem"), "value"] == pytest.approx(found.loc[("none", "zero"), "value"])
+    assert found.loc[("rtsm", "cem"), "value"] == pytest.approx(
+        found.loc[("none", "zero"), "value"]
+    )
 
 
 def test_the_sentence_and_the_tables_say_what_the_rows_say() -> None:
     common = dict(env=HOPPER, planner="none", execution="open loop", n=7, seed=0, scale="smoke")
-    rows = tables.frame([
-        common | dict(model=model, metric=metric, steps_ahead=steps, value=value * steps)
-        for model, value in (("rtsm", 0.02), ("lstm", 0.04), ("onestep", 0.05))
-        for metric in results.SCORES for steps in results.AHEAD
-    ] + [common | dict(model=model, metric="train_seconds", value=9.0) for model in ("rtsm", "lstm", "onestep")]
-    )  # fmt: skip
-    assert "`rtsm` is 0.50 times that of the best other, `lstm`, at 10 steps" in results.sentences(rows)
+    rows = tables.frame(
+        [
+            common | dict(model=model, metric=metric, steps_ahead=steps, value=value * steps)
+            for model, value in (("rtsm", 0.02), ("lstm", 0.04), ("onestep", 0.05))
+            for metric in results.SCORES
+            for steps in results.AHEAD
+        ]
+        + [
+            common | dict(model=model, metric="train_seconds", value=9.0)
+            for model in ("rtsm", "lstm", "onestep")
+        ]
+    )
+    assert "`rtsm` is 0.50 times that of the best other, `lstm`, at 10 steps" in results.sentences(
+        rows
+    )
     lines = results.scores_table(rows).splitlines()
-    assert [cell.strip() for cell in lines[2].split("|")][2:] == ["`rtsm`", "0.2", "1", "0.2", "1", "9", "7", ""]
+    assert [cell.strip() for cell in lines[2].split("|")][2:] == [
+        "`rtsm`",
+        "0.2",
+        "1",
+        "0.2",
+        "1",
+        "9",
+        "7",
+        "",
+    ]
     assert "-0.86" in results.model_free_table()
 
 
@@ -212,8 +266,18 @@ def test_the_table_of_one_notebook_is_published_with_all_its_seeds(
 
 def test_actions_of_another_scale_are_refused_with_what_to_divide_them_by() -> None:
     data = pendulum()
-    with pytest.raises(TrajectoryError, match=r"go up to 2.*within \[-1, 1\].*actions / env.action_space.high"):
-        Trajectories(data.states, 2 * np.sign(data.actions), PENDULUM, data.dt, data.names, data.units, angles=())
+    with pytest.raises(
+        TrajectoryError, match=r"go up to 2.*within \[-1, 1\].*actions / env.action_space.high"
+    ):
+        Trajectories(
+            data.states,
+            2 * np.sign(data.actions),
+            PENDULUM,
+            data.dt,
+            data.names,
+            data.units,
+            angles=(),
+        )
 
 
 def test_no_dimension_is_taken_for_an_angle_unless_it_is_named() -> None:
@@ -223,14 +287,23 @@ def test_no_dimension_is_taken_for_an_angle_unless_it_is_named() -> None:
         assert model.for_data(data).features.angles == []  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("model", [tsmlib.TSM, tsmlib.RecurrentTSM, tsmlib.OneStep, tsmlib.LSTM, tsmlib.Ensemble])
+@pytest.mark.parametrize(
+    "model", [tsmlib.TSM, tsmlib.RecurrentTSM, tsmlib.OneStep, tsmlib.LSTM, tsmlib.Ensemble]
+)
 def test_a_model_that_was_never_fitted_neither_scores_nor_plans(model: Any) -> None:
     data, net = pendulum(), model(3, 1)
-    with pytest.raises(ValueError, match=rf"features of this {model.__name__} were never fitted.*for_data\(traj"):
+    with pytest.raises(
+        ValueError, match=rf"features of this {model.__name__} were never fitted.*for_data\(traj"
+    ):
         tsmlib.score(net, net.features, data, data, samples=1, horizon=5)
     task = tsmlib.Task.from_env(PENDULUM, n=2, horizon=10, reward=still)
     with pytest.raises(ValueError, match="were never fitted, so it cannot predict"):
-        tsmlib.cem(tsmlib.model_predictor(net, task.past(net.past_len)), still, tsmlib.DirectActions(10, 1), 2)
+        tsmlib.cem(
+            tsmlib.model_predictor(net, task.past(net.past_len)),
+            still,
+            tsmlib.DirectActions(10, 1),
+            2,
+        )
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from .evaluation.prediction import score as score
 from .exploration import Exploration as Exploration
 from .exploration import ExplorationOptions as ExplorationOptions
 from .exploration import explore as explore
+from .film import film as film
 from .fine_tuning import fine_tune as fine_tune
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
@@ -35,11 +36,10 @@ from .policies.learning import LearningOptions as LearningOptions
 from .policies.learning import learn_policy as learn_policy
 from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy
+from .pretrained import load_pretrained as load_pretrained
+from .pretrained import load_task as load_task
 from .storage.artifacts import load_model as load_model
 from .storage.artifacts import save_model as save_model
-from .study.media import film as film
-from .study.models import load_pretrained as load_pretrained
-from .study.tasks import load_task as load_task
 from .training.callbacks import Callback as Callback
 from .training.callbacks import CsvCallback as CsvCallback
 from .training.callbacks import Progress as Progress

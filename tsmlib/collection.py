@@ -15,7 +15,9 @@ from torch import Tensor
 from tsmlib.envs.stepping import Seeds, Simulation, make_simulation, simulation
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
-Controller = Callable[[Segment], Tensor]  # the past (N, L, .) -> the next K actions (N, K, du), then asked again
+Controller = Callable[
+    [Segment], Tensor
+]  # the past (N, L, .) -> the next K actions (N, K, du), then asked again
 
 
 def collect(
@@ -50,7 +52,9 @@ def collect(
     while taken < horizon and not episodes.ended.all():
         actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
         if actions.shape[1] < 1:
-            raise ValueError(f"the controller gave no actions when asked at step {taken} of {horizon}")
+            raise ValueError(
+                f"the controller gave no actions when asked at step {taken} of {horizon}"
+            )
         reached = episodes.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)
@@ -60,7 +64,11 @@ def collect(
     inside = np.arange(longest) < episodes.steps[:, None]
     return Trajectories(
         states=np.concatenate(seen, axis=1, dtype=np.float32)[:, : longest + 1],
-        actions=np.where(inside[..., None], np.concatenate(done, axis=1, dtype=np.float32)[:, :longest], np.float32(0)),
+        actions=np.where(
+            inside[..., None],
+            np.concatenate(done, axis=1, dtype=np.float32)[:, :longest],
+            np.float32(0),
+        ),
         env=episodes.id,
         dt=episodes.dt,
         names=episodes.names,
@@ -78,7 +86,8 @@ def collect_random(
     horizon: int = 100,
     seed: int = 0,
     rms: float = 0.5,  # of full action
-    time_constant: float | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
+    time_constant: float
+    | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
 ) -> Trajectories:
     """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone.
 
@@ -88,9 +97,14 @@ def collect_random(
     seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:
         actions = smooth_torques(
-            episodes, horizon, generator=torch.Generator().manual_seed(seed), action_dim=run.action_dim, rms=rms,
-            time_constant=time_constant or 1.5 * run.dt, dt=run.dt,
-        )  # fmt: skip
+            episodes,
+            horizon,
+            generator=torch.Generator().manual_seed(seed),
+            action_dim=run.action_dim,
+            rms=rms,
+            time_constant=time_constant or 1.5 * run.dt,
+            dt=run.dt,
+        )
         return collect(run, open_loop(actions), horizon=horizon, seed=seed)
 
 
@@ -109,15 +123,23 @@ def smooth_torques(
     The filter starts at rest, so the first torques are small; they settle to a root mean square of ``rms``, clipped.
     """
     if n < 1 or horizon < 1:
-        raise ValueError(f"n is {n}, horizon is {horizon}, expected a positive number of episodes and of steps")
+        raise ValueError(
+            f"n is {n}, horizon is {horizon}, expected a positive number of episodes and of steps"
+        )
     keep = np.exp(-dt / time_constant)
     noise = torch.randn(n, horizon, action_dim, generator=generator).numpy()
-    once, twice, torques = np.zeros((n, action_dim)), np.zeros((n, action_dim)), np.empty_like(noise)
+    once, twice, torques = (
+        np.zeros((n, action_dim)),
+        np.zeros((n, action_dim)),
+        np.empty_like(noise),
+    )
     for step in range(horizon):
         once = keep * once + (1 - keep) * noise[:, step]
         twice = keep * twice + (1 - keep) * once
         torques[:, step] = twice
-    settled = (1 - keep) ** 2 * np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # standard deviation of two equal poles
+    settled = (1 - keep) ** 2 * np.sqrt(
+        (1 + keep**2) / (1 - keep**2) ** 3
+    )  # standard deviation of two equal poles
     return torch.from_numpy((torques * (rms / settled)).clip(-1, 1).astype(np.float32))
 
 

@@ -55,7 +55,10 @@ Tasks = Callable[[int], Task]  # round -> the tasks of its episodes
 Measure = Callable[[DynamicsModel, ActionPrior | None], Mapping[str, float]]  # named numbers
 Episodes = Callable[[int], Trajectories | None]  # round -> episodes that no plan made, or none
 SECONDS = ("cpu_seconds", "wall_seconds")
-BY_MODE: Mapping[str, Json] = {"judging": 0, "screened": 1.0}  # as all plans were judged before there was a choice
+BY_MODE: Mapping[str, Json] = {
+    "judging": 0,
+    "screened": 1.0,
+}  # as all plans were judged before there was a choice
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,29 @@ class ExplorationOptions:
     screened: float = 0.25
 
     def __post_init__(self) -> None:
-        least = {"rounds": 1, "every": 1, "candidates": 2, "elites": 1, "iterations": 1, "samples": 2, "judging": 0}
+        least = {
+            "rounds": 1,
+            "every": 1,
+            "candidates": 2,
+            "elites": 1,
+            "iterations": 1,
+            "samples": 2,
+            "judging": 0,
+        }
         for name, low in least.items():
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
-                raise ValueError(f"{name} is {value!r:.80}; expected a whole number of at least {low}")
+                raise ValueError(
+                    f"{name} is {value!r:.80}; expected a whole number of at least {low}"
+                )
         if self.elites > self.candidates:
-            raise ValueError(f"elites is {self.elites}, of {self.candidates} candidates; expected no more than these")
+            raise ValueError(
+                f"elites is {self.elites}, of {self.candidates} candidates; expected no more than these"
+            )
         if not 0 < self.rms < math.inf:
-            raise ValueError(f"rms is {self.rms}, expected the size of the torques to search, above zero")
+            raise ValueError(
+                f"rms is {self.rms}, expected the size of the torques to search, above zero"
+            )
         for name in ("noise", "bonus"):
             if not 0 <= (value := getattr(self, name)) < math.inf:
                 raise ValueError(f"{name} is {value}; expected a finite number, zero or above")
@@ -139,9 +156,11 @@ def explore(
     seed: int = 0,
     folder: Path | None = None,  # of its own
     progress: str = "",
-    measure: Measure | None = None,  # of model and prior, after every round, by names that no record has
+    measure: Measure
+    | None = None,  # of model and prior, after every round, by names that no record has
     callback: Callback | None = None,  # at every round
-    augmented: Callable[[Trajectories], Trajectories] | None = None,  # of what the model is trained on
+    augmented: Callable[[Trajectories], Trajectories]
+    | None = None,  # of what the model is trained on
     episodes: Episodes | None = None,  # in place of plans, to compare with
 ) -> Exploration:
     """Rounds of planning, executing and learning, by a ``model`` and a ``prior`` that were trained on ``train``.
@@ -165,27 +184,41 @@ def explore(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
             "Take bonus=0, or an ensemble or a segment model"
         )
-    if options.bonus or not as_dynamics(model).stochastic:  # by the bonus's samples, or by the one rollout
+    if (
+        options.bonus or not as_dynamics(model).stochastic
+    ):  # by the bonus's samples, or by the one rollout
         options = replace(options, judging=0, screened=1.0)
-    weights = model.state_dict() | ({} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()})
+    weights = model.state_dict() | (
+        {} if prior is None else {f"prior.{k}": v for k, v in prior.state_dict().items()}
+    )
     identity: dict[str, Json] = {
-        "options": asdict(options), "seed": seed, "env": train.env, "began with": artifacts.digest(weights)[:16],
+        "options": asdict(options),
+        "seed": seed,
+        "env": train.env,
+        "began with": artifacts.digest(weights)[:16],
         "configurations": [net.config() for net in (model, prior) if net is not None],
         "data": [artifacts.trajectories_digest(data) for data in (train, held_out)],
         "episodes": "planned" if episodes is None else "given",
-    }  # fmt: skip
+    }
     found, began = Exploration(train, held_out), time.process_time()
     with ExitStack() as stack:
         if folder is not None:
             stack.enter_context(writer_lock(folder, f"exploration, seed {seed}"))
         for k in tqdm(range(1, options.rounds + 1), desc=progress, disable=not progress):
-            place = None if folder is None else _Round(folder / f"round-{k:03d}", encode_nonfinite(identity))
+            place = (
+                None
+                if folder is None
+                else _Round(folder / f"round-{k:03d}", encode_nonfinite(identity))
+            )
             new, record = (
                 _collected(k, model, prior, train, tasks, options, seed, place)
-                if episodes is None else (episodes(k), dict[str, float]())
-            )  # fmt: skip
+                if episodes is None
+                else (episodes(k), dict[str, float]())
+            )
             found.episodes.append(new)
-            before = (found.records[-1]["env_steps"] if found.records else 0) + int(record.get("discarded_steps", 0))
+            before = (found.records[-1]["env_steps"] if found.records else 0) + int(
+                record.get("discarded_steps", 0)
+            )
             if new is not None:
                 n = min(len(new) - 1, max(1, round(options.held_out * len(new))))
                 if n:
@@ -194,7 +227,9 @@ def explore(
                 before += int(new.steps.sum())
             record = {"round": k, "env_steps": before} | record
             train_on = found.train if augmented is None else augmented(found.train)
-            record = _trained(k, model, prior, found, train_on, record, options, seed, place, measure)
+            record = _trained(
+                k, model, prior, found, train_on, record, options, seed, place, measure
+            )
             found.seconds.append({name: record.pop(name) for name in SECONDS if name in record})
             found.records.append(record)
             if callback is not None:
@@ -202,7 +237,9 @@ def explore(
     return found
 
 
-def _require_robot(model: Trainable, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories) -> None:
+def _require_robot(
+    model: Trainable, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories
+) -> None:
     """Error unless all are of one robot, as far as their sizes and names tell."""
     train.require_robot_of(held_out)
     require_robot(model, train, "a model of the robot that explores")
@@ -215,51 +252,90 @@ def _require_robot(model: Trainable, prior: ActionPrior | None, train: Trajector
 
 
 def _collected(
-    k: int, model: Trainable, prior: ActionPrior | None, like: Trajectories, tasks: Tasks,
-    options: ExplorationOptions, seed: int, place: _Round | None,
-) -> tuple[Trajectories | None, dict[str, float]]:  # fmt: skip
+    k: int,
+    model: Trainable,
+    prior: ActionPrior | None,
+    like: Trajectories,
+    tasks: Tasks,
+    options: ExplorationOptions,
+    seed: int,
+    place: _Round | None,
+) -> tuple[Trajectories | None, dict[str, float]]:
     """The episodes of round k and what is said of them, from the folder if they are there; None where all are lost."""
     if place is not None and (stored := place.episodes()) is not None:
         return stored
     began, task = _now(), tasks(k)
     if task.env != like.env:
-        raise ValueError(f"the tasks of round {k} are of {task.env}, the data of {like.env}; expected one robot")
+        raise ValueError(
+            f"the tasks of round {k} are of {task.env}, the data of {like.env}; expected one robot"
+        )
     if len(task) < 2:
-        raise ValueError(f"round {k} has {len(task)} task; expected at least 2, since one episode is held out")
-    bonus = partial(_with_bonus, weight=options.bonus, scale=torch.from_numpy(like.states.std((0, 1))))
-    aim = replace(task, reward_for=lambda target: bonus(task.reward_for(target))) if options.bonus else task
+        raise ValueError(
+            f"round {k} has {len(task)} task; expected at least 2, since one episode is held out"
+        )
+    bonus = partial(
+        _with_bonus, weight=options.bonus, scale=torch.from_numpy(like.states.std((0, 1)))
+    )
+    aim = (
+        replace(task, reward_for=lambda target: bonus(task.reward_for(target)))
+        if options.bonus
+        else task
+    )
     direct = DirectActions(task.horizon, task.action_dim, rms=options.rms)
     space = direct if prior is None else LatentActions(prior, task.horizon)
     draw = seed * 1_000_003 + 1000 * k
     planner: Planner = partial(
-        cem, candidates=options.candidates, elites=options.elites, iterations=options.iterations,
-        screened=options.screened, seed=draw,
-    )  # fmt: skip
+        cem,
+        candidates=options.candidates,
+        elites=options.elites,
+        iterations=options.iterations,
+        screened=options.screened,
+        seed=draw,
+    )
     if options.noise:
-        planner = _Perturbed(planner, options.noise, torch.Generator().manual_seed(-1 - draw))  # of no search
+        planner = _Perturbed(
+            planner, options.noise, torch.Generator().manual_seed(-1 - draw)
+        )  # of no search
     judge: Judge = model_predictor
     if options.bonus:
         judge = partial(model_predictor, samples=options.samples)
     elif options.judging:
         judge = partial(expected_predictor, samples=options.judging)
     stable = without_unstable(
-        aim, lambda left, _: mpc(left, model, space, planner, every=options.every, judge=judge, seed=draw + 1)
+        aim,
+        lambda left, _: mpc(
+            left, model, space, planner, every=options.every, judge=judge, seed=draw + 1
+        ),
     )
     counted: dict[str, float] = {"lost": stable.lost, "discarded_steps": stable.discarded_steps}
     if (trial := stable.found) is None:
         return None, _unknown(task, bonus=bool(options.bonus)) | counted | _since(began)
     record = _said(trial, bonus=bool(options.bonus)) | counted | _since(began)
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
-    episodes = replace(like, states=seen.states, actions=seen.actions, lengths=seen.lengths, terminated=seen.terminated)
+    episodes = replace(
+        like,
+        states=seen.states,
+        actions=seen.actions,
+        lengths=seen.lengths,
+        terminated=seen.terminated,
+    )
     if place is not None:
         place.keep_episodes(episodes, record)
     return episodes, record
 
 
 def _trained(
-    k: int, model: Trainable, prior: ActionPrior | None, found: Exploration, augmented: Trajectories,
-    record: dict[str, float], options: ExplorationOptions, seed: int, place: _Round | None, measure: Measure | None,
-) -> dict[str, float]:  # fmt: skip
+    k: int,
+    model: Trainable,
+    prior: ActionPrior | None,
+    found: Exploration,
+    augmented: Trajectories,
+    record: dict[str, float],
+    options: ExplorationOptions,
+    seed: int,
+    place: _Round | None,
+    measure: Measure | None,
+) -> dict[str, float]:
     """The record of round k with what training gave; ``model`` and ``prior`` trained, or loaded if they are there."""
     if place is not None and (stored := place.models(model, prior)) is not None:
         return stored
@@ -310,7 +386,9 @@ def _said(trial: Trial, *, bonus: bool) -> dict[str, float]:
 
 def _unknown(task: Task, *, bonus: bool) -> dict[str, float]:
     """The names of ``_said`` for a round without episodes, all NaN, so that every record has the same columns."""
-    final_distance, success = task.judged(torch.from_numpy(task.start)[:, None].expand(-1, task.horizon + 1, -1))
+    final_distance, success = task.judged(
+        torch.from_numpy(task.start)[:, None].expand(-1, task.horizon + 1, -1)
+    )
     names = ["executed_return"]
     names += ["success"] if success is not None else []
     names += ["final_distance"] if not final_distance.isnan().any() else []
@@ -342,7 +420,9 @@ class _Perturbed:
     deviation: float
     generator: torch.Generator
 
-    def __call__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /) -> Plan:
+    def __call__(
+        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /
+    ) -> Plan:
         plan = self.planner(predict, reward, space, start)
         noise = space.noise(1, len(plan.parameters), self.generator)[0]
         parameters = plan.parameters + self.deviation * space.scale * noise
@@ -364,7 +444,9 @@ class _Round:
         return (None, self._record(whole)) if whole.exists() else None  # all were lost
 
     def keep_episodes(self, episodes: Trajectories, record: Mapping[str, float]) -> None:
-        artifacts.save_trajectories(self.folder / "episodes.safetensors", episodes, self._header(record))
+        artifacts.save_trajectories(
+            self.folder / "episodes.safetensors", episodes, self._header(record)
+        )
 
     def models(self, model: Trainable, prior: ActionPrior | None) -> dict[str, float] | None:
         """The record of the whole round, its weights now in ``model`` and ``prior``; None if not all is there."""
@@ -374,14 +456,20 @@ class _Round:
         record = self._record(path)
         for name, part in {"model": cast(nn.Module, model), "prior": prior}.items():
             if part is not None:
-                stored = artifacts.load_model(self.folder / f"{name}.safetensors", cast(Any, type(part)))
+                stored = artifacts.load_model(
+                    self.folder / f"{name}.safetensors", cast(Any, type(part))
+                )
                 part.load_state_dict(stored.state_dict())
         return record
 
-    def keep_models(self, model: Trainable, prior: ActionPrior | None, record: Mapping[str, float]) -> None:
+    def keep_models(
+        self, model: Trainable, prior: ActionPrior | None, record: Mapping[str, float]
+    ) -> None:
         if prior is not None:
             artifacts.save_model(self.folder / "prior.safetensors", prior, self._header(record))
-        artifacts.save_model(self.folder / "model.safetensors", cast(Any, model), self._header(record))
+        artifacts.save_model(
+            self.folder / "model.safetensors", cast(Any, model), self._header(record)
+        )
         for checkpoint in self.folder.glob("*.checkpoint"):
             shutil.rmtree(checkpoint)
 
@@ -391,7 +479,10 @@ class _Round:
     def _record(self, path: Path) -> dict[str, float]:
         header = artifacts.read_header(path)
         stored = cast(dict[str, Json], header.get("identity", {}))
-        later: dict[str, Json] = {"episodes": "planned", "configurations": self.identity["configurations"]}
+        later: dict[str, Json] = {
+            "episodes": "planned",
+            "configurations": self.identity["configurations"],
+        }
         options = {"rms": 0.1, **BY_MODE, **cast(dict[str, Json], stored.get("options", {}))}
         found = later | stored | {"options": options}
         if differs := artifacts.differences(found, dict(self.identity)):

@@ -61,13 +61,23 @@ def fine_tune(
     try:
         with _only(model, part):
             history = fit(
-                model, loss, train, validation, options,
-                seed=seed, device=device, checkpoint=checkpoint, progress=progress, callback=callback,
-            )  # fmt: skip
+                model,
+                loss,
+                train,
+                validation,
+                options,
+                seed=seed,
+                device=device,
+                checkpoint=checkpoint,
+                progress=progress,
+                callback=callback,
+            )
     except TrainingStopped as stopped:
         if not validate(loss, held_out, seed) < before:
             model.load_state_dict(first)
-            stopped.add_note("These were no better than the weights that it began with, which the model has again.")
+            stopped.add_note(
+                "These were no better than the weights that it began with, which the model has again."
+            )
         raise
     if min(history.validation) >= before:
         model.load_state_dict(first)
@@ -86,7 +96,11 @@ def _only(model: nn.Module, part: Part) -> Iterator[None]:
             stack.enter_context(_frozen(model))
             stack.enter_context(learned_codes(model))
         else:
-            has = [name for name, kind in (("head", Headed), ("codes", CodeLayers)) if isinstance(model, kind)]
+            has = [
+                name
+                for name, kind in (("head", Headed), ("codes", CodeLayers))
+                if isinstance(model, kind)
+            ]
             raise ValueError(
                 f"part is {part!r:.80}; of {type(model).__name__} one can train {', '.join(map(repr, ['all', *has]))}"
             )

@@ -10,7 +10,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-Reward = Callable[[Tensor, Tensor], Tensor]  # states (..., B, T, dx), actions (..., B, T, du) -> (..., B, T)
+Reward = Callable[
+    [Tensor, Tensor], Tensor
+]  # states (..., B, T, dx), actions (..., B, T, du) -> (..., B, T)
 
 TIP = slice(4, 6)  # fingertip x, y in the state, metres
 BLOCK = slice(6, 8)  # block x, y in the state, metres
@@ -80,8 +82,14 @@ def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
         ) from error
     expected = torch.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
     if not isinstance(found, Tensor) or found.shape != expected:
-        what = f"a tensor {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
-        raise ValueError(f"the reward of {given} is {what}; expected a tensor {tuple(expected)}, one number per step")
+        what = (
+            f"a tensor {tuple(found.shape)}"
+            if isinstance(found, Tensor)
+            else f"a {type(found).__name__}"
+        )
+        raise ValueError(
+            f"the reward of {given} is {what}; expected a tensor {tuple(expected)}, one number per step"
+        )
     unexplained = found.isnan() & torch.isfinite(states).all(-1)
     if unexplained.any():
         where = unexplained.nonzero()[0].tolist()

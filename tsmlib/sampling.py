@@ -47,7 +47,9 @@ class GivenNoise:
         """ValueError for another shape than that which was drawn."""
         given = self.numbers.pop(0)
         if tuple(given.shape) != tuple(shape):
-            raise ValueError(f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn")
+            raise ValueError(
+                f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn"
+            )
         return given
 
 
@@ -79,10 +81,14 @@ def generator_of(*key: int) -> torch.Generator:
 
     Seeds that differ by a sum could meet; and on a CPU torch keeps the low 32 bits of a seed alone.
     """
-    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
+    return torch.Generator().manual_seed(
+        int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1)
+    )
 
 
-def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNoise, like: Tensor) -> Tensor:
+def standard_normal(
+    shape: Sequence[int], noise: Noise | GivenNoise | RecordedNoise, like: Tensor
+) -> Tensor:
     """Draw N(0, 1) of ``shape`` with the device and type of ``like``: the same numbers on any device."""
     if isinstance(noise, NoNoise):
         return like.new_zeros(tuple(shape))
@@ -93,15 +99,22 @@ def standard_normal(shape: Sequence[int], noise: Noise | GivenNoise | RecordedNo
         return like.new_zeros(tuple(shape))
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])
-        return torch.cat([standard_normal(share, generator, like) for generator in noise.generators])
+        return torch.cat(
+            [standard_normal(share, generator, like) for generator in noise.generators]
+        )
     if isinstance(noise, SharedNoise):
         drawn = standard_normal((noise.period, *shape[1:]), noise.generator, like)
         return drawn.repeat(shape[0] // noise.period, *[1] * (len(shape) - 1))
-    return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(like.device)
+    return torch.randn(shape, generator=noise, device=noise.device, dtype=like.dtype).to(
+        like.device
+    )
 
 
 def random_indices(
-    below: int, shape: Sequence[int], noise: torch.Generator | GivenNoise | RecordedNoise, device: torch.device
+    below: int,
+    shape: Sequence[int],
+    noise: torch.Generator | GivenNoise | RecordedNoise,
+    device: torch.device,
 ) -> Tensor:
     """Indices from 0 to ``below`` - 1, all equally likely, on ``device``. Only losses draw them: the noise of planners
     (``SharedNoise``, ...) is not accepted."""
@@ -128,9 +141,13 @@ def by_generator(
         for k, generator in enumerate(noise.generators):
             yield slice(k * share, (k + 1) * share), generator
     else:
-        begun = [generator.get_state() for _, generator in by_generator(noise.period, noise.generator)]
+        begun = [
+            generator.get_state() for _, generator in by_generator(noise.period, noise.generator)
+        ]
         for first in range(0, rows, noise.period):
-            for (part, generator), state in zip(by_generator(noise.period, noise.generator), begun, strict=True):
+            for (part, generator), state in zip(
+                by_generator(noise.period, noise.generator), begun, strict=True
+            ):
                 generator.set_state(state)
                 yield slice(first + part.start, first + part.stop), generator
 

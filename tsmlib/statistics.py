@@ -66,7 +66,9 @@ def holm(p_values: ArrayLike, levels: ArrayLike) -> np.ndarray:
     """Which of several hypotheses Holm's procedure rejects (n,), each p value held against its own level; NaN: none."""
     p, level = np.asarray(p_values, dtype=float), np.asarray(levels, dtype=float)
     rejected, asked = np.zeros(len(p), dtype=bool), int(np.isfinite(p).sum())
-    for k, i in enumerate(np.argsort(np.where(np.isfinite(p), p / level, np.inf), kind="stable")[:asked]):
+    for k, i in enumerate(
+        np.argsort(np.where(np.isfinite(p), p / level, np.inf), kind="stable")[:asked]
+    ):
         if p[i] > level[i] / (asked - k):
             break
         rejected[i] = True
@@ -97,12 +99,15 @@ def two_sample_auc(first: ArrayLike, second: ArrayLike, *, folds: int = 5, seed:
 
     sides = [np.asarray(side, dtype=float) for side in (first, second)]
     if min(map(len, sides)) < 2 * folds:
-        raise ValueError(f"{len(sides[0])} and {len(sides[1])} rows are too few for {folds} folds of at least 2 each")
+        raise ValueError(
+            f"{len(sides[0])} and {len(sides[1])} rows are too few for {folds} folds of at least 2 each"
+        )
     features, label = np.concatenate(sides), np.repeat([1, 0], [len(side) for side in sides])
     ridge = 0.01  # against a loss that is a mean over rows
     classifier = make_pipeline(
-        StandardScaler(), FunctionTransformer(lambda x: np.hstack([x, x**2])),
+        StandardScaler(),
+        FunctionTransformer(lambda x: np.hstack([x, x**2])),
         LogisticRegression(C=1 / (ridge * len(label)), class_weight="balanced", max_iter=1000),
-    )  # fmt: skip
+    )
     parts = StratifiedKFold(folds, shuffle=True, random_state=seed)
     return float(cross_val_score(classifier, features, label, scoring="roc_auc", cv=parts).mean())

@@ -80,7 +80,11 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         states, actions = self.states, self.actions
-        if states.ndim != 3 or actions.ndim != 3 or states.shape[:2] != (actions.shape[0], actions.shape[1] + 1):
+        if (
+            states.ndim != 3
+            or actions.ndim != 3
+            or states.shape[:2] != (actions.shape[0], actions.shape[1] + 1)
+        ):
             raise TrajectoryError(
                 f"states {states.shape} and actions {actions.shape} of {self.env} do not fit: "
                 "expected (N, T + 1, dx) and (N, T, du)"
@@ -111,9 +115,17 @@ class Trajectories:
 
     @classmethod
     def ragged(
-        cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], env: str, dt: float, names: tuple[str, ...],
-        units: tuple[str, ...], angles: tuple[int, ...] = (), *, terminated: Sequence[bool] = (),
-    ) -> Trajectories:  # fmt: skip
+        cls,
+        states: Sequence[np.ndarray],
+        actions: Sequence[np.ndarray],
+        env: str,
+        dt: float,
+        names: tuple[str, ...],
+        units: tuple[str, ...],
+        angles: tuple[int, ...] = (),
+        *,
+        terminated: Sequence[bool] = (),
+    ) -> Trajectories:
         """Episodes of states (T_i + 1, dx) and actions (T_i, du), padded to the longest of them."""
         for episode, (x, u) in enumerate(zip(states, actions, strict=True)):
             if x.ndim != 2 or u.ndim != 2 or len(x) != len(u) + 1:
@@ -123,7 +135,9 @@ class Trajectories:
                 )
         lengths = tuple(len(u) for u in actions)
         longest = max(lengths, default=0)
-        x = np.stack([np.pad(part, ((0, longest + 1 - len(part)), (0, 0)), mode="edge") for part in states])
+        x = np.stack(
+            [np.pad(part, ((0, longest + 1 - len(part)), (0, 0)), mode="edge") for part in states]
+        )
         u = np.stack([np.pad(part, ((0, longest - len(part)), (0, 0))) for part in actions])
         return cls(x, u, env, dt, names, units, angles, lengths, tuple(map(bool, terminated)))
 
@@ -153,19 +167,26 @@ class Trajectories:
         """The episodes of both, padded to the longest; TrajectoryError where they are not of one robot."""
         self.require_robot_of(other)
         both, longest = (self, other), max(self.horizon, other.horizon)
-        states = [np.pad(t.states, ((0, 0), (0, longest - t.horizon), (0, 0)), mode="edge") for t in both]
+        states = [
+            np.pad(t.states, ((0, 0), (0, longest - t.horizon), (0, 0)), mode="edge") for t in both
+        ]
         actions = [np.pad(t.actions, ((0, 0), (0, longest - t.horizon), (0, 0))) for t in both]
         ended = [t.terminated or (False,) * len(t) for t in both]
         return replace(
-            self, states=np.concatenate(states), actions=np.concatenate(actions), terminated=ended[0] + ended[1],
+            self,
+            states=np.concatenate(states),
+            actions=np.concatenate(actions),
+            terminated=ended[0] + ended[1],
             lengths=tuple(np.concatenate([t.steps for t in both]).tolist()),
-        )  # fmt: skip
+        )
 
     def require_robot_of(self, other: Trajectories) -> None:
         """TrajectoryError where the episodes of both are not of one robot."""
         for name in ("env", "dt", "names", "units", "angles"):
             if (ours := getattr(self, name)) != (theirs := getattr(other, name)):
-                raise TrajectoryError(f"episodes with {name} {ours} and {theirs} cannot be joined; expected one robot")
+                raise TrajectoryError(
+                    f"episodes with {name} {ours} and {theirs} cannot be joined; expected one robot"
+                )
 
     def cut(self, steps: int) -> Trajectories:
         """The first ``steps`` steps of every episode that has as many; TrajectoryError where none has."""
@@ -174,7 +195,9 @@ class Trajectories:
             raise TrajectoryError(
                 f"no episode of {self.env} has {steps} steps: {len(self)} episodes, the longest of {self.horizon}"
             )
-        ended = [bool(self.terminated and self.terminated[i] and self.steps[i] == steps) for i in among]
+        ended = [
+            bool(self.terminated and self.terminated[i] and self.steps[i] == steps) for i in among
+        ]
         states, actions = self.states[among][:, : steps + 1], self.actions[among][:, :steps]
         return replace(self, states=states, actions=actions, lengths=(), terminated=tuple(ended))
 
@@ -189,7 +212,10 @@ class Trajectories:
     def _check_ends(self) -> None:
         """Lengths and terminations that fit the arrays, and padding that is what it has to be."""
         n, horizon = len(self), self.horizon
-        for field, values, kind in (("lengths", self.lengths, int), ("terminated", self.terminated, bool)):
+        for field, values, kind in (
+            ("lengths", self.lengths, int),
+            ("terminated", self.terminated, bool),
+        ):
             if values and (len(values) != n or any(type(value) is not kind for value in values)):
                 raise TrajectoryError(
                     f"{field} of {self.env} is {values!r:.80}; expected a tuple of {n} {kind.__name__}s, one each"
@@ -199,7 +225,9 @@ class Trajectories:
                 f"lengths of {self.env} go from {min(self.lengths)} to {max(self.lengths)}; expected at least 1, and "
                 f"the longest to fill the {horizon} steps of the arrays"
             )
-        after = np.arange(horizon) >= self.steps[:, None]  # (N, T), of actions and of the states that they lead to
+        after = (
+            np.arange(horizon) >= self.steps[:, None]
+        )  # (N, T), of actions and of the states that they lead to
         last = np.take_along_axis(self.states, self.steps[:, None, None], axis=1)
         wrong = after & ((self.states[:, 1:] != last).any(-1) | (self.actions != 0).any(-1))
         if wrong.any():
@@ -225,15 +253,21 @@ class Trajectories:
 
 def initial_past(states: Tensor, past_len: int, action_dim: int) -> Segment:
     """The past of an episode that starts in ``states`` (B, dx): x_0 repeated, zero actions."""
-    return Segment(states[:, None].expand(-1, past_len, -1), states.new_zeros(len(states), past_len, action_dim))
+    return Segment(
+        states[:, None].expand(-1, past_len, -1),
+        states.new_zeros(len(states), past_len, action_dim),
+    )
 
 
-def windows(segment: Segment, episodes: Tensor, starts: Tensor, past_len: int, future_len: int) -> Window:
+def windows(
+    segment: Segment, episodes: Tensor, starts: Tensor, past_len: int, future_len: int
+) -> Window:
     """Cut one window per pair (episode, start): the past is columns start .. start + past_len of ``segment``."""
     columns = starts[:, None] + torch.arange(past_len + future_len, device=starts.device)
     states, actions = (part[episodes[:, None], columns] for part in segment)
     return Window(
-        Segment(states[:, :past_len], actions[:, :past_len]), Segment(states[:, past_len:], actions[:, past_len:])
+        Segment(states[:, :past_len], actions[:, :past_len]),
+        Segment(states[:, past_len:], actions[:, past_len:]),
     )
 
 
@@ -271,7 +305,9 @@ def batches(
             f"collect episodes of at least {future_len} steps"
         )
     # Starts of each episode, for episodes of different length.
-    counts = (torch.tensor(lengths) + (1 + last_start - max(lengths))).clamp_min(0) if lengths else None
+    counts = (
+        (torch.tensor(lengths) + (1 + last_start - max(lengths))).clamp_min(0) if lengths else None
+    )
     while True:
         if counts is None:
             episodes = torch.randint(n, (batch_size,), generator=generator)

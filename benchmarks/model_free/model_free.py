@@ -1,7 +1,7 @@
 """Policies learned without a model, by Stable-Baselines3: the model-free curves of figure 7, and those of 10_explore.
 
 PPO from Stable-Baselines3 and TRPO from sb3-contrib (the paper names no method) on the tasks of section 5.3.2: the
-reward, the starts, the targets and the steps of an episode are those of ``tsmlib.study.learn``, which asks a model
+reward, the starts, the targets and the steps of an episode are those of ``reproduction.learn``, which asks a model
 where these ask the simulator. A few configurations are tried on validation targets; the best one learns with every
 seed, and its executed return on the frozen test targets is measured along the way. README.md tells how to install it.
 
@@ -37,10 +37,10 @@ from tsmlib.envs.stepping import within_bounds
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import HORIZON, Task
 from tsmlib.storage import tables
-from tsmlib.study import pendulum, worlds
-from tsmlib.study.results import exploration
-from tsmlib.study.results.exploration import PENDULUM
-from tsmlib.study.runs import ROOT
+from reproduction import pendulum, worlds
+from reproduction.results import exploration
+from reproduction.results.exploration import PENDULUM
+from reproduction.runs import ROOT
 from tsmlib.trajectory import Segment
 
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v1")
@@ -76,12 +76,26 @@ SETTINGS: dict[str, list[dict[str, float]]] = {
     ],
 }  # episodes: per update, of SAC side by side; std: of the actions, at first; updates: per step of the environment
 MINIBATCH = 250  # steps; of PPO, and of TRPO's value function
-STEPS = {"tsm/Reacher-v0": 300_000, "tsm/ReacherPush-v1": 1_000_000, PENDULUM: 100_000}  # by each seed
-SEARCH_STEPS = {"tsm/Reacher-v0": 60_000, "tsm/ReacherPush-v1": 200_000, PENDULUM: 40_000}  # by each configuration
+STEPS = {
+    "tsm/Reacher-v0": 300_000,
+    "tsm/ReacherPush-v1": 1_000_000,
+    PENDULUM: 100_000,
+}  # by each seed
+SEARCH_STEPS = {
+    "tsm/Reacher-v0": 60_000,
+    "tsm/ReacherPush-v1": 200_000,
+    PENDULUM: 40_000,
+}  # by each configuration
 VALIDATION_STARTS = 2000  # seed of the pendulum's that a configuration is chosen by
 SEARCH_SEED = 100
 RECORDS = 25  # along the way, and one before
-UNITS = {"return_true": "m", "final_distance": "m", "success": "share", "seconds": "s", "cpu_seconds": "s"}
+UNITS = {
+    "return_true": "m",
+    "final_distance": "m",
+    "success": "share",
+    "seconds": "s",
+    "cpu_seconds": "s",
+}
 EXTRA = ("configuration",)  # a column beside the usual ones
 
 Predictor = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, du)
@@ -93,7 +107,9 @@ Predictor = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions
 def observed(states: np.ndarray, target: np.ndarray) -> np.ndarray:
     """What a policy sees, as ours do: cosines and sines of the angles, the rest of the state, the target (n, k)."""
     angles = states[:, :2]
-    return np.concatenate([np.cos(angles), np.sin(angles), states[:, 2:], target], axis=1, dtype=np.float32)
+    return np.concatenate(
+        [np.cos(angles), np.sin(angles), states[:, 2:], target], axis=1, dtype=np.float32
+    )
 
 
 Robots = gymnasium.vector.VectorEnv
@@ -127,15 +143,21 @@ def _arm(env: str) -> Setup:
         task=lambda split: study.load_task(env, split),
         made=lambda n: cast(Robots, gymnasium.make_vec(env, num_envs=n, threads=1).unwrapped),
         action_space=lambda robots: robots.single_action_space,
-        target=lambda robots: cast(Any, robots).target, seen=observed, seeds=lambda seed, _: seed,
+        target=lambda robots: cast(Any, robots).target,
+        seen=observed,
+        seeds=lambda seed, _: seed,
         stepped=lambda robots, actions: robots.step(actions)[:2],
-    )  # fmt: skip
+    )
 
 
 def _swings(split: str) -> Task:
     """Starts of the pendulum: those that measure its rounds, or others by which a configuration is chosen."""
     n = worlds.world(PENDULUM).sizes["paper"].starts
-    return worlds.world(PENDULUM).tested(n) if split == "test" else pendulum.swing_up(n, VALIDATION_STARTS)
+    return (
+        worlds.world(PENDULUM).tested(n)
+        if split == "test"
+        else pendulum.swing_up(n, VALIDATION_STARTS)
+    )
 
 
 def _swung(robots: Robots, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,15 +169,20 @@ def _swung(robots: Robots, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 SETUPS = {env: _arm(env) for env in ENVS} | {
     PENDULUM: Setup(
-        exploration.HORIZON, _swings,
+        exploration.HORIZON,
+        _swings,
         made=lambda n: gymnasium.make_vec(PENDULUM, num_envs=n, vectorization_mode="sync"),
-        action_space=lambda robots: gymnasium.spaces.Box(-1, 1, robots.single_action_space.shape, np.float32),
-        target=lambda robots: np.zeros((robots.num_envs, 0)), seen=lambda states, _: states.astype(np.float32),
+        action_space=lambda robots: gymnasium.spaces.Box(
+            -1, 1, robots.single_action_space.shape, np.float32
+        ),
+        target=lambda robots: np.zeros((robots.num_envs, 0)),
+        seen=lambda states, _: states.astype(np.float32),
         # One for each pendulum, none of another training seed; from neighbouring ones they would start alike.
         seeds=lambda seed, n: np.random.SeedSequence(seed).generate_state(n).tolist(),
-        stepped=_swung, unit="",
+        stepped=_swung,
+        unit="",
     )
-}  # fmt: skip
+}
 
 
 class Episodes:
@@ -165,7 +192,9 @@ class Episodes:
         self.setup = SETUPS[env]
         self.robots = self.setup.made(n)
         self.actions = self.setup.action_space(self.robots)
-        self.seed: int | list[int] | None = self.setup.seeds(seed, n)  # of the first reset; later ones go on from there
+        self.seed: int | list[int] | None = self.setup.seeds(
+            seed, n
+        )  # of the first reset; later ones go on from there
         self.taken = 0
 
     @property
@@ -232,7 +261,9 @@ def vectorised(episodes: Episodes) -> Any:
             seen, rewards, over = episodes.step(self.actions)
             infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
             if over:
-                infos = [{"terminal_observation": last, "TimeLimit.truncated": True} for last in seen]
+                infos = [
+                    {"terminal_observation": last, "TimeLimit.truncated": True} for last in seen
+                ]
                 seen = episodes.reset()
             return seen, rewards.astype(np.float32), np.full(self.num_envs, over), infos
 
@@ -245,7 +276,9 @@ def vectorised(episodes: Episodes) -> Any:
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
             raise NotImplementedError("the episodes share their attributes")
 
-        def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        def env_method(
+            self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+        ) -> list[Any]:
             raise NotImplementedError("the episodes share their methods")
 
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
@@ -260,21 +293,36 @@ def learner(algorithm: str, env: str, setting: Mapping[str, float], *, seed: int
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    special = {name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")}
+    special = {
+        name: value for name, value in setting.items() if name not in ("episodes", "std", "updates")
+    }
     network: dict[str, Any] = dict(net_arch=[64, 64])
     robots = vectorised(Episodes(env, int(setting["episodes"]), seed=seed))
     if algorithm == "sac":
         from sbx import SAC
 
         return SAC(  # ReLU is its default
-            "MlpPolicy", VecNormalize(robots, gamma=GAMMA), gamma=GAMMA, policy_kwargs=network, seed=seed, device="cpu",
-            gradient_steps=max(1, round(setting["updates"] * setting["episodes"])), **special,
-        )  # fmt: skip
+            "MlpPolicy",
+            VecNormalize(robots, gamma=GAMMA),
+            gamma=GAMMA,
+            policy_kwargs=network,
+            seed=seed,
+            device="cpu",
+            gradient_steps=max(1, round(setting["updates"] * setting["episodes"])),
+            **special,
+        )
     network |= dict(activation_fn=torch.nn.ReLU, log_std_init=math.log(setting["std"]))
     return {"ppo": PPO, "trpo": TRPO}[algorithm](
-        "MlpPolicy", VecNormalize(robots, gamma=GAMMA), n_steps=SETUPS[env].horizon, batch_size=MINIBATCH, gamma=GAMMA,
-        policy_kwargs=network, seed=seed, device="cpu", **special,
-    )  # fmt: skip
+        "MlpPolicy",
+        VecNormalize(robots, gamma=GAMMA),
+        n_steps=SETUPS[env].horizon,
+        batch_size=MINIBATCH,
+        gamma=GAMMA,
+        policy_kwargs=network,
+        seed=seed,
+        device="cpu",
+        **special,
+    )
 
 
 def learn(
@@ -332,7 +380,9 @@ class Table:
         rows = [row for row in self.rows if all(row[name] == value for name, value in key.items())]
         return rows if rows and max(row["env_steps"] for row in rows) >= steps else []
 
-    def put(self, key: Mapping[str, Any], task: Task, records: list[dict[str, float]]) -> list[dict[str, Any]]:
+    def put(
+        self, key: Mapping[str, Any], task: Task, records: list[dict[str, float]]
+    ) -> list[dict[str, Any]]:
         """Write what is known of a run, in place of what was known before."""
         simulator = {} if task.env == PENDULUM else {"sim": EnvSpec.parse(task.env).simulator}
         common = dict(
@@ -356,16 +406,25 @@ class Table:
             for metric, unit in UNITS.items()
             if metric in record
         ]
-        others = [row for row in self.rows if any(row[name] != value for name, value in key.items())]
+        others = [
+            row for row in self.rows if any(row[name] != value for name, value in key.items())
+        ]
         self.rows = [*others, *new]
         tables.save(self.path, self.rows, extra=EXTRA)
         return new
 
 
 def run(
-    table: Table, env: str, algorithm: str, setting: Mapping[str, float], *, split: str, steps: int, records: int,
+    table: Table,
+    env: str,
+    algorithm: str,
+    setting: Mapping[str, float],
+    *,
+    split: str,
+    steps: int,
+    records: int,
     seed: int,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """The last record of a run, on targets of ``split``: from the table, or learned now and put there."""
     subset = {"validation": "search", "test": ""}[split]
     key = dict(env=env, model=algorithm, subset=subset, configuration=named(setting), seed=seed)
@@ -376,25 +435,45 @@ def run(
             found.append(record)
             rows = table.put(key, task, found)
     last = {row["metric"]: row["value"] for row in rows}  # rows are in the order of time
-    print(f"{env} {algorithm} {named(setting)}, seed {seed}, {split}: "
-          + ", ".join(f"{metric} {value:.3f}" for metric, value in last.items()), flush=True)  # fmt: skip
+    print(
+        f"{env} {algorithm} {named(setting)}, seed {seed}, {split}: "
+        + ", ".join(f"{metric} {value:.3f}" for metric, value in last.items()),
+        flush=True,
+    )
     return last
 
 
 def search(table: Table, env: str, algorithm: str, *, steps: int) -> dict[str, float]:
     """The configuration with the highest return on the validation targets."""
     options = dict(split="validation", steps=steps, records=2, seed=SEARCH_SEED)
-    return max(SETTINGS[algorithm], key=lambda s: run(table, env, algorithm, s, **options)["return_true"])
+    return max(
+        SETTINGS[algorithm], key=lambda s: run(table, env, algorithm, s, **options)["return_true"]
+    )
 
 
 def parser() -> argparse.ArgumentParser:
-    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--env", choices=(*ENVS, PENDULUM), help=f"one task instead of {' and '.join(ENVS)}")
-    found.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=GRADIENTS, help="default ppo and trpo")
-    found.add_argument("--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})")
+    found = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    found.add_argument(
+        "--env", choices=(*ENVS, PENDULUM), help=f"one task instead of {' and '.join(ENVS)}"
+    )
+    found.add_argument(
+        "--algorithm", nargs="+", choices=ALGORITHMS, default=GRADIENTS, help="default ppo and trpo"
+    )
+    found.add_argument(
+        "--steps", type=int, default=0, help=f"of the environment, by each seed (default {STEPS})"
+    )
     found.add_argument("--seeds", type=int, default=3, help="0, 1, ... (default 3)")
-    found.add_argument("--records", type=int, default=RECORDS, help=f"along each curve (default {RECORDS})")
-    found.add_argument("--out", type=Path, default=ROOT / "runs/paper/seed0/metrics/model_free.csv", help="the table")
+    found.add_argument(
+        "--records", type=int, default=RECORDS, help=f"along each curve (default {RECORDS})"
+    )
+    found.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "runs/paper/seed0/metrics/model_free.csv",
+        help="the table",
+    )
     return found
 
 
@@ -408,15 +487,25 @@ def main(given: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     table = Table(arguments.out)
-    pairs = list(itertools.product([arguments.env] if arguments.env else ENVS,
-                                   arguments.algorithm))  # fmt: skip
+    pairs = list(itertools.product([arguments.env] if arguments.env else ENVS, arguments.algorithm))
     steps = {env: arguments.steps or most for env, most in STEPS.items()}
     tried = {env: min(steps[env], most) for env, most in SEARCH_STEPS.items()}
-    best = {(env, algorithm): search(table, env, algorithm, steps=tried[env]) for env, algorithm in pairs}
+    best = {
+        (env, algorithm): search(table, env, algorithm, steps=tried[env])
+        for env, algorithm in pairs
+    }
     for seed in range(arguments.seeds):
         for env, algorithm in pairs:
-            run(table, env, algorithm, best[env, algorithm], split="test", steps=steps[env],
-                records=arguments.records, seed=seed)  # fmt: skip
+            run(
+                table,
+                env,
+                algorithm,
+                best[env, algorithm],
+                split="test",
+                steps=steps[env],
+                records=arguments.records,
+                seed=seed,
+            )
     print(arguments.out)
 
 

@@ -30,19 +30,25 @@ from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
 from tsmlib.models.one_step_ensemble import OneStepEnsemble
-from tsmlib.planning.mbrl_lib import transition_batch
+from tsmlib.contrib.mbrl_lib import transition_batch
 from tsmlib.storage import tables
-from tsmlib.study import parameters, runs
-from tsmlib.study.results import prediction as prediction_results
+from reproduction import parameters, runs
+from reproduction.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
 
 MODELS = {"gaussian": "pets", "mse": "pets+mse"}  # --form -> word in the column "model"
 MEMBERS = 5
-BATCH, LEARNING_RATE, WEIGHT_DECAY = 256, 1e-3, 5e-5  # mbrl-lib's examples/conf/overrides/mbpo_pusher.yaml
+BATCH, LEARNING_RATE, WEIGHT_DECAY = (
+    256,
+    1e-3,
+    5e-5,
+)  # mbrl-lib's examples/conf/overrides/mbpo_pusher.yaml
 UNITS = {"train_seconds": "s", "transitions_per_second": "1/s"}
 PART = 250  # batches between two looks at the validation data, as often as the models here look
 
-Network = Callable[[Tensor], tuple[Tensor, Tensor | None]]  # (M, R, features + du) -> mean, log variance (M, R, dx)
+Network = Callable[
+    [Tensor], tuple[Tensor, Tensor | None]
+]  # (M, R, features + du) -> mean, log variance (M, R, dx)
 
 
 # What goes in and what comes out -------------------------------------------------------------------------------------
@@ -70,7 +76,12 @@ class Peer(OneStepEnsemble):
     """
 
     def __init__(self, network: Network, features: Features, *, members: int = MEMBERS) -> None:
-        self.network, self.features, self.members, self.unit = network, features, members, unit_of(features)
+        self.network, self.features, self.members, self.unit = (
+            network,
+            features,
+            members,
+            unit_of(features),
+        )
 
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -89,14 +100,23 @@ def wrapped(form: str, features: Features, action_dim: int) -> Any:
 
     unit = unit_of(features)
     ensemble = GaussianMLP(
-        features.dim + action_dim, len(unit), "cpu",
-        num_layers=4, hid_size=200, ensemble_size=MEMBERS, deterministic=form == "mse",
-        propagation_method="fixed_model", activation_fn_cfg={"_target_": "torch.nn.SiLU"},
-    )  # fmt: skip
+        features.dim + action_dim,
+        len(unit),
+        "cpu",
+        num_layers=4,
+        hid_size=200,
+        ensemble_size=MEMBERS,
+        deterministic=form == "mse",
+        propagation_method="fixed_model",
+        activation_fn_cfg={"_target_": "torch.nn.SiLU"},
+    )
     return OneDTransitionRewardModel(
-        ensemble, target_is_delta=True, normalize=True, learned_rewards=False,
+        ensemble,
+        target_is_delta=True,
+        normalize=True,
+        learned_rewards=False,
         obs_process_fn=lambda scaled: features(torch.as_tensor(scaled) * unit),
-    )  # fmt: skip
+    )
 
 
 def batch_of(data: Trajectories, features: Features) -> Any:
@@ -104,27 +124,40 @@ def batch_of(data: Trajectories, features: Features) -> Any:
     return transition_batch(replace(data, states=data.states / unit_of(features).numpy()))
 
 
-def initialise(form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH) -> tuple[Any, Any]:
+def initialise(
+    form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH
+) -> tuple[Any, Any]:
     """mbrl-lib's model with new weights and the statistics of ``data``, and batches of a bootstrap for every member."""
     from mbrl.util.replay_buffer import BootstrapIterator
 
     model, whole = wrapped(form, features, data.actions.shape[2]), batch_of(data, features)
     model.update_normalizer(whole)
     return model, BootstrapIterator(
-        whole, batch, MEMBERS, shuffle_each_epoch=True, permute_indices=False, rng=np.random.default_rng(seed)
+        whole,
+        batch,
+        MEMBERS,
+        shuffle_each_epoch=True,
+        permute_indices=False,
+        rng=np.random.default_rng(seed),
     )
 
 
 def network_of(model: Any) -> Network:
     """All members of mbrl-lib's model as one function, its own normalisation of the inputs included."""
-    return lambda inputs: model.model(model.input_normalizer.normalize(inputs), use_propagation=False)
+    return lambda inputs: model.model(
+        model.input_normalizer.normalize(inputs), use_propagation=False
+    )
 
 
 class Parts:
     """Loops over ``batches`` that are ``size`` long and go on where the last one ended, pass after pass."""
 
     def __init__(self, batches: Iterable[Any], size: int) -> None:
-        self.stream, self.size, self.drawn = itertools.chain.from_iterable(itertools.repeat(batches)), size, 0
+        self.stream, self.size, self.drawn = (
+            itertools.chain.from_iterable(itertools.repeat(batches)),
+            size,
+            0,
+        )
 
     def __iter__(self) -> Iterator[Any]:
         for batch in itertools.islice(self.stream, self.size):
@@ -137,7 +170,13 @@ class BudgetUsed(Exception):
 
 
 def train(
-    form: str, features: Features, data: Trajectories, held_out: Trajectories, *, seconds: float, seed: int
+    form: str,
+    features: Features,
+    data: Trajectories,
+    held_out: Trajectories,
+    *,
+    seconds: float,
+    seed: int,
 ) -> tuple[Any, dict[str, float]]:
     """mbrl-lib's model with its best weights on ``held_out`` after ``seconds``, and what training took.
 
@@ -153,10 +192,14 @@ def train(
     model, bootstraps = initialise(form, features, data, seed=seed)
     parts = Parts(bootstraps, min(PART, len(bootstraps)))
     best: dict[str, Any] = {"score": None, "weights": None}
-    bar = tqdm(total=round(seconds), desc=f"{EnvSpec.parse(data.env).name} {MODELS[form]}", unit="s")
+    bar = tqdm(
+        total=round(seconds), desc=f"{EnvSpec.parse(data.env).name} {MODELS[form]}", unit="s"
+    )
     began = time.process_time()
 
-    def after_part(model: Any, _: int, part: int, loss: float, score: Tensor, best_score: Tensor) -> None:
+    def after_part(
+        model: Any, _: int, part: int, loss: float, score: Tensor, best_score: Tensor
+    ) -> None:
         if best["score"] is None or not torch.equal(best_score, best["score"]):
             best.update(score=best_score.clone(), weights=copy.deepcopy(model.state_dict()))
         used = time.process_time() - began
@@ -167,17 +210,22 @@ def train(
 
     with suppress(BudgetUsed):
         ModelTrainer(model, optim_lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY).train(
-            parts, dataset_val=TransitionIterator(batch_of(held_out, features), BATCH), callback=after_part, silent=True
+            parts,
+            dataset_val=TransitionIterator(batch_of(held_out, features), BATCH),
+            callback=after_part,
+            silent=True,
         )
     used = time.process_time() - began
     bar.close()
     model.load_state_dict(best["weights"])
     model.eval()
     return model, {
-        "train_seconds": used, "transitions_per_second": parts.drawn * BATCH / used,
-        "epochs": parts.drawn / len(bootstraps), "parameters": sum(w.numel() for w in model.parameters()),
+        "train_seconds": used,
+        "transitions_per_second": parts.drawn * BATCH / used,
+        "epochs": parts.drawn / len(bootstraps),
+        "parameters": sum(w.numel() for w in model.parameters()),
         "validation_mse": best["score"].mean().item(),
-    }  # fmt: skip
+    }
 
 
 def check(model: Any, peer: Peer, data: Trajectories) -> None:
@@ -192,7 +240,9 @@ def check(model: Any, peer: Peer, data: Trajectories) -> None:
     moving = peer.features.moving
     off = ((mean / peer.unit) - (theirs - x)[members])[..., moving].abs().max().item()
     if not off < 1e-3:  # x in units of its increments is up to 1e3, in single precision
-        raise SystemExit(f"the adapter is {off:.1e} standard deviations off mbrl-lib's own prediction")
+        raise SystemExit(
+            f"the adapter is {off:.1e} standard deviations off mbrl-lib's own prediction"
+        )
 
 
 # Scores --------------------------------------------------------------------------------------------------------------
@@ -203,49 +253,81 @@ def table(path: Path, rows: list[dict[str, Any]]) -> None:
     key = ("env", "model", "seed")
     new = {tuple(row[name] for name in key) for row in rows}
     kept = tables.records(tables.load(path)) if path.exists() else []
-    tables.save(path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows])
+    tables.save(
+        path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows]
+    )
 
 
 def run_of(folder: Path) -> runs.Run:
     """The run whose folder this is, ``.../<scale>/seed<k>``."""
     scale, seed = folder.parent.name, folder.name.removeprefix("seed")
     if scale not in parameters.SCALES or not seed.isdecimal():
-        raise SystemExit(f"--run-dir is {folder}, expected the folder of a run, such as runs/paper/seed0")
+        raise SystemExit(
+            f"--run-dir is {folder}, expected the folder of a run, such as runs/paper/seed0"
+        )
     return runs.Run("peers_pets", scale, int(seed), folder)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=ENV_IDS, default="tsm/ReacherPush-v1", help="default tsm/ReacherPush-v1")
-    parser.add_argument("--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)")
-    parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of training (default 300)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--env", choices=ENV_IDS, default="tsm/ReacherPush-v1", help="default tsm/ReacherPush-v1"
+    )
+    parser.add_argument(
+        "--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=300, help="CPU seconds of training (default 300)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default 0)")
-    parser.add_argument("--samples", type=int, default=32, help="per trajectory (default 32, as 03_predict)")
-    parser.add_argument("--episodes", type=int, default=1000, help="of the test split (default 1000)")
-    parser.add_argument("--run-dir", type=Path, default=Path("runs/paper/seed0"), help="default runs/paper/seed0")
-    parser.add_argument("--out", type=Path, help="table to write (default: metrics/peers_pets.csv of the run)")
+    parser.add_argument(
+        "--samples", type=int, default=32, help="per trajectory (default 32, as 03_predict)"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=1000, help="of the test split (default 1000)"
+    )
+    parser.add_argument(
+        "--run-dir", type=Path, default=Path("runs/paper/seed0"), help="default runs/paper/seed0"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="table to write (default: metrics/peers_pets.csv of the run)"
+    )
     arguments = parser.parse_args()
     run = run_of(arguments.run_dir.resolve())
     data, validation, test = (study.dataset(run, arguments.env, split) for split in study.SPLITS)
     test, word = test.take(slice(arguments.episodes)), MODELS[arguments.form]
     features = Features(data.states.shape[2], data.angles).fit(torch.from_numpy(data.states))
     copies, _ = study.training_data(run, arguments.env, "ensemble")
-    model, took = train(arguments.form, features, copies, validation, seconds=arguments.seconds, seed=arguments.seed)
+    model, took = train(
+        arguments.form, features, copies, validation, seconds=arguments.seconds, seed=arguments.seed
+    )
     peer = Peer(network_of(model), features)
     check(model, peer, test)
-    print(f"{arguments.env}, {word}: " + ", ".join(f"{name} {value:,.4g}" for name, value in took.items()))
+    print(
+        f"{arguments.env}, {word}: "
+        + ", ".join(f"{name} {value:,.4g}" for name, value in took.items())
+    )
     began = time.perf_counter()
     splits, options = (test, validation), dict(samples=arguments.samples, seed=arguments.seed)
     open_loop = prediction.score(peer, features, *splits, progress=f"{word}, open loop", **options)
     options |= dict(starts=prediction_results.SEGMENTS, horizon=10)
     segments = prediction.score(peer, features, *splits, progress=f"{word}, segments", **options)
-    print(f"{arguments.samples} samples of {len(test)} trajectories scored in {time.perf_counter() - began:.0f} s")
+    print(
+        f"{arguments.samples} samples of {len(test)} trajectories scored in {time.perf_counter() - began:.0f} s"
+    )
     for metric, curve in open_loop.against_horizon().items():
         print(f"    {metric:18} at 10 steps {curve[9]:9.3f}   at 80 steps {curve[79]:9.3f}")
     common = dict(seed=arguments.seed, scale=run.scale)
     rows = prediction_results.rows(arguments.env, word, open_loop, segments, test, **common)
-    about = {name: rows[0][name] for name in ("env", "sim", "model", "planner", "execution")} | common
-    rows += [dict(about, metric=name, value=value, unit=UNITS.get(name, "")) for name, value in took.items()]
+    about = {
+        name: rows[0][name] for name in ("env", "sim", "model", "planner", "execution")
+    } | common
+    rows += [
+        dict(about, metric=name, value=value, unit=UNITS.get(name, ""))
+        for name, value in took.items()
+    ]
     path = arguments.out or run.metrics / "peers_pets.csv"
     table(path, rows)
     print(path)

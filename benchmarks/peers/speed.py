@@ -38,7 +38,7 @@ from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, zero_torques
 from tsmlib.statistics import interval
 from tsmlib.storage import artifacts, tables
-from tsmlib.study import runs, zoo
+from tsmlib import zoo
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
@@ -48,8 +48,12 @@ OURS = {"gaussian": "ensemble", "mse": "ensemble+mse"}  # as pets.MODELS
 EPISODES = 500  # whose transitions the turns of training draw from
 FUTURE = 20  # steps of a training window here, each of them one transition to an ensemble
 ELITES, MOMENTUM = 0.1, 0.1  # of mbrl-lib's CEM: examples/conf/overrides/pets_pusher.yaml
-JUDGED = 32  # samples behind a predicted return, which the planner did not see, as tsmlib.study
-SPREAD: dict[str, Callable[[np.ndarray], float]] = {"median": np.median, "lowest": np.min, "highest": np.max}
+JUDGED = 32  # samples behind a predicted return, which the planner did not see, as reproduction
+SPREAD: dict[str, Callable[[np.ndarray], float]] = {
+    "median": np.median,
+    "lowest": np.min,
+    "highest": np.max,
+}
 
 Clock = Callable[[], float]
 
@@ -89,20 +93,33 @@ def ours(form: str, features: Features, data: Trajectories, *, batch: int, bf16:
     """``fit`` and an ``Ensemble`` with as many layers: a batch of windows is dealt out, ``batch`` for each member."""
     windows = batch * pets.MEMBERS // FUTURE
     net = Ensemble(
-        data.states.shape[2], data.actions.shape[2], angles=data.angles, gaussian=form == "gaussian",
-        members=pets.MEMBERS, hidden=200, layers=4,
-    )  # fmt: skip
+        data.states.shape[2],
+        data.actions.shape[2],
+        angles=data.angles,
+        gaussian=form == "gaussian",
+        members=pets.MEMBERS,
+        hidden=200,
+        layers=4,
+    )
     net.features.load_state_dict(features.state_dict())
     dealt_out, held_out = windows * FUTURE / pets.MEMBERS, data.take(slice(1))
     if dealt_out != batch:
-        raise ValueError(f"{windows} windows of {FUTURE} steps are {dealt_out:g} for each member, not {batch}")
+        raise ValueError(
+            f"{windows} windows of {FUTURE} steps are {dealt_out:g} for each member, not {batch}"
+        )
 
     def run(updates: int) -> None:
-        options = TrainingOptions(1, FUTURE, updates, batch_size=windows, validate_every=updates, bf16=bf16)
+        options = TrainingOptions(
+            1, FUTURE, updates, batch_size=windows, validate_every=updates, bf16=bf16
+        )
         fit(net, net.loss, data, held_out, options)
 
     return Trainer(
-        f"tsmlib, {'bfloat16' if bf16 and native_bf16() else 'float32'}, {batch} a member", False, run, batch, size(net)
+        f"tsmlib, {'bfloat16' if bf16 and native_bf16() else 'float32'}, {batch} a member",
+        False,
+        run,
+        batch,
+        size(net),
     )
 
 
@@ -117,7 +134,9 @@ def same_size(trainers: Sequence[Trainer], *, within: float = 0.01) -> None:
         raise SystemExit(f"the networks are not equal in size: {counts}")
 
 
-def speeds(trainers: Sequence[Trainer], clock: Clock, *, transitions: int, rounds: int) -> dict[str, np.ndarray]:
+def speeds(
+    trainers: Sequence[Trainer], clock: Clock, *, transitions: int, rounds: int
+) -> dict[str, np.ndarray]:
     """Transitions per second (rounds,) of each trainer, each having taken a turn before, which is not counted.
 
     transitions: that every member sees in each turn.
@@ -142,7 +161,7 @@ class Way:
     """A way to plan: who searches what, through which model.
 
     planner: mbrl-cem (mbrl-lib's), or cem or adam of ``tsmlib.planning``. search_space: direct or latent.
-    model: pets (mbrl-lib's ensemble), or a word of ``tsmlib.study``. samples: of the model for every candidate.
+    model: pets (mbrl-lib's ensemble), or a word of ``reproduction``. samples: of the model for every candidate.
     bound: of what mbrl-cem searches, half of which is the standard deviation that it starts with.
     """
 
@@ -157,7 +176,10 @@ class Way:
     @property
     def settings(self) -> str:
         """As the table has it in the column ``configuration``."""
-        return f"{self.candidates} x {self.iterations} x {self.samples}" + f" in +-{self.bound:g}" * bool(self.bound)
+        return (
+            f"{self.candidates} x {self.iterations} x {self.samples}"
+            + f" in +-{self.bound:g}" * bool(self.bound)
+        )
 
     @property
     def name(self) -> str:
@@ -172,7 +194,9 @@ class Way:
 
 
 PETS = partial(Way, "mbrl-cem", "direct", "pets")
-USUAL = dict(iterations=5, candidates=350, samples=20)  # theirs: pets_pusher.yaml, and algorithm/pets.yaml
+USUAL = dict(
+    iterations=5, candidates=350, samples=20
+)  # theirs: pets_pusher.yaml, and algorithm/pets.yaml
 SHIPPED = PAPERS, OURS = zoo.PAPERS, zoo.OURS
 WAYS = (
     PETS(**USUAL, bound=1.0),  # the limits of the torques
@@ -180,7 +204,9 @@ WAYS = (
     PETS(iterations=5, candidates=350, samples=5, bound=0.2),
     PETS(iterations=5, candidates=100, samples=5, bound=0.2),
     PETS(iterations=2, candidates=100, samples=5, bound=0.2),
-    *(Way("cem", "latent", model, iterations=8, candidates=96) for model in SHIPPED),  # scale laptop; paper has 10
+    *(
+        Way("cem", "latent", model, iterations=8, candidates=96) for model in SHIPPED
+    ),  # scale laptop; paper has 10
     *(Way("cem", "latent", model, iterations=4, candidates=48) for model in SHIPPED),
     *(Way("cem", "latent", model, iterations=2, candidates=24) for model in SHIPPED),
     Way("adam", "latent", OURS, iterations=100),
@@ -190,7 +216,9 @@ WAYS = (
 )
 
 
-def search(objective: Callable[[Tensor], Tensor], shape: tuple[int, ...], way: Way, *, seed: int) -> Tensor:
+def search(
+    objective: Callable[[Tensor], Tensor], shape: tuple[int, ...], way: Way, *, seed: int
+) -> Tensor:
     """mbrl-lib's ``TrajectoryOptimizer`` for one target: the parameters ``shape`` with the best ``objective``.
 
     objective: parameters (C, *shape) -> returns (C,). With the settings of its examples it gives the elites' mean.
@@ -199,15 +227,26 @@ def search(objective: Callable[[Tensor], Tensor], shape: tuple[int, ...], way: W
     from omegaconf import OmegaConf
 
     horizon, dim = shape
-    settings = OmegaConf.create({
-        "_target_": "mbrl.planning.CEMOptimizer", "num_iterations": way.iterations, "elite_ratio": ELITES,
-        "population_size": way.candidates, "alpha": MOMENTUM, "device": "cpu", "lower_bound": None,
-        "upper_bound": None, "return_mean_elites": True, "clipped_normal": False,
-    })  # fmt: skip
+    settings = OmegaConf.create(
+        {
+            "_target_": "mbrl.planning.CEMOptimizer",
+            "num_iterations": way.iterations,
+            "elite_ratio": ELITES,
+            "population_size": way.candidates,
+            "alpha": MOMENTUM,
+            "device": "cpu",
+            "lower_bound": None,
+            "upper_bound": None,
+            "return_mean_elites": True,
+            "clipped_normal": False,
+        }
+    )
     limits = np.full(dim, way.bound)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # mbrl-lib draws from the global generator
-        optimizer = TrajectoryOptimizer(settings, -limits, limits, horizon, keep_last_solution=False)
+        optimizer = TrajectoryOptimizer(
+            settings, -limits, limits, horizon, keep_last_solution=False
+        )
         return torch.from_numpy(optimizer.optimize(objective))
 
 
@@ -226,7 +265,13 @@ def through_pets(model: Any, unit: Tensor, task: Task, samples: int) -> Callable
     class Spaces:  # of an environment, which nothing here asks for
         observation_space = action_space = None
 
-    env = ModelEnv(Spaces(), model, never, partial(stepwise, task, unit), generator=torch.Generator().manual_seed(0))
+    env = ModelEnv(
+        Spaces(),
+        model,
+        never,
+        partial(stepwise, task, unit),
+        generator=torch.Generator().manual_seed(0),
+    )
     start = task.start[0] / unit.numpy()
     return lambda actions: env.evaluate_action_sequences(actions, start, samples)
 
@@ -240,7 +285,11 @@ class Models:
     prior: Any
 
     def space(self, way: Way, horizon: int) -> SearchSpace:
-        return LatentActions(self.prior, horizon) if way.search_space == "latent" else DirectActions(horizon)
+        return (
+            LatentActions(self.prior, horizon)
+            if way.search_space == "latent"
+            else DirectActions(horizon)
+        )
 
 
 def at(task: Task, chosen: Sequence[int] | np.ndarray) -> Task:
@@ -255,23 +304,33 @@ def planned(way: Way, task: Task, models: Models, *, seed: int = 0) -> Tensor:
         predict = model_predictor(model, task.past(model.past_len), samples=way.samples, seed=seed)
         if way.planner == "adam":
             return adam(predict, task.reward, space, len(task), iterations=way.iterations).actions
-        options: dict[str, Any] = dict(candidates=way.candidates, elites=max(2, way.candidates // 10), seed=seed)
-        return cem(predict, task.reward, space, len(task), iterations=way.iterations, **options).actions
+        options: dict[str, Any] = dict(
+            candidates=way.candidates, elites=max(2, way.candidates // 10), seed=seed
+        )
+        return cem(
+            predict, task.reward, space, len(task), iterations=way.iterations, **options
+        ).actions
     found = []
 
     def decode(parameters: Tensor) -> Tensor:
         """(C, *shape) -> (C, T, du). What mbrl-cem searches is within its bounds, so that no torque is squashed."""
-        return parameters if way.search_space == "direct" else space.decode(parameters[:, None])[:, 0]
+        return (
+            parameters if way.search_space == "direct" else space.decode(parameters[:, None])[:, 0]
+        )
 
     for i in range(len(task)):
         single = at(task, [i])
         if way.model == "pets":
             value = through_pets(models.theirs, model.unit, single, way.samples)
         else:
-            predict = model_predictor(model, single.past(model.past_len), samples=way.samples, seed=seed)
+            predict = model_predictor(
+                model, single.past(model.past_len), samples=way.samples, seed=seed
+            )
             value = partial(_value, predict, single)
         with torch.no_grad():
-            best = search(lambda parameters, v=value: v(decode(parameters)), space.shape, way, seed=seed + i)
+            best = search(
+                lambda parameters, v=value: v(decode(parameters)), space.shape, way, seed=seed + i
+            )
             found.append(decode(best[None])[0])
     return torch.stack(found)
 
@@ -296,7 +355,9 @@ class Outcome:
         return self.trial.executed_return.numpy()
 
 
-def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, rounds: int) -> list[Outcome]:
+def outcomes(
+    ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, rounds: int
+) -> list[Outcome]:
     """Plan and execute in every way. In each round mbrl-lib plans for its share of the targets, and ours for all."""
     shares = np.array_split(np.arange(len(task)), rounds)
     actions: dict[Way, Tensor] = {way: torch.zeros(len(task), task.horizon, 2) for way in ways}
@@ -318,14 +379,18 @@ def outcomes(ways: Sequence[Way], task: Task, models: Models, clock: Clock, *, r
         model = models.known[way.model]
         predict = fresh_predictor(model, task.past(model.past_len), samples=JUDGED, seed=1)
         with torch.no_grad():
-            predicted = expected_return(predict(actions[way][None]), actions[way][None], task.reward)[0]
+            predicted = expected_return(
+                predict(actions[way][None]), actions[way][None], task.reward
+            )[0]
         results.append(Outcome(way, np.array(seconds[way]), execute(task, actions[way]), predicted))
     return results
 
 
 def as_good(subject: Outcome, others: Sequence[Outcome]) -> Outcome | None:
     """The fastest of ``others`` whose true return is, in the mean, at least that of ``subject``; None without any."""
-    good = [other for other in others if other.executed_return.mean() >= subject.executed_return.mean()]
+    good = [
+        other for other in others if other.executed_return.mean() >= subject.executed_return.mean()
+    ]
     return min(good, key=lambda other: np.median(other.seconds), default=None)
 
 
@@ -348,32 +413,52 @@ def spread(values: np.ndarray, digits: int = 2) -> str:
 
 
 def training(
-    form: str, features: Features, data: Trajectories, clock: Clock, *, transitions: int, rounds: int
+    form: str,
+    features: Features,
+    data: Trajectories,
+    clock: Clock,
+    *,
+    transitions: int,
+    rounds: int,
 ) -> list[dict[str, Any]]:
     """Print and return transitions per second, and what they are over mbrl-lib's in the same round."""
-    small, large = pets.BATCH, 4 * pets.BATCH  # a quarter of the windows of tsmlib.study, and all of them
+    small, large = (
+        pets.BATCH,
+        4 * pets.BATCH,
+    )  # a quarter of the windows of reproduction, and all of them
     trainers = [
-        theirs(form, features, data, batch=small), ours(form, features, data, batch=small, bf16=False),
-        theirs(form, features, data, batch=large), ours(form, features, data, batch=large, bf16=False),
-    ]  # fmt: skip
+        theirs(form, features, data, batch=small),
+        ours(form, features, data, batch=small, bf16=False),
+        theirs(form, features, data, batch=large),
+        ours(form, features, data, batch=large, bf16=False),
+    ]
     if native_bf16():
         trainers.append(ours(form, features, data, batch=large, bf16=True))
     same_size(trainers)
     found = speeds(trainers, clock, transitions=transitions, rounds=rounds)
     first, *_ = trainers
-    print(f"\ntraining, {form}: transitions per second that each of the {pets.MEMBERS} members sees; over the first")
+    print(
+        f"\ntraining, {form}: transitions per second that each of the {pets.MEMBERS} members sees; over the first"
+    )
     rows = []
     for trainer in trainers:
         values = found[trainer.name]
         ratio = values / found[first.name]
-        print(f"{trainer.name:34} {trainer.parameters:8,} parameters {spread(values, 0):>24} {spread(ratio):>22}")
+        print(
+            f"{trainer.name:34} {trainer.parameters:8,} parameters {spread(values, 0):>24} {spread(ratio):>22}"
+        )
         about = dict(
-            env=ENV, sim="mujoco", model=pets.MODELS[form] if trainer.theirs else OURS[form],
-            configuration=trainer.name, n=rounds,
-        )  # fmt: skip
+            env=ENV,
+            sim="mujoco",
+            model=pets.MODELS[form] if trainer.theirs else OURS[form],
+            configuration=trainer.name,
+            n=rounds,
+        )
         rows.append(dict(about, metric="parameters", value=trainer.parameters))
         for word, of in SPREAD.items():
-            rows.append(dict(about, metric=f"transitions_per_second_{word}", value=of(values), unit="1/s"))
+            rows.append(
+                dict(about, metric=f"transitions_per_second_{word}", value=of(values), unit="1/s")
+            )
             rows.append(dict(about, metric=f"ratio_{word}", value=of(ratio)))
     return rows
 
@@ -391,13 +476,18 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
         f"{'over the first':>14} {'over idle':>14} {'times faster':>22} {'ms a rollout':>12}"
     )
     for outcome in found:
-        way, (gain, half), ratio = outcome.way, compared(outcome, first), times_faster(outcome, first)
+        way, (gain, half), ratio = (
+            outcome.way,
+            compared(outcome, first),
+            times_faster(outcome, first),
+        )
         over_idle, idle_half = interval(outcome.executed_return - idle)
         rollout = np.median(outcome.seconds) / (way.candidates * way.iterations * way.samples)
         values = {
-            "return_predicted": outcome.predicted_return.mean().item(), "return_true": outcome.executed_return.mean(),
+            "return_predicted": outcome.predicted_return.mean().item(),
+            "return_true": outcome.executed_return.mean(),
             "final_distance": outcome.trial.final_distance.mean().item(),
-        }  # fmt: skip
+        }
         predicted, true, distance = values.values()
         print(
             f"{way.name:64} {spread(outcome.seconds):>22} {predicted:9.2f} {true:8.2f} {distance:8.3f} "
@@ -405,22 +495,43 @@ def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
             f"{1000 * rollout:12.2f}"
         )
         about = dict(
-            env=ENV, sim="mujoco", task=task.name, model=way.model, planner=way.planner,
+            env=ENV,
+            sim="mujoco",
+            task=task.name,
+            model=way.model,
+            planner=way.planner,
             search_space=way.search_space,
-            horizon=task.horizon, configuration=way.settings,
-        )  # fmt: skip
-        gains = {"gain": gain, "gain_half": half, "gain_idle": over_idle, "gain_idle_half": idle_half}
-        for metric, value in {**values, **{f"return_{word}": value for word, value in gains.items()}}.items():
-            rows.append(dict(about, metric=metric, value=value, unit="m" * (metric == "final_distance"), n=n))
+            horizon=task.horizon,
+            configuration=way.settings,
+        )
+        gains = {
+            "gain": gain,
+            "gain_half": half,
+            "gain_idle": over_idle,
+            "gain_idle_half": idle_half,
+        }
+        for metric, value in {
+            **values,
+            **{f"return_{word}": value for word, value in gains.items()},
+        }.items():
+            rows.append(
+                dict(
+                    about, metric=metric, value=value, unit="m" * (metric == "final_distance"), n=n
+                )
+            )
         for word, of in SPREAD.items():
-            rows.append(dict(about, metric=f"plan_seconds_{word}", value=of(outcome.seconds), unit="s", n=n))
+            rows.append(
+                dict(about, metric=f"plan_seconds_{word}", value=of(outcome.seconds), unit="s", n=n)
+            )
             rows.append(dict(about, metric=f"ratio_{word}", value=of(ratio), n=n))
     return rows
 
 
 def verdicts(found: Sequence[Outcome]) -> None:
     """Print, for each of mbrl-lib's settings, the fastest of ours that returns as much, and the other way round."""
-    by_origin = {origin: [o for o in found if o.way.origin == origin] for origin in ("theirs", "ours")}
+    by_origin = {
+        origin: [o for o in found if o.way.origin == origin] for origin in ("theirs", "ours")
+    }
     for subjects, others in (("theirs", "ours"), ("ours", "theirs")):
         print(f"\nthe fastest of {others} that returns at least as much as each of {subjects}")
         for subject in by_origin[subjects]:
@@ -439,7 +550,13 @@ def verdicts(found: Sequence[Outcome]) -> None:
 
 
 def trained(
-    run: runs.Run, form: str, features: Features, data: Trajectories, validation: Trajectories, *, seconds: float
+    run: runs.Run,
+    form: str,
+    features: Features,
+    data: Trajectories,
+    validation: Trajectories,
+    *,
+    seconds: float,
 ) -> Any:
     """mbrl-lib's model after ``seconds`` of CPU time: from the run's folder, else trained now and kept there."""
     path = run.folder("peers") / f"{pets.MODELS[form]}.safetensors"
@@ -448,23 +565,41 @@ def trained(
     if path.exists():
         weights, header = artifacts.load(path, kind="peer")
         if header["made_from"] == made_from:
-            model, _ = pets.initialise(form, features, data, seed=0)  # the statistics of its inputs are not weights
+            model, _ = pets.initialise(
+                form, features, data, seed=0
+            )  # the statistics of its inputs are not weights
             model.load_state_dict(weights)
             return model.eval()
     model, took = pets.train(form, features, data, validation, seconds=seconds, seed=0)
-    artifacts.save(path, model.state_dict(), kind="peer", header={"made_from": made_from, "took": took})
+    artifacts.save(
+        path, model.state_dict(), kind="peer", header={"made_from": made_from, "took": took}
+    )
     return model
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--form", choices=pets.MODELS, default="gaussian", help="what plans (default gaussian)")
-    parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of its training (default 300)")
-    parser.add_argument("--targets", type=int, default=10, help="of the frozen test task (default 10)")
-    parser.add_argument("--rounds", type=int, default=2, help="each with a share of the targets (default 2)")
-    parser.add_argument("--transitions", type=int, default=10240, help="of a turn of training (default 10240)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--form", choices=pets.MODELS, default="gaussian", help="what plans (default gaussian)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=300, help="CPU seconds of its training (default 300)"
+    )
+    parser.add_argument(
+        "--targets", type=int, default=10, help="of the frozen test task (default 10)"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=2, help="each with a share of the targets (default 2)"
+    )
+    parser.add_argument(
+        "--transitions", type=int, default=10240, help="of a turn of training (default 10240)"
+    )
     parser.add_argument("--training-rounds", type=int, default=5, help="default 5")
-    parser.add_argument("--threads", type=int, default=1, help="default 1; with more, seconds are those of a clock")
+    parser.add_argument(
+        "--threads", type=int, default=1, help="default 1; with more, seconds are those of a clock"
+    )
     arguments = parser.parse_args()
     if not 1 <= arguments.rounds <= arguments.targets:
         parser.error(f"{arguments.rounds} rounds share {arguments.targets} targets; each needs one")

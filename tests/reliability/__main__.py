@@ -23,12 +23,14 @@ from reliability import cluster, files, pipelines, simulators, training
 from reliability.world import Outcome
 from tsmlib.storage import files as files_storage
 from tsmlib.storage import manifest
-from tsmlib.study import runs
+from reproduction import runs
 
 DOCS = runs.ROOT / "docs" / "reliability.md"
 MARKS = ("<!-- table -->", "<!-- end of table -->")
 LONG_ONLY = -1
-CHECKS: dict[str, list[tuple[Callable[[int], Outcome], int, int]]] = {  # check, quick and long trials
+CHECKS: dict[
+    str, list[tuple[Callable[[int], Outcome], int, int]]
+] = {  # check, quick and long trials
     "training": [
         (training.killed_at_random_moments, 20, 300),
         (training.at_every_call, 3, 1),
@@ -79,7 +81,9 @@ def main() -> int:
         name, _, trials = word.partition("=")
         entries = CHECKS.get(name) or by_name.get(name, [])
         if word != "table" and (not entries or (trials and not trials.isdecimal())):
-            print(f"error: no part is called {word!r}; there are {', '.join([*CHECKS, *by_name])} and table.")
+            print(
+                f"error: no part is called {word!r}; there are {', '.join([*CHECKS, *by_name])} and table."
+            )
             return 2
         for check, few, many in entries:
             if not quick or few != LONG_ONLY:
@@ -95,11 +99,20 @@ def main() -> int:
         seconds = seconds_used() - began
         failed += not 0 < outcome.of == outcome.right and not outcome.note.endswith("not done")
         score = f"{outcome.right} of {outcome.of}   {outcome.note}   {seconds:.0f} s"
-        print(f"{said(check)[0]:7} {check.__name__:28} {score}", *outcome.wrong[:10], sep="\n        ", flush=True)
+        print(
+            f"{said(check)[0]:7} {check.__name__:28} {score}",
+            *outcome.wrong[:10],
+            sep="\n        ",
+            flush=True,
+        )
         entry = {
-            "right": outcome.right, "of": outcome.of, "note": outcome.note,
-            "seconds": round(seconds), "wrong": outcome.wrong[:10], "day": f"{datetime.now(UTC):%Y-%m-%d}",
-        }  # fmt: skip
+            "right": outcome.right,
+            "of": outcome.of,
+            "note": outcome.note,
+            "seconds": round(seconds),
+            "wrong": outcome.wrong[:10],
+            "day": f"{datetime.now(UTC):%Y-%m-%d}",
+        }
         if outcome.of or not outcome.note.endswith("not done"):
             manifest.write_json(place / f"{check.__name__}.json", entry)
     write_table(place)
@@ -123,17 +136,33 @@ def write_table(place: Path) -> None:
     table, _, after = rest.partition(MARKS[1])
     written = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
     kept = {tuple(cells[:2]): cells[2:] for cells in written if len(cells) == 7}
-    lines = ["| test | what | right | of | measured | CPU s | day |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| test | what | right | of | measured | CPU s | day |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for part in CHECKS.values():
         for check, _, _ in part:
             path = place / f"{check.__name__}.json"
             told, found = _cells(*said(check)), kept.get(_cells(*said(check)))
             if path.exists():
                 entry = manifest.read_own_json(path)
-                found = [*_cells(*(entry.get(name, "") for name in ("right", "of", "note", "seconds", "day")))]
-            lines.append("| " + " | ".join([*told, *(found or ["", "", "not yet run at full length", "", ""])]) + " |")
-    lines += ["", f"Python {platform.python_version()}, torch {torch.__version__}, {platform.system()}."]
-    files_storage.write_bytes(DOCS, "\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]).encode())
+                found = [
+                    *_cells(
+                        *(entry.get(name, "") for name in ("right", "of", "note", "seconds", "day"))
+                    )
+                ]
+            lines.append(
+                "| "
+                + " | ".join([*told, *(found or ["", "", "not yet run at full length", "", ""])])
+                + " |"
+            )
+    lines += [
+        "",
+        f"Python {platform.python_version()}, torch {torch.__version__}, {platform.system()}.",
+    ]
+    files_storage.write_bytes(
+        DOCS, "\n".join([before + MARKS[0], "", *lines, "", MARKS[1] + after]).encode()
+    )
 
 
 def _cells(*values: object) -> tuple[str, ...]:

@@ -22,7 +22,18 @@ from unittest import mock
 import numpy as np
 import torch
 
-from reliability.world import TRAIN, Child, Outcome, artefacts, folder, forged, in_child, new_model, refusal, rng
+from reliability.world import (
+    TRAIN,
+    Child,
+    Outcome,
+    artefacts,
+    folder,
+    forged,
+    in_child,
+    new_model,
+    refusal,
+    rng,
+)
 from tsmlib.envs import fingerprint
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.models.action_prior import ActionPrior
@@ -32,10 +43,10 @@ from tsmlib.models.tsm import TSM
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
 from tsmlib.storage import artifacts, files, manifest
 from tsmlib.storage.files import StoreError
-from tsmlib.storage.minari import load_minari, save_minari
-from tsmlib.study import parameters, runs
-from tsmlib.study.parameters import ParameterError
-from tsmlib.study.runs import RunError
+from tsmlib.contrib.minari import load_minari, save_minari
+from reproduction import parameters, runs
+from reproduction.parameters import ParameterError
+from reproduction.runs import RunError
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 try:
@@ -119,7 +130,10 @@ def spoils(data: bytes, trials: int) -> Iterator[tuple[str, bytes]]:
         yield f"{len(tail)} appended", data + tail
     for _ in range(max(1, trials // 20)):
         start, size = draw.randrange(len(data)), 4096
-        yield f"zeroed at {start}", data[:start] + bytes(min(size, len(data) - start)) + data[start + size :]
+        yield (
+            f"zeroed at {start}",
+            data[:start] + bytes(min(size, len(data) - start)) + data[start + size :],
+        )
 
 
 # Malice --------------------------------------------------------------------------------------------------------------
@@ -147,7 +161,9 @@ def hostile_files(place: Path) -> dict[str, bytes]:
     kinds["os.system"] = b"cposix\nsystem\n(S'mkdir " + str(canary).encode() + b"'\ntR."
     for legacy in (False, True):
         buffer = io.BytesIO()
-        torch.save({"w": torch.ones(2), "x": payload}, buffer, _use_new_zipfile_serialization=not legacy)
+        torch.save(
+            {"w": torch.ones(2), "x": payload}, buffer, _use_new_zipfile_serialization=not legacy
+        )
         kinds[f"torch.save, {'legacy' if legacy else 'zip'}"] = buffer.getvalue()
     buffer = io.BytesIO()
     np.save(buffer, np.array([payload], dtype=object), allow_pickle=True)
@@ -156,12 +172,17 @@ def hostile_files(place: Path) -> dict[str, bytes]:
     np.savez(buffer, allow_pickle=True, a=np.array([payload], dtype=object))
     kinds["object .npz"] = buffer.getvalue()
     kinds["yaml"] = f"!!python/object/apply:os.mkdir ['{canary}']".encode()
-    kinds["json class"] = json.dumps({"__class__": "os.system", "args": [f"mkdir {canary}"]}).encode()
+    kinds["json class"] = json.dumps(
+        {"__class__": "os.system", "args": [f"mkdir {canary}"]}
+    ).encode()
     kinds["python"] = f"import os; os.mkdir({str(canary)!r})".encode()
     for name, member in {
-        "zip ../": "../canary", "zip absolute": str(canary), "zip drive": "C:\\canary", "zip nul": "a\0b",
+        "zip ../": "../canary",
+        "zip absolute": str(canary),
+        "zip drive": "C:\\canary",
+        "zip nul": "a\0b",
         "zip twice": "x",
-    }.items():  # fmt: skip
+    }.items():
         buffer = io.BytesIO()
         with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -198,7 +219,9 @@ def _malice() -> Outcome:
     found, seen = Outcome(), []
 
     def hook(event: str, _: tuple[Any, ...]) -> None:
-        if event.startswith(("pickle.", "os.system", "os.exec", "os.posix_spawn", "subprocess.", "socket.")):
+        if event.startswith(
+            ("pickle.", "os.system", "os.exec", "os.posix_spawn", "subprocess.", "socket.")
+        ):
             seen.append(event)
 
     with folder() as place:
@@ -212,7 +235,10 @@ def _malice() -> Outcome:
                 path.write_bytes(hostile)
                 began = time.process_time()
                 good, said = named(kind, path, load, name)
-                found.count(good and time.process_time() - began < 10 and not (place / "canary").exists(), said)
+                found.count(
+                    good and time.process_time() - began < 10 and not (place / "canary").exists(),
+                    said,
+                )
             path.write_bytes(data)
         found.count(seen == ["listening"], f"events: {seen[:5]}")
         found.note = f"{len(kinds)} files under the names of {found.of // len(kinds)} artefacts"
@@ -240,8 +266,14 @@ def hostile_minari(trials: int = 0) -> Outcome:
                 make(group)
             found.count(*harmless(one, TRAIN.take(slice(1)), name, refused=name not in HARMLESS))
         file.write_bytes(good)
-        specification = json.dumps({"id": "Evil-v0", "entry_point": "os:mkdir", "additional_wrappers": [],
-                                    "kwargs": {"path": str(place / "canary")}})  # fmt: skip
+        specification = json.dumps(
+            {
+                "id": "Evil-v0",
+                "entry_point": "os:mkdir",
+                "additional_wrappers": [],
+                "kwargs": {"path": str(place / "canary")},
+            }
+        )
         space = json.loads(stated["observation_space"])
         changes: dict[str, dict[str, Any]] = {
             "an entry point": {"env_spec": specification, "observation_space": None},
@@ -249,18 +281,30 @@ def hostile_minari(trials: int = 0) -> Outcome:
             "arrow": {"data_format": "arrow"},
             "a format that is a path": {"data_format": "../../canary"},
             "deep json": {"observation_space": "[" * 100_000},
-            "a dictionary": {"observation_space": json.dumps({"type": "Dict", "subspaces": {"x": space}})},
-            "a text": {"action_space": json.dumps({"type": "Text", "max_length": 10**9, "low": [], "high": []})},
-            "a large box": {"observation_space": json.dumps({**space, "shape": [10**9], "low": -1, "high": 1})},
+            "a dictionary": {
+                "observation_space": json.dumps({"type": "Dict", "subspaces": {"x": space}})
+            },
+            "a text": {
+                "action_space": json.dumps(
+                    {"type": "Text", "max_length": 10**9, "low": [], "high": []}
+                )
+            },
+            "a large box": {
+                "observation_space": json.dumps({**space, "shape": [10**9], "low": -1, "high": 1})
+            },
             "a large type": {"observation_space": json.dumps({**space, "dtype": "S1000000000"})},
             "another version": {"minari_version": "99.0"},
         }
         for name, change in changes.items():
-            said = {word: value for word, value in {**stated, **change}.items() if value is not None}
+            said = {
+                word: value for word, value in {**stated, **change}.items() if value is not None
+            }
             metadata.write_text(json.dumps(said))
             found.count(*harmless(one, TRAIN, name))
         metadata.write_text(json.dumps({**stated, "env_spec": specification}))
-        found.count(*harmless(one, TRAIN.take(slice(1)), "an entry point beside spaces", refused=False))
+        found.count(
+            *harmless(one, TRAIN.take(slice(1)), "an entry point beside spaces", refused=False)
+        )
         found.count(not (place / "canary").exists(), "something was executed")
         draw, path = rng(6), whole / "data" / "main_data.hdf5"
         data = path.read_bytes()
@@ -271,7 +315,13 @@ def hostile_minari(trials: int = 0) -> Outcome:
     return found
 
 
-HARMLESS = ("a group within itself", "one object twice", "50 groups deep", "10,000 groups", "a long attribute")
+HARMLESS = (
+    "a group within itself",
+    "one object twice",
+    "50 groups deep",
+    "10,000 groups",
+    "a long attribute",
+)
 
 
 def hostile_hdf5(place: Path) -> dict[str, Callable[[Any], Any]]:
@@ -307,7 +357,9 @@ def hostile_hdf5(place: Path) -> dict[str, Callable[[Any], Any]]:
 
     fields = np.zeros((31, 3), [("a", "f4"), ("b", "i4")])
     return {
-        "external storage": put(shape=(31, 3), dtype="f8", external=[(str(secret), 0, secret.stat().st_size)]),
+        "external storage": put(
+            shape=(31, 3), dtype="f8", external=[(str(secret), 0, secret.stat().st_size)]
+        ),
         "external link": linked(h5py.ExternalLink(str(other), "/x")),
         "soft link": linked(h5py.SoftLink("/elsewhere")),
         "soft link to itself": linked(h5py.SoftLink("/episode_0/observations")),
@@ -333,7 +385,9 @@ def hostile_hdf5(place: Path) -> dict[str, Callable[[Any], Any]]:
     }
 
 
-def harmless(place: Path, data: Trajectories, name: str, *, refused: bool = True) -> tuple[bool, str]:
+def harmless(
+    place: Path, data: Trajectories, name: str, *, refused: bool = True
+) -> tuple[bool, str]:
     """Whether a data set is refused, or loaded as ``data``, in time, in words, and in little memory."""
     about = {word: getattr(data, word) for word in ("env", "dt", "names", "units", "angles")}
     began, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -353,9 +407,15 @@ def harmless(place: Path, data: Trajectories, name: str, *, refused: bool = True
 # What does not belong together ---------------------------------------------------------------------------------------
 
 OTHERWISE: dict[str, Any] = {
-    "dt": 0.01, "names": ["x"] * 6, "units": ["cm"] * 6, "angles": [0], "noise": 0.25, "delay": 3,
-    "simulator": "0" * 64, "segment_len": 5,
-}  # fmt: skip
+    "dt": 0.01,
+    "names": ["x"] * 6,
+    "units": ["cm"] * 6,
+    "angles": [0],
+    "noise": 0.25,
+    "delay": 3,
+    "simulator": "0" * 64,
+    "segment_len": 5,
+}
 
 
 def mismatched(trials: int = 0) -> Outcome:
@@ -385,7 +445,9 @@ def mismatched(trials: int = 0) -> Outcome:
                     else:
                         field = "env" if name in prints else name
                         both = repr(stated[field]) in said and repr(expected[field]) in said
-                        found.count(both and path.name in said, f"{path.stem} {name} as {env}: {said}")
+                        found.count(
+                            both and path.name in said, f"{path.stem} {name} as {env}: {said}"
+                        )
     return found
 
 
@@ -394,24 +456,120 @@ def mismatched(trials: int = 0) -> Outcome:
 
 def hostile_texts() -> list[str]:
     """Values that no parameter may have, typed on a command line: at least 150."""
-    texts = ["../x", "../../etc/passwd", "a/../../b", "..", "~", "~root", "~/x", "a\0b", "\0", "a\nb", "\n", "\r", "\t",
-             "a\u202eb", "\u200bx", "\ufeffx", "\u2028x", "\x1b[31mred", "\x7f", "\ud800x", " x", "x ", "CON", "con",
-             "nul.txt", "aux/x", "a/PRN", "com1", "LPT9.x", "../..", "a/..", "x/../../..", "/../x", "~x", "Nul", "PRN",
-             "com7/x", "x" * 300, "x" * 1001, "x" * 100_000]  # fmt: skip
+    texts = [
+        "../x",
+        "../../etc/passwd",
+        "a/../../b",
+        "..",
+        "~",
+        "~root",
+        "~/x",
+        "a\0b",
+        "\0",
+        "a\nb",
+        "\n",
+        "\r",
+        "\t",
+        "a\u202eb",
+        "\u200bx",
+        "\ufeffx",
+        "\u2028x",
+        "\x1b[31mred",
+        "\x7f",
+        "\ud800x",
+        " x",
+        "x ",
+        "CON",
+        "con",
+        "nul.txt",
+        "aux/x",
+        "a/PRN",
+        "com1",
+        "LPT9.x",
+        "../..",
+        "a/..",
+        "x/../../..",
+        "/../x",
+        "~x",
+        "Nul",
+        "PRN",
+        "com7/x",
+        "x" * 300,
+        "x" * 1001,
+        "x" * 100_000,
+    ]
     tails = ("1", "smoke", "tsm", "x" * 20)
     texts += [f"{text}{tail}" for text in ("../", "~", "a\0", "a\n", "\u202e") for tail in tails]
-    ranges = (range(1, 32), range(127, 161), range(0x200E, 0x2010), range(0x2028, 0x2030), range(0x2060, 0x2070))
+    ranges = (
+        range(1, 32),
+        range(127, 161),
+        range(0x200E, 0x2010),
+        range(0x2028, 0x2030),
+        range(0x2060, 0x2070),
+    )
     return texts + [f"a{chr(code)}b" for codes in (*ranges, [0xE0001]) for code in codes]
 
 
 def hostile_numbers() -> list[str]:
     """Values that no number of ours may have."""
     return [
-        "-1", "-0.5", "1e9", "1e308", "nan", "NaN", "inf", "-inf", "infinity", "true", "True", "None", "null", "0x10",
-        "0b1", "0o7", "1_000", "1,5", "1;2", "10**9", "1+1", "[1]", "{}", "()", "", " ", "1 ", " 1", "+", "-", "--1",
-        "1.", ".5", "1.0", "1e3", "1/2", "½", "²", "１", "٣", "1e", "e1", "1j", "$1", "`id`", "$(id)", "%s", "{seed}",
-        "{x.__class__}", "__import__('os')", "9" * 19, "9" * 5000, "2147483648", "-2147483649", "Smoke", "seed=1",
-    ]  # fmt: skip
+        "-1",
+        "-0.5",
+        "1e9",
+        "1e308",
+        "nan",
+        "NaN",
+        "inf",
+        "-inf",
+        "infinity",
+        "true",
+        "True",
+        "None",
+        "null",
+        "0x10",
+        "0b1",
+        "0o7",
+        "1_000",
+        "1,5",
+        "1;2",
+        "10**9",
+        "1+1",
+        "[1]",
+        "{}",
+        "()",
+        "",
+        " ",
+        "1 ",
+        " 1",
+        "+",
+        "-",
+        "--1",
+        "1.",
+        ".5",
+        "1.0",
+        "1e3",
+        "1/2",
+        "½",
+        "²",
+        "１",
+        "٣",
+        "1e",
+        "e1",
+        "1j",
+        "$1",
+        "`id`",
+        "$(id)",
+        "%s",
+        "{seed}",
+        "{x.__class__}",
+        "__import__('os')",
+        "9" * 19,
+        "9" * 5000,
+        "2147483648",
+        "-2147483649",
+        "Smoke",
+        "seed=1",
+    ]
 
 
 def hostile_parameters(trials: int = 0) -> Outcome:
@@ -423,8 +581,28 @@ def hostile_parameters(trials: int = 0) -> Outcome:
 
     found, per_parameter, seen = Outcome(), [], set[str]()
     words = hostile_texts() + hostile_numbers()
-    names = ["sed", "", " ", "seed ", "Seed", "__class__", "seed=1; import os; x", "os.system('id')", "a.b", "a[0]",
-             "seed\n", "лl", "import os", "lambda: 0", "x" * 300, "run_dir\0", "None", "-p", "--seed", "é"]  # fmt: skip
+    names = [
+        "sed",
+        "",
+        " ",
+        "seed ",
+        "Seed",
+        "__class__",
+        "seed=1; import os; x",
+        "os.system('id')",
+        "a.b",
+        "a[0]",
+        "seed\n",
+        "лl",
+        "import os",
+        "lambda: 0",
+        "x" * 300,
+        "run_dir\0",
+        "None",
+        "-p",
+        "--seed",
+        "é",
+    ]
     with folder() as place, mock.patch.dict(os.environ, TSM_RUN_DIR=str(place / "runs")):
         for word, notebook in runs.notebooks().items():
             for name, default in parameters.declared(notebook.path).items():
@@ -436,17 +614,34 @@ def hostile_parameters(trials: int = 0) -> Outcome:
                 seen.add(name)
                 per_parameter.append(len(hostile))
                 for text in hostile:
-                    given = [f"--{name}={text}"] if name in ("scale", "seed") else [f"-p{name}={text}"]
+                    given = (
+                        [f"--{name}={text}"] if name in ("scale", "seed") else [f"-p{name}={text}"]
+                    )
                     errors = io.StringIO()
                     with contextlib.redirect_stderr(errors):
                         code = main(["run", word, *given])
                     line = errors.getvalue()
                     clear = line.count("\n") == 1 and name in line and "expected" in line
-                    found.count(code == 2 and clear, f"{word} {name}={text[:40]!r}: {code} {line[:200]}")
+                    found.count(
+                        code == 2 and clear, f"{word} {name}={text[:40]!r}: {code} {line[:200]}"
+                    )
             for name in names:
                 with contextlib.redirect_stderr(io.StringIO()):
                     found.count(main(["run", word, f"-p{name}=1"]) == 2, f"{word} {name!r}")
-        for bad in (*hostile_texts(), -1, 2**31, 1.0, True, None, [], {}, b"x", float("nan"), 10**30, object()):
+        for bad in (
+            *hostile_texts(),
+            -1,
+            2**31,
+            1.0,
+            True,
+            None,
+            [],
+            {},
+            b"x",
+            float("nan"),
+            10**30,
+            object(),
+        ):
             for name in ("scale", "seed", "run_dir", "env", "models", "n_targets"):
                 said = refusal(lambda: runs.resolve("05_control", **{name: bad}), ParameterError)  # noqa: B023
                 found.count(name in said, f"resolve({name}={bad!r:.40}): {said}")
@@ -457,8 +652,35 @@ def hostile_parameters(trials: int = 0) -> Outcome:
 
 # Made up -------------------------------------------------------------------------------------------------------------
 
-WORDS = ["", "env", "tsm/Reacher-v0", "TSM", "x" * 50, "states", "../x", "\0", "nan", None, True, 0, -1, 1, 3, 10**9,
-         2**70, 1e308, -1e-308, [], {}, [[]], [0], {"a": 1}, [1, 2, 3], ["a", "b", "c"], ["m"] * 3]  # fmt: skip
+WORDS = [
+    "",
+    "env",
+    "tsm/Reacher-v0",
+    "TSM",
+    "x" * 50,
+    "states",
+    "../x",
+    "\0",
+    "nan",
+    None,
+    True,
+    0,
+    -1,
+    1,
+    3,
+    10**9,
+    2**70,
+    1e308,
+    -1e-308,
+    [],
+    {},
+    [[]],
+    [0],
+    {"a": 1},
+    [1, 2, 3],
+    ["a", "b", "c"],
+    ["m"] * 3,
+]
 
 
 def made_up(draw: Any, value: Any, depth: int = 0) -> Any:
@@ -466,8 +688,15 @@ def made_up(draw: Any, value: Any, depth: int = 0) -> Any:
     if draw.random() < 0.12:
         return draw.choice(WORDS)
     if isinstance(value, dict):
-        items = {name: made_up(draw, item, depth + 1) for name, item in value.items() if draw.random() > 0.06}
-        return {**items, **({str(draw.choice(WORDS)): draw.choice(WORDS)} if draw.random() < 0.1 else {})}
+        items = {
+            name: made_up(draw, item, depth + 1)
+            for name, item in value.items()
+            if draw.random() > 0.06
+        }
+        return {
+            **items,
+            **({str(draw.choice(WORDS)): draw.choice(WORDS)} if draw.random() < 0.1 else {}),
+        }
     if isinstance(value, list):
         items = [made_up(draw, item, depth + 1) for item in value if draw.random() > 0.04]
         return items + ([draw.choice(WORDS)] if draw.random() < 0.06 else [])
@@ -481,17 +710,33 @@ def fuzz(trials: int) -> Outcome:
     with folder() as place:
         kinds = artefacts(place)
         words = {"dataset": "trajectories", "model": "model", "checkpoint": "checkpoint"}
-        plain = [(w, *artifacts.load(kinds[kind][0], kind=w), kinds[kind][0]) for kind, w in words.items()]
-        sheets = [(kinds[kind][0], json.loads(kinds[kind][0].read_text())) for kind in ("manifest", "status")]
+        plain = [
+            (w, *artifacts.load(kinds[kind][0], kind=w), kinds[kind][0])
+            for kind, w in words.items()
+        ]
+        sheets = [
+            (kinds[kind][0], json.loads(kinds[kind][0].read_text()))
+            for kind in ("manifest", "status")
+        ]
         loads = dict(kinds.values())
         notebook = place / "01_x.ipynb"
-        cells = [{"cell_type": "code", "metadata": {"tags": ["parameters"]}, "source": ["seed = 0\n", 'scale = ""']}]
+        cells = [
+            {
+                "cell_type": "code",
+                "metadata": {"tags": ["parameters"]},
+                "source": ["seed = 0\n", 'scale = ""'],
+            }
+        ]
         for trial in range(trials):
             draw = rng(27, trial)
             work: Callable[[], Any]
             if trial % 4 < 2:
                 word, arrays, header, path = draw.choice(plain)
-                tensors = {name: change(draw, tensor) for name, tensor in arrays.items() if draw.random() > 0.02}
+                tensors = {
+                    name: change(draw, tensor)
+                    for name, tensor in arrays.items()
+                    if draw.random() > 0.02
+                }
                 schema = {} if draw.random() < 0.9 else {"schema": draw.choice(WORDS)}
                 forged(path, tensors or arrays, kind=word, header=made_up(draw, header), **schema)
                 work = loads[path]
@@ -507,14 +752,18 @@ def fuzz(trials: int) -> Outcome:
                 work = loads[path] if draw.random() < 0.5 else lambda: manifest.verify(path)  # noqa: B023
             else:
                 notebook.write_text(json.dumps(made_up(draw, {"cells": cells})))
-                text = "".join(draw.choices("0123456789eE+-._ax\n\0 ,;[](){}'\"=tsm/Rv", k=draw.randrange(12)))
+                text = "".join(
+                    draw.choices("0123456789eE+-._ax\n\0 ,;[](){}'\"=tsm/Rv", k=draw.randrange(12))
+                )
                 name = draw.choice(list(parameters.SCHEMA))
                 given = {name: text}
-                work = draw.choice([
-                    lambda: parameters.typed(notebook, given),  # noqa: B023
-                    lambda: parameters.convert(name, text),  # noqa: B023
-                    lambda: parameters.check(name, draw.choice(WORDS)),  # noqa: B023
-                ])  # fmt: skip
+                work = draw.choice(
+                    [
+                        lambda: parameters.typed(notebook, given),  # noqa: B023
+                        lambda: parameters.convert(name, text),  # noqa: B023
+                        lambda: parameters.check(name, draw.choice(WORDS)),  # noqa: B023
+                    ]
+                )
             try:
                 work()
                 found.count(True)
@@ -536,8 +785,15 @@ def greedy(place: Path) -> Outcome:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     little_memory()
     prior = ActionPrior(2, segment_len=4, channels=8, dilations=(1, 2))
-    models = [new_model(), OneStep(3, 2, hidden=8), LSTM(3, 2, hidden=8), Ensemble(3, 2, hidden=8), prior,
-              OneStepPolicy(3, 2, hidden=8), SegmentPolicy(3, prior, channels=8)]  # fmt: skip
+    models = [
+        new_model(),
+        OneStep(3, 2, hidden=8),
+        LSTM(3, 2, hidden=8),
+        Ensemble(3, 2, hidden=8),
+        prior,
+        OneStepPolicy(3, 2, hidden=8),
+        SegmentPolicy(3, prior, channels=8),
+    ]
 
     def ask(model: Any, **changed: Any) -> str:
         header = {"class": type(model).__name__, "config": {**model.config(), **changed}}
@@ -551,7 +807,9 @@ def greedy(place: Path) -> Outcome:
                 said = ask(model, **{name: huge})
                 grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
                 good = path.name in said and "at most" in said and grown < 100
-                found.count(good, f"{type(model).__name__}, {name} {huge!r:.30}: {grown:.0f} MB, {said}")
+                found.count(
+                    good, f"{type(model).__name__}, {name} {huge!r:.30}: {grown:.0f} MB, {said}"
+                )
     began = time.process_time()
     said = ask(models[3], members=10_000, layers=10_000)
     found.count("larger than its file" in said and time.process_time() - began < 10, said)

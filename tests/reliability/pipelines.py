@@ -19,8 +19,8 @@ import nbformat
 import numpy as np
 
 from reliability.world import Outcome, folder, in_child, new_model, refusal, rng
-from tsmlib.study import notebooks, runs
-from tsmlib.study.runs import ROOT, RunError
+from reproduction import notebooks, runs
+from reproduction.runs import ROOT, RunError
 
 TESTS = str(Path(__file__).resolve().parent.parent)
 
@@ -30,14 +30,16 @@ TESTS = str(Path(__file__).resolve().parent.parent)
 SLEEPER = "import os, sys, time\nopen({mark!r}, 'w').write(str(os.getpid()))\ntime.sleep(3600)"
 RUNNER = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "import sys; from pathlib import Path; from tsmlib.study import notebooks, runs; from tsmlib.__main__ import main\n"
+    "import sys; from pathlib import Path; from reproduction import notebooks, runs; from tsmlib.__main__ import main\n"
     "runs.NOTEBOOKS = notebooks.NOTEBOOKS = Path(sys.argv[1]); sys.exit(main(['run', 'first', '--scale', 'smoke']))"
 )
 
 
 def write_notebook(path: Path, *cells: str) -> None:
     """A notebook with a parameters cell and ``cells``."""
-    notebook = nbformat.v4.new_notebook(metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}})
+    notebook = nbformat.v4.new_notebook(
+        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    )
     first = 'scale = ""\nseed = 0\nrun_dir = ""'
     notebook.cells = [nbformat.v4.new_code_cell(source) for source in (first, *cells)]
     notebook.cells[0].metadata["tags"] = ["parameters"]
@@ -49,13 +51,19 @@ def killed_runs(trials: int) -> Outcome:
     """R14: kernel SIGKILL, sys.exit(0), an error, SIGINT, SIGTERM, SIGKILL of the runner: never complete, refused."""
     found = Outcome()
     for trial in range(trials):
-        how = ("kernel SIGKILL", "sys.exit(0)", "an error", "SIGINT", "SIGTERM", "SIGKILL")[trial % 6]
+        how = ("kernel SIGKILL", "sys.exit(0)", "an error", "SIGINT", "SIGTERM", "SIGKILL")[
+            trial % 6
+        ]
         with folder() as place:
             mark = place / "inside"
             cells = {"sys.exit(0)": "import sys; sys.exit(0)", "an error": "1 / 0"}
             cell = cells.get(how, SLEEPER.format(mark=str(mark)))
             write_notebook(place / "notebooks" / "01_first.ipynb", cell, "print('after')")
-            environment = {**os.environ, "TSM_RUN_DIR": str(place / "runs"), "PYTHONPATH": str(ROOT)}
+            environment = {
+                **os.environ,
+                "TSM_RUN_DIR": str(place / "runs"),
+                "PYTHONPATH": str(ROOT),
+            }
             command = [sys.executable, "-c", RUNNER, str(place / "notebooks")]
             with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:
                 if how not in ("sys.exit(0)", "an error"):
@@ -68,7 +76,9 @@ def killed_runs(trials: int) -> Outcome:
                     else:
                         process.send_signal(getattr(signal, how))
                 code = process.wait(600)
-            state = json.loads((place / "runs/smoke/seed0/01_first.status.json").read_text())["state"]
+            state = json.loads((place / "runs/smoke/seed0/01_first.status.json").read_text())[
+                "state"
+            ]
             found.count(code != 0 and state != "complete", f"{how}: exit {code}, {state}")
             run = runs.resolve("02_second", scale="smoke", run_dir=str(place / "runs"))
             with patch.object(runs, "NOTEBOOKS", place / "notebooks"):
@@ -93,28 +103,44 @@ def cells_out_of_order(trials: int) -> Outcome:
 
     found, tables = Outcome(), 0
     for word, notebook in runs.notebooks().items():
-        cells = [cell.source for cell in nbformat.read(notebook.path, 4).cells if cell.cell_type == "code"]
-        mixed = [random.Random(trial).sample(range(len(cells)), len(cells)) for trial in range(trials)]
+        cells = [
+            cell.source
+            for cell in nbformat.read(notebook.path, 4).cells
+            if cell.cell_type == "code"
+        ]
+        mixed = [
+            random.Random(trial).sample(range(len(cells)), len(cells)) for trial in range(trials)
+        ]
         with kernel(TSM_SCALE="smoke", TQDM_DISABLE="1") as (_, client):
             for order in [[index] for index in range(len(cells))] + mixed:
                 with folder() as place:
-                    anew = f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"
+                    anew = (
+                        f"%reset -f\nimport os; os.environ['TSM_RUN_DIR'] = {str(place)!r}; del os"
+                    )
                     printed(client, anew)
                     for index in order:
                         before = written(place)
                         reply, said = printed(client, cells[index])
                         if new := written(place) - before:
-                            found.count("may differ from the notebook's" in said, f"{word}, cell {index}: {new}")
+                            found.count(
+                                "may differ from the notebook's" in said,
+                                f"{word}, cell {index}: {new}",
+                            )
                         ours = ("NameError", "StoreError", "ParameterError", "RunError")
                         known = reply["status"] == "ok" or reply["ename"] in ours
-                        known = known or str(reply["evalue"]).startswith("the reward fails on")  # of another robot
+                        known = known or str(reply["evalue"]).startswith(
+                            "the reward fails on"
+                        )  # of another robot
                         found.count(
-                            known, f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}"
+                            known,
+                            f"{word}, cell {index} of {order}: {reply.get('ename')}: {reply.get('evalue')}",
                         )
                     tables += len(list(place.rglob("metrics/*.csv")))
                     run = runs.resolve(notebook.stem, scale="smoke", run_dir=str(place))
                     said = refusal(lambda: notebooks.require(run, notebook.stem), RunError)  # noqa: B023
-                    found.count(f"python -m tsmlib run {word} --scale smoke" in said, f"{word}: {said}")
+                    found.count(
+                        f"python -m tsmlib run {word} --scale smoke" in said, f"{word}: {said}"
+                    )
     found.note = f"{tables} tables came about; each is said, none taken for a result"
     return found
 
@@ -136,14 +162,25 @@ def notebooks_in_any_order(trials: int) -> Outcome:
                 for notebook in order:
                     done = subprocess.run(
                         [sys.executable, "-m", "tsmlib", "run", notebook.name, "--scale", "smoke"],
-                        env={**os.environ, "TSM_RUN_DIR": str(place), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-                        cwd=place, capture_output=True, text=True, check=False,
-                    )  # fmt: skip
+                        env={
+                            **os.environ,
+                            "TSM_RUN_DIR": str(place),
+                            "OMP_NUM_THREADS": "1",
+                            "PYTHONPATH": str(ROOT),
+                        },
+                        cwd=place,
+                        capture_output=True,
+                        text=True,
+                        check=False,
+                    )
                     found.count(done.returncode == 0, done.stderr[-500:])
                 tables = {path.name: numbers(path) for path in place.rglob("metrics/*.csv")}
                 first = first or tables
                 for name in sorted(first):
-                    found.count(tables.get(name) == first[name], f"{name} differs in order {[p.stem for p in order]}")
+                    found.count(
+                        tables.get(name) == first[name],
+                        f"{name} differs in order {[p.stem for p in order]}",
+                    )
     found.note = f"{len(runs.notebooks())} notebooks, {len(first)} tables"
     return found
 
@@ -155,14 +192,38 @@ def notebooks_in_workflows(trials: int = 0) -> Outcome:
         return Outcome(note="no Snakemake: not done")
     for executor in ("pool", "local"):
         with folder() as place:
-            command = ["-m", "tsmlib", "run", "all", "--scale", "smoke", "--seeds", "0,2", "--executor", executor]
+            command = [
+                "-m",
+                "tsmlib",
+                "run",
+                "all",
+                "--scale",
+                "smoke",
+                "--seeds",
+                "0,2",
+                "--executor",
+                executor,
+            ]
             done = subprocess.run(
                 [sys.executable, *command],
-                env={**os.environ, "TSM_RUN_DIR": str(place), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-                cwd=place, capture_output=True, text=True, check=False,
-            )  # fmt: skip
+                env={
+                    **os.environ,
+                    "TSM_RUN_DIR": str(place),
+                    "OMP_NUM_THREADS": "1",
+                    "PYTHONPATH": str(ROOT),
+                },
+                cwd=place,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
             found.count(done.returncode == 0, done.stderr[-500:])
-            made.append({str(path.relative_to(place)): numbers(path) for path in place.rglob("metrics/*.csv")})
+            made.append(
+                {
+                    str(path.relative_to(place)): numbers(path)
+                    for path in place.rglob("metrics/*.csv")
+                }
+            )
     pool, workflow = made
     found.count(pool, "no tables")
     for name in sorted(pool.keys() | workflow.keys()):
@@ -187,7 +248,7 @@ os.umask(int(sys.argv[2], 8))
 import torch; torch.set_num_threads(int(sys.argv[3]))
 from tsmlib import study
 from tsmlib.storage import artifacts, manifest
-from tsmlib.study import runs
+from reproduction import runs
 for seed in range(int(sys.argv[4])):
     run = runs.resolve("05_control", scale="smoke", seed=seed, run_dir=sys.argv[1])
     net, header = study.load_or_train(run, "tsm/Reacher-v0", "tsm")
@@ -203,21 +264,38 @@ for seed in range(int(sys.argv[4])):
 """
 
 
-def whole(place: Path, *, umask: str = "022", threads: int = 1, seeds: int = 1, **environment: str) -> list[Any]:
+def whole(
+    place: Path, *, umask: str = "022", threads: int = 1, seeds: int = 1, **environment: str
+) -> list[Any]:
     """Data, a model and plans of each of the first seeds, made in a fresh process."""
     done = subprocess.run(
         [sys.executable, "-c", WHOLE, str(place / "runs"), umask, str(threads), str(seeds)],
         env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads), **environment},
-        cwd=place, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=place,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return [json.loads(line[5:]) for line in done.stdout.splitlines() if line.startswith("made ")]
 
 
 ELSEWHERE: list[dict[str, str]] = [
     {"TZ": "UTC", "LANG": "C.UTF-8", "PYTHONHASHSEED": "0"},
-    {"TZ": "Asia/Kathmandu", "LANG": "de_DE.UTF-8", "LC_ALL": "C", "PYTHONHASHSEED": "12345", "umask": "077"},
-    {"TZ": "America/St_Johns", "LANG": "tr_TR.UTF-8", "PYTHONHASHSEED": "4294967295", "umask": "000", "HOME": "/none"},
+    {
+        "TZ": "Asia/Kathmandu",
+        "LANG": "de_DE.UTF-8",
+        "LC_ALL": "C",
+        "PYTHONHASHSEED": "12345",
+        "umask": "077",
+    },
+    {
+        "TZ": "America/St_Johns",
+        "LANG": "tr_TR.UTF-8",
+        "PYTHONHASHSEED": "4294967295",
+        "umask": "000",
+        "HOME": "/none",
+    },
 ]
 
 
@@ -248,7 +326,9 @@ def threads(trials: int) -> Outcome:
         reach = abs(mean[i]) + 1.729 * error[i]  # 90 %, 19 degrees of freedom
         said = f"{name}: {mean[i]:.3g} +- {error[i]:.3g}, deviation {deviation[i]:.3g}"
         found.count(deviation[i] > 0 and reach <= 0.5 * deviation[i], said)
-    found.note = f"largest difference {np.max(np.abs(mean) / deviation):.3f} of a seed's standard deviation"
+    found.note = (
+        f"largest difference {np.max(np.abs(mean) / deviation):.3f} of a seed's standard deviation"
+    )
     return found
 
 
@@ -269,7 +349,14 @@ def another_thread_count(trials: int = 0) -> Outcome:
         model = new_model()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            curve = fit(model, model.loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=place / "run")
+            curve = fit(
+                model,
+                model.loss,
+                TRAIN,
+                HELD_OUT,
+                TrainingOptions(**SIZES),
+                checkpoint=place / "run",
+            )
         return curve.resumed, [str(warning.message) for warning in said]
 
     for count in (1, 2):
@@ -280,5 +367,7 @@ def another_thread_count(trials: int = 0) -> Outcome:
                 found.count(not noted and not said, f"{noted} {said}")
             else:
                 found.count(noted == ["at step 8: threads 1 -> 2"], str(noted))
-                found.count(said and "threads 1 -> 2" in said[0] and "last bits" in said[0], str(said))
+                found.count(
+                    said and "threads 1 -> 2" in said[0] and "last bits" in said[0], str(said)
+                )
     return found

@@ -62,7 +62,11 @@ def faults_in_mujoco(trials: int) -> Outcome:
             words = (env_id, f"episode {episode}", f"step {step}")
             found.count(good and all(word in str(error) for word in words), str(error))
         except ValueError as error:  # a torque that is no number: nothing was simulated
-            good = what == "torque" and f"episode {episode}, step 0" in str(error) and env_id in str(error)
+            good = (
+                what == "torque"
+                and f"episode {episode}, step 0" in str(error)
+                and env_id in str(error)
+            )
             found.count(good, str(error))
         env.close()
     return found
@@ -95,7 +99,9 @@ def faults_in_pymunk(trials: int) -> Outcome:
             states = env.rollout(torques(3, 5))
             found.count(False, f"trial {trial} in {env_id}: nothing was said, {states[episode, 0]}")
         except SimulationUnstable as error:
-            found.count((error.env, error.episode, error.step) == (env_id, episode, step), str(error))
+            found.count(
+                (error.env, error.episode, error.step) == (env_id, episode, step), str(error)
+            )
     return found
 
 
@@ -111,7 +117,11 @@ def restores(trials: int) -> Outcome:
         for trial in range(trials):
             draw = rng(19, trial)
             touching = trial % 2 and close.any()
-            at = draw.choice(np.flatnonzero(close).tolist()) + 1 if touching else draw.randrange(1, steps)
+            at = (
+                draw.choice(np.flatnonzero(close).tolist()) + 1
+                if touching
+                else draw.randrange(1, steps)
+            )
             at = min(at, steps - 1)
             first = arms(env_id, n)
             first.rollout(actions[:, :at])
@@ -119,17 +129,22 @@ def restores(trials: int) -> Outcome:
             if env_id in MUJOCO_IDS:
                 other.set_state(first.get_state())
             else:
-                found.count("Replay" in refusal(first.get_state, RuntimeError), "pymunk gave a snapshot")
+                found.count(
+                    "Replay" in refusal(first.get_state, RuntimeError), "pymunk gave a snapshot"
+                )
                 other.reset(seed=0)
                 other.rollout(actions[:, :at])
-            found.count(np.array_equal(other.rollout(actions[:, at:]), whole[:, at:]), f"{env_id} from step {at}")
+            found.count(
+                np.array_equal(other.rollout(actions[:, at:]), whole[:, at:]),
+                f"{env_id} from step {at}",
+            )
     found.note = f"{contacts} of {2 * steps} steps with contacts"
     return found
 
 
 def large_sets(trials: int) -> Outcome:
     """R17: sets of ``trials`` episodes hold no warning, no jump, nothing that is not finite."""
-    from tsmlib.study.data import random_data
+    from reproduction.data import random_data
 
     found = Outcome()
     for env_id in (*MUJOCO_IDS, *PYMUNK_IDS):
@@ -138,6 +153,8 @@ def large_sets(trials: int) -> Outcome:
         change, speed = np.abs(np.diff(states[..., :2], axis=1)), np.abs(states[..., 2:4])
         fastest = np.maximum(speed[:, 1:], speed[:, :-1])
         # Within a step a joint may bounce off its stop or the block: then speeds before and after say less
-        found.count((change <= 1.5 * fastest.max() * DT).all(), f"{env_id}: a jump of {change.max()} rad")
+        found.count(
+            (change <= 1.5 * fastest.max() * DT).all(), f"{env_id}: a jump of {change.max()} rad"
+        )
         found.count(np.isfinite(states).all(), env_id)
     return found

@@ -41,7 +41,7 @@ from reliability.world import (
     train,
 )
 from tsmlib.storage import artifacts, files, tables
-from tsmlib.study import runs
+from reproduction import runs
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Window
@@ -63,7 +63,10 @@ def killed_at_random_moments(trials: int) -> Outcome:
             before = contents(place)
             again = in_child(lambda: work(place / "run"))  # noqa: B023
             found.count(first == expected, f"trial {trial}: other bits")
-            found.count(again == expected and contents(place) == before, f"trial {trial}: a finished run was changed")
+            found.count(
+                again == expected and contents(place) == before,
+                f"trial {trial}: a finished run was changed",
+            )
             found.count(not list(place.rglob(".*.tmp-*")), f"trial {trial}: half a file is left")
     found.note = f"{trials} trainings, a quarter of them of policies, {kills} kills"
     return found
@@ -71,7 +74,11 @@ def killed_at_random_moments(trials: int) -> Outcome:
 
 def contents(place: Path) -> dict[str, bytes]:
     """Every file but the lock."""
-    return {str(path): path.read_bytes() for path in place.rglob("*") if path.is_file() and path.name != ".lock"}
+    return {
+        str(path): path.read_bytes()
+        for path in place.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
 
 
 # Faults at one call --------------------------------------------------------------------------------------------------
@@ -97,10 +104,15 @@ def at_every_call(every: int = 1) -> Outcome:
                     if value and good:  # the training came to its end before the fault
                         break
                     points += 1
-                    text = os.strerror(getattr(errno, fault, 0))  # where a fault cost something, it is said
+                    text = os.strerror(
+                        getattr(errno, fault, 0)
+                    )  # where a fault cost something, it is said
                     said = good or child.killed or (str(place / "run") in value and text in value)
                     found.count(said, f"{fault} at call {point}: {value}")
-                    found.count(resumes(place / "run", expected), f"{fault} at call {point}: not resumed bit for bit")
+                    found.count(
+                        resumes(place / "run", expected),
+                        f"{fault} at call {point}: not resumed bit for bit",
+                    )
     found.note = f"{points} faults"
     return found
 
@@ -111,15 +123,24 @@ def at_every_system_call(trials: int = 1000) -> Outcome:
     if shutil.which("strace") is None:
         return found
     (expected, _), points = reference(), 0
-    calls = "write,pwrite64,fsync,fdatasync,rename,renameat,renameat2,unlink,unlinkat,mkdir,ftruncate"
+    calls = (
+        "write,pwrite64,fsync,fdatasync,rename,renameat,renameat2,unlink,unlinkat,mkdir,ftruncate"
+    )
     with folder() as start:
         stopped_at(start / "run", 9)
         log = start / "strace.txt"
         shutil.copytree(start / "run", start / "whole")
-        traced(lambda: train(start / "whole", steps=SIZES["steps"]), ["-e", f"trace={calls},openat", "-y"], log)
+        traced(
+            lambda: train(start / "whole", steps=SIZES["steps"]),
+            ["-e", f"trace={calls},openat", "-y"],
+            log,
+        )
         published = order_of(log.read_text())
         for name, order in published.items():
-            found.count(re.fullmatch("w+fRd", order), f"{name}: {order}, expected write, fsync, rename, fsync (folder)")
+            found.count(
+                re.fullmatch("w+fRd", order),
+                f"{name}: {order}, expected write, fsync, rename, fsync (folder)",
+            )
         for fault in ("signal=SIGKILL", "error=ENOSPC", "error=EIO"):
             for call in ("write", "fsync", "rename", "unlink", "ftruncate"):
                 for k in range(1, trials + 1):
@@ -127,10 +148,16 @@ def at_every_system_call(trials: int = 1000) -> Outcome:
                         shutil.copytree(start / "run", place / "run")
                         options = ["-e", f"trace={call}", "-e", f"inject={call}:{fault}:when={k}"]
                         child = traced(lambda: train(place / "run"), options, place / "log")
-                        if "(INJECTED)" not in (text := (place / "log").read_text()) and "SIGKILL" not in text:
+                        if (
+                            "(INJECTED)" not in (text := (place / "log").read_text())
+                            and "SIGKILL" not in text
+                        ):
                             break
                         points += 1
-                        found.count(resumes(place / "run", expected), f"{fault} at {call} {k}: other bits ({child})")
+                        found.count(
+                            resumes(place / "run", expected),
+                            f"{fault} at {call} {k}: other bits ({child})",
+                        )
     found.note = f"{points} faults, {len(published)} files published in order"
     return found
 
@@ -170,7 +197,9 @@ def order_of(text: str) -> dict[str, str]:
                 for name, seen in order.items():
                     if str(Path(name).parent) == match[1] and not seen.endswith("d"):
                         order[name] = seen + "d"
-        elif match := re.search(r'rename\w*\((?:AT_FDCWD[^"]*)?"([^"]+)", (?:AT_FDCWD[^"]*)?"([^"]+)"', line):
+        elif match := re.search(
+            r'rename\w*\((?:AT_FDCWD[^"]*)?"([^"]+)", (?:AT_FDCWD[^"]*)?"([^"]+)"', line
+        ):
             order[match[2]] = waiting.pop(match[1], "") + "R"
     return order
 
@@ -256,7 +285,9 @@ def newest_generation_spoilt(trials: int) -> Outcome:
                 warnings.simplefilter("always")
                 used = load_generation(place / "run")
             text = " ".join(str(warning.message) for warning in said)
-            found.count(used and used[0] == before and str(before) in text and str(newest) in text, text)
+            found.count(
+                used and used[0] == before and str(before) in text and str(newest) in text, text
+            )
     return found
 
 
@@ -266,23 +297,37 @@ def newest_generation_spoilt(trials: int) -> Outcome:
 def values_that_are_not_finite(trials: int) -> Outcome:
     """R8: one NaN or infinity at a random place of a data set: refused, naming episode, step and field."""
     found, data = Outcome(), TRAIN.take(slice(10))
-    fields = {"env": data.env, "dt": data.dt, "names": data.names, "units": data.units, "angles": data.angles}
+    fields = {
+        "env": data.env,
+        "dt": data.dt,
+        "names": data.names,
+        "units": data.units,
+        "angles": data.angles,
+    }
     with folder() as place:
         path = place / "data.safetensors"
         for trial in range(trials):
             draw = rng(8, trial)
-            arrays = {"states": torch.from_numpy(data.states.copy()), "actions": torch.from_numpy(data.actions.copy())}
+            arrays = {
+                "states": torch.from_numpy(data.states.copy()),
+                "actions": torch.from_numpy(data.actions.copy()),
+            }
             name = draw.choice(["states", "actions"])
             episode, step, column = (draw.randrange(size) for size in arrays[name].shape)
             arrays[name][episode, step, column] = draw.choice([math.nan, math.inf, -math.inf])
             forged(path, arrays, kind="trajectories", header={"trajectories": fields})
             word = data.names[column] if name == "states" else f"action {column}"
             said = refusal(lambda: artifacts.load_trajectories(path))
-            found.count(str(path) in said and f"episode {episode}, step {step}, field '{word}'" in said, said)
+            found.count(
+                str(path) in said and f"episode {episode}, step {step}, field '{word}'" in said,
+                said,
+            )
         weights = {name: tensor.clone() for name, tensor in new_model().state_dict().items()}
         for name in weights:
             spoilt = {**weights, name: torch.full_like(weights[name], math.nan)}
-            forged(path, spoilt, kind="model", header={"class": "TSM", "config": new_model().config()})
+            forged(
+                path, spoilt, kind="model", header={"class": "TSM", "config": new_model().config()}
+            )
             said = refusal(lambda: artifacts.load_model(path, type(new_model())))
             found.count(str(path) in said and name in said, said)
     return found
@@ -302,12 +347,22 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
                 calls += 1
                 if calls == at + 1:  # noqa: B023
                     first = next(model.parameters())  # noqa: B023
-                    cliff = (first - first.detach()).abs().sum().sqrt()  # zero, with an infinite slope
+                    cliff = (
+                        (first - first.detach()).abs().sum().sqrt()
+                    )  # zero, with an infinite slope
                     return value + cliff if in_gradient else value * math.nan  # noqa: B023
             return value
 
         with folder() as place:
-            work = partial(fit, model, loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=place / "run")
+            work = partial(
+                fit,
+                model,
+                loss,
+                TRAIN,
+                HELD_OUT,
+                TrainingOptions(**SIZES),
+                checkpoint=place / "run",
+            )
             said = refusal(work, TrainingStopped)
             kept = (load_generation(place / "run") is not None) is (at >= SIZES["validate_every"])
             good = calls == at + 1 and f"at step {at} of" in said and kept
@@ -352,7 +407,7 @@ def full_disk(trials: int = 0) -> Outcome:
     """R10: a full disk while data, a table, figure, video or checkpoint is written: the old file stays, it is said."""
     from matplotlib.figure import Figure
 
-    from tsmlib import figures
+    from tsmlib import plots as figures
 
     found, (expected, _) = Outcome(), reference()
 
@@ -367,7 +422,9 @@ def full_disk(trials: int = 0) -> Outcome:
         return Child(limited).result()
 
     with folder() as place:
-        data, table, picture, film = (place / f"x.{kind}" for kind in ("safetensors", "csv", "pdf", "mp4"))
+        data, table, picture, film = (
+            place / f"x.{kind}" for kind in ("safetensors", "csv", "pdf", "mp4")
+        )
         rows = [{"metric": "success", "value": 0.5, "n": i} for i in range(200)]
         writers: dict[Path, Callable[[], Any]] = {
             data: lambda: artifacts.save_trajectories(data, TRAIN),
@@ -379,8 +436,15 @@ def full_disk(trials: int = 0) -> Outcome:
             before = path.read_bytes()
             for size in (0, 1, 1000, len(before) - 1):
                 good, said = cramped(write, size)
-                clear = not good and str(path) in said and f"{len(before)} bytes" in said and "too large" in said
-                found.count(clear and path.read_bytes() == before, f"{path.name}, {size} bytes: {said}")
+                clear = (
+                    not good
+                    and str(path) in said
+                    and f"{len(before)} bytes" in said
+                    and "too large" in said
+                )
+                found.count(
+                    clear and path.read_bytes() == before, f"{path.name}, {size} bytes: {said}"
+                )
         frames = np.zeros((3, 64, 64, 3), np.uint8)
         figures.save_video(frames, film)
         before = film.read_bytes()
@@ -409,9 +473,14 @@ def interrupted_in_a_cell(trials: int) -> Outcome:
         run(client, "train(None)")
         seconds, slowest, stopped = time.monotonic() - began, 0.0, 0
         half = run(client, "train(None, bf16=True)")
-        run(client, "torch.set_grad_enabled(False); torch.set_autocast_enabled('cpu', True)")  # as an interrupt may
+        run(
+            client, "torch.set_grad_enabled(False); torch.set_autocast_enabled('cpu', True)"
+        )  # as an interrupt may
         run(client, "torch.autocast_increment_nesting()")
-        found.count(run(client, "train(None, bf16=True)") == half != "", "other bits in a kernel that was interrupted")
+        found.count(
+            run(client, "train(None, bf16=True)") == half != "",
+            "other bits in a kernel that was interrupted",
+        )
         for trial in range(trials):
             with folder() as place:
                 cell = f"digest = train(Path({str(place / 'run')!r})); digest"
@@ -436,7 +505,12 @@ def kernel(**environment: str) -> Iterator[tuple[Any, Any]]:
     """Manager and client of a kernel in the folder of the notebooks."""
     from jupyter_client.manager import start_new_kernel
 
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(runs.ROOT), **environment}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(runs.ROOT),
+        **environment,
+    }
     options = dict(env=environment, cwd=str(runs.NOTEBOOKS), stderr=subprocess.DEVNULL)
     manager, client = start_new_kernel(kernel_name="python3", **options)
     try:
@@ -462,7 +536,9 @@ def printed(client: Any, cell: str) -> tuple[dict[str, Any], str]:
         if message["msg_type"] == "stream":
             found.append(message["content"]["text"])
 
-    reply = client.execute_interactive(cell, output_hook=hook, timeout=3600, stop_on_error=False)  # nor the next one
+    reply = client.execute_interactive(
+        cell, output_hook=hook, timeout=3600, stop_on_error=False
+    )  # nor the next one
     return reply["content"], "".join(found)
 
 
@@ -498,14 +574,24 @@ def memory(trials: int) -> Outcome:
     with folder() as place:
         open_before = len(os.listdir("/proc/self/fd"))
         options = TrainingOptions(
-            **{**SIZES, "past_len": model.past_len, "steps": trials, "validate_every": max(1, trials // 20)}
+            **{
+                **SIZES,
+                "past_len": model.past_len,
+                "steps": trials,
+                "validate_every": max(1, trials // 20),
+            }
         )
         fit(model, loss, data, HELD_OUT, options, checkpoint=place / "run")
         steps, megabytes = np.array(samples).T
         slope = 1000 * np.polyfit(steps, megabytes, 1)[0]
         found.count(slope <= 1.0, f"{slope:.2f} MB per 1,000 steps")
-        found.count(megabytes[-1] <= 1.05 * megabytes[0], f"from {megabytes[0]:.0f} to {megabytes[-1]:.0f} MB")
+        found.count(
+            megabytes[-1] <= 1.05 * megabytes[0],
+            f"from {megabytes[0]:.0f} to {megabytes[-1]:.0f} MB",
+        )
         found.count(abs(len(os.listdir("/proc/self/fd")) - open_before) <= 2, "files are left open")
-        found.count(len(list((place / "run").glob("*.safetensors"))) == 2, "more than two generations")
+        found.count(
+            len(list((place / "run").glob("*.safetensors"))) == 2, "more than two generations"
+        )
         found.note = f"{trials} steps, {slope:+.3f} MB per 1,000"
     return found

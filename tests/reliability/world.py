@@ -35,7 +35,9 @@ from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
 
 H = 4
-SIZES: dict[str, Any] = dict(past_len=H, future_len=H, steps=24, batch_size=8, validate_every=4, warmup=3)
+SIZES: dict[str, Any] = dict(
+    past_len=H, future_len=H, steps=24, batch_size=8, validate_every=4, warmup=3
+)
 
 
 @dataclass
@@ -56,7 +58,11 @@ class Outcome:
 
     def add(self, other: Outcome) -> None:
         """Take over the trials of another."""
-        self.of, self.right, self.wrong = self.of + other.of, self.right + other.right, self.wrong + other.wrong
+        self.of, self.right, self.wrong = (
+            self.of + other.of,
+            self.right + other.right,
+            self.wrong + other.wrong,
+        )
 
     def check(self) -> Outcome:
         """Fail unless all trials went as they should."""
@@ -69,7 +75,9 @@ class Outcome:
 def folder() -> Iterator[Path]:
     """An empty folder in memory where there is such a thing, since many small files are written."""
     fast = Path("/dev/shm")
-    with tempfile.TemporaryDirectory(dir=fast if os.access(fast, os.W_OK) else None, prefix="tsmlib-") as name:
+    with tempfile.TemporaryDirectory(
+        dir=fast if os.access(fast, os.W_OK) else None, prefix="tsmlib-"
+    ) as name:
         yield Path(name)
 
 
@@ -77,10 +85,18 @@ def episodes(n: int, seed: int) -> Trajectories:
     """States that drift with the actions and with some noise."""
     rng = np.random.default_rng(seed)
     actions = np.repeat(rng.uniform(-1, 1, (n, 6, 2)), 5, axis=1)
-    steps = 0.2 * actions @ np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.4]]) + 0.05 * rng.normal(size=(n, 30, 3))
+    steps = 0.2 * actions @ np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.4]]) + 0.05 * rng.normal(
+        size=(n, 30, 3)
+    )
     states = np.concatenate([np.zeros((n, 1, 3)), steps.cumsum(1)], 1)
     return Trajectories(
-        states.astype(np.float32), actions.astype(np.float32), "tsm/Made-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (0,)
+        states.astype(np.float32),
+        actions.astype(np.float32),
+        "tsm/Made-v0",
+        0.02,
+        ("a", "b", "c"),
+        ("m",) * 3,
+        (0,),
     )
 
 
@@ -162,7 +178,9 @@ class Child:
                 os.close(reader)
                 signal.signal(signal.SIGINT, signal.default_int_handler)
                 torch.set_num_threads(1)  # the threads of the parent are not here
-                tqdm.set_lock(threading.RLock())  # a child that is killed keeps the one that all share
+                tqdm.set_lock(
+                    threading.RLock()
+                )  # a child that is killed keeps the one that all share
                 warnings.simplefilter("ignore")
                 try:
                     found = (True, work())
@@ -209,7 +227,9 @@ def in_child(work: Callable[[], Any]) -> Any:
 # Artefacts -----------------------------------------------------------------------------------------------------------
 
 
-def forged(path: Path, arrays: dict[str, torch.Tensor], *, kind: str, header: Any, **about: Any) -> None:
+def forged(
+    path: Path, arrays: dict[str, torch.Tensor], *, kind: str, header: Any, **about: Any
+) -> None:
     """An artefact whose checksum holds, whatever is in it: not damage, but the work of somebody."""
     said = {"sha256": "0" * 64, "schema": artifacts.SCHEMA, "kind": kind, "header": header, **about}
     text = json.dumps(said, separators=(",", ":"))
@@ -223,8 +243,8 @@ def forged(path: Path, arrays: dict[str, torch.Tensor], *, kind: str, header: An
 
 def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
     """One file of each kind, and what loads it."""
-    from tsmlib.study.notebooks import _note, require
-    from tsmlib.study.runs import Run
+    from reproduction.notebooks import _note, require
+    from reproduction.runs import Run
 
     data, model = place / "data.safetensors", place / "model.safetensors"
     artifacts.save_trajectories(data, TRAIN.take(slice(3)), {"seed": 1})

@@ -55,9 +55,16 @@ def fingerprint(env_id: str) -> dict[str, object]:
     changed = spec.physics.changed
     varied = {**changed, "standard": {name: STANDARD[name] for name in changed}} if changed else {}
     return {
-        "env": env_id, "dt": DT, "names": names, "units": units, "angles": [0, 1],
-        "noise": spec.noise, "delay": spec.delay, **varied, "simulator": simulator,
-    }  # fmt: skip
+        "env": env_id,
+        "dt": DT,
+        "names": names,
+        "units": units,
+        "angles": [0, 1],
+        "noise": spec.noise,
+        "delay": spec.delay,
+        **varied,
+        "simulator": simulator,
+    }
 
 
 def _known(spec: EnvSpec) -> str:

@@ -44,15 +44,25 @@ class ArmVectorEnv(VectorEnv, ABC):
     dt = DT
 
     def __init__(
-        self, num_envs: int, env_id: str, *, max_episode_steps: int = 100, render_mode: str | None = None,
+        self,
+        num_envs: int,
+        env_id: str,
+        *,
+        max_episode_steps: int = 100,
+        render_mode: str | None = None,
         **changes: Unpack[Changes],
-    ) -> None:  # fmt: skip
+    ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}; expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
         self._arm = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id)
-        self.num_envs, self.env_id, self.task, self.physics = num_envs, self._arm.id, self._arm.task, self._arm.physics
+        self.num_envs, self.env_id, self.task, self.physics = (
+            num_envs,
+            self._arm.id,
+            self._arm.task,
+            self._arm.physics,
+        )
         self.max_episode_steps, self.render_mode = max_episode_steps, render_mode
         dx = self._arm.state_dim
         self.names, self.units = geometry.STATE_NAMES[:dx], geometry.STATE_UNITS[:dx]
@@ -98,11 +108,15 @@ class ArmVectorEnv(VectorEnv, ABC):
     def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         """One state (dx,) and target (2,) drawn, as uint8 (height, width, 3)."""
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start N episodes; gives states (N, dx) and ``{"target": (N, 2)}``."""
         options = options or {}
         if unknown := set(options) - {"states", "target"}:
-            raise ValueError(f"unknown reset options {sorted(unknown)}; expected 'states' and 'target'")
+            raise ValueError(
+                f"unknown reset options {sorted(unknown)}; expected 'states' and 'target'"
+            )
         super().reset(seed=seed)
         if seed is not None or self._seed_root is None:
             self._seed_root, self._resets = (secrets.randbits(64) if seed is None else seed), 0
@@ -118,8 +132,11 @@ class ArmVectorEnv(VectorEnv, ABC):
             states, target = (np.stack(part) for part in zip(*map(self._draw, rngs), strict=True))
         if "target" in options:
             given = np.asarray(options["target"], np.float64)
-            target = self._checked(np.broadcast_to(given, target.shape) if given.ndim == 1 else given, target.shape,
-                                   "target")  # fmt: skip
+            target = self._checked(
+                np.broadcast_to(given, target.shape) if given.ndim == 1 else given,
+                target.shape,
+                "target",
+            )
         self._states, self.target, self._elapsed = states, target, 0
         self._start(states)
         return states.copy(), {"target": target.copy()}
@@ -130,7 +147,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         Raises ValueError (nothing simulated) where an action is not finite, SimulationUnstable as its name says.
         """
         if self._elapsed is None:
-            raise gymnasium.error.ResetNeeded(f"{self.env_id}: call reset() before step() or rollout()")
+            raise gymnasium.error.ResetNeeded(
+                f"{self.env_id}: call reset() before step() or rollout()"
+            )
         actions = self.checked(actions)
         if actions.shape[1] == 0:
             return np.zeros((self.num_envs, 0, len(self.names)))
@@ -147,7 +166,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         """``actions`` as floats; ValueError where they are not of this shape, or not finite."""
         actions = np.asarray(actions, np.float64)
         if actions.ndim != 3 or actions.shape[0] != self.num_envs or actions.shape[2] != 2:
-            raise ValueError(f"actions are {actions.shape}; {self.env_id} expected (N={self.num_envs}, T, 2)")
+            raise ValueError(
+                f"actions are {actions.shape}; {self.env_id} expected (N={self.num_envs}, T, 2)"
+            )
         bad = np.argwhere(~np.isfinite(actions))
         if len(bad):
             episode, step, joint = bad[0]
@@ -157,20 +178,31 @@ class ArmVectorEnv(VectorEnv, ABC):
             )
         return actions
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and the targets."""
         states = self.rollout(np.asarray(actions)[:, None])[:, 0]
         moved = states[:, 6:8] if self.task == "push" else states[:, 4:6]
         torque = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
         reward = -np.linalg.norm(moved - self.target, axis=-1) - np.sum(torque**2, axis=-1)
         truncated = np.full(self.num_envs, (self._elapsed or 0) >= self.max_episode_steps)
-        return states, reward, np.zeros(self.num_envs, bool), truncated, {"target": self.target.copy()}
+        return (
+            states,
+            reward,
+            np.zeros(self.num_envs, bool),
+            truncated,
+            {"target": self.target.copy()},
+        )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One uint8 image (height, width, 3) per episode, or None without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
-        return tuple(self.image(state, target) for state, target in zip(self._states, self.target, strict=True))
+        return tuple(
+            self.image(state, target)
+            for state, target in zip(self._states, self.target, strict=True)
+        )
 
     def _draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A state (dx,) and a target (2,) from the reset distribution."""
@@ -182,7 +214,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         if self.task == "reach":
             return state, target
         while True:  # the block must not touch the arm
-            with_block = np.concatenate([state, _in_ring(rng, *geometry.block_ring(self._arm)), np.zeros(2)])
+            with_block = np.concatenate(
+                [state, _in_ring(rng, *geometry.block_ring(self._arm)), np.zeros(2)]
+            )
             if closest_gap(with_block, self.env_id) > geometry.BLOCK_CLEARANCE:
                 return with_block, target
 
@@ -199,7 +233,9 @@ class ArmVectorEnv(VectorEnv, ABC):
     def _checked(self, given: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
         array = np.array(given, np.float64)
         if array.shape != shape:
-            raise ValueError(f"reset option {name!r} of {self.env_id} is {array.shape}; expected {shape}")
+            raise ValueError(
+                f"reset option {name!r} of {self.env_id} is {array.shape}; expected {shape}"
+            )
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             raise ValueError(
@@ -230,13 +266,18 @@ class ArmEnv(gymnasium.Env):
     angles = (0, 1)
     dt = DT
 
-    def __init__(self, env_id: str, render_mode: str | None = None, **changes: Unpack[Changes]) -> None:
+    def __init__(
+        self, env_id: str, render_mode: str | None = None, **changes: Unpack[Changes]
+    ) -> None:
         name = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id).id
         vector = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode).unwrapped
         assert isinstance(vector, ArmVectorEnv)
         self.vector, self.env_id, self.render_mode = vector, name, render_mode
         self.names, self.units, self.task = vector.names, vector.units, vector.task
-        self.observation_space, self.action_space = vector.single_observation_space, vector.single_action_space
+        self.observation_space, self.action_space = (
+            vector.single_observation_space,
+            vector.single_action_space,
+        )
 
     @property
     def spec(self) -> GymnasiumSpec | None:
@@ -252,7 +293,9 @@ class ArmEnv(gymnasium.Env):
         """The task's target (2,)."""
         return self.vector.target[0]
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         """As `ArmVectorEnv.reset`, with ``options["states"]`` (dx,) and ``options["target"]`` (2,)."""
         super().reset(seed=seed)
         options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}

@@ -21,7 +21,14 @@ from tsmlib.envs.stepping import make
 WIDTH, HEIGHT, SMOOTH = 480, 300, 2  # pixels; of a picture that is drawn so many times as large
 ACROSS = 3.2  # metres from edge to edge
 BELOW = 0.3  # metres of ground that are seen
-SKY, GROUND, MARK, EDGE, BODY, OTHER = "#FAFAF8", "#D5DAE0", "#7B8794", "#22303C", "#56B4E9", "#E69F00"
+SKY, GROUND, MARK, EDGE, BODY, OTHER = (
+    "#FAFAF8",
+    "#D5DAE0",
+    "#7B8794",
+    "#22303C",
+    "#56B4E9",
+    "#E69F00",
+)
 
 Points = np.ndarray  # (..., 2), metres across and up
 
@@ -75,7 +82,9 @@ def frames(env_id: str, states: np.ndarray) -> np.ndarray:
         return np.stack([_pendulum(state) for state in states])
     hidden = _hidden_positions(env_id)
     if hidden is None:
-        raise ValueError(f"{env_id} cannot be drawn from its observations; film it by its own render_mode='rgb_array'")
+        raise ValueError(
+            f"{env_id} cannot be drawn from its observations; film it by its own render_mode='rgb_array'"
+        )
     return _from_the_side(_robot(env_id), np.asarray(states, np.float64), hidden)
 
 
@@ -104,10 +113,18 @@ def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
         middle = data.geom_xpos[bodies][:, [0, 2]]
         picture = _Picture(float(position[0]) - ACROSS / 2, -BELOW)
         picture.ground()
-        for place, i in sorted(zip(middle, bodies, strict=True), key=lambda pair: -data.geom_xpos[pair[1], 1]):
+        for place, i in sorted(
+            zip(middle, bodies, strict=True), key=lambda pair: -data.geom_xpos[pair[1], 1]
+        ):
             half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[[0, 2], 2]
-            second = "left" in (name := model.geom(i).name) or name.startswith("b")  # left leg, or hind leg
-            picture.rod(np.stack([place - half, place + half]), float(model.geom_size[i, 0]), OTHER if second else BODY)
+            second = "left" in (name := model.geom(i).name) or name.startswith(
+                "b"
+            )  # left leg, or hind leg
+            picture.rod(
+                np.stack([place - half, place + half]),
+                float(model.geom_size[i, 0]),
+                OTHER if second else BODY,
+            )
         found.append(picture.array())
     return np.stack(found)
 
@@ -116,7 +133,9 @@ def _half_length(model: Any, geom: int) -> float:
     """Of a capsule or a cylinder along its own third axis; of a ball 0."""
     import mujoco
 
-    long = int(model.geom_type[geom]) in map(int, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER))
+    long = int(model.geom_type[geom]) in map(
+        int, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+    )
     return float(model.geom_size[geom, 1]) if long else 0.0
 
 

@@ -23,28 +23,56 @@ DT = 0.02  # s per step
 # The block: the object to push, or the obstacle (a disc seen from above).
 BLOCK_RADIUS = Physics.object_radius
 WALL = 0.24  # the walls' faces on push; the object's centre stays within 0.21 m along x and y
-BLOCK_MASS = Physics.mass  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
+BLOCK_MASS = (
+    Physics.mass
+)  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
 BLOCK_DECAY = 0.05  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
 FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
-BLOCK_RING = (0.08, 0.17)  # m; distance of the block's centre from the shoulder at reset: within reach all around
+BLOCK_RING = (
+    0.08,
+    0.17,
+)  # m; distance of the block's centre from the shoulder at reset: within reach all around
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
 MAX_OVERLAP = 0.005  # m of block and arm in a given start; impacts reach 1.5 mm
 
 START_VELOCITY = 0.005  # rad/s, both joints
 START_ANGLES = {  # rad; shoulder and elbow are uniform within plus and minus this
-    "reach": (0.1, 0.1), "obstacle": (0.1, 0.1),  # the reset distribution of Gymnasium's Reacher
+    "reach": (0.1, 0.1),
+    "obstacle": (0.1, 0.1),  # the reset distribution of Gymnasium's Reacher
     "push": (np.pi, 2.5),  # in every direction, and bent
-}  # fmt: skip
+}
 TARGET_RING = {  # m from the shoulder, uniform over the area; nearer to it the first link is in the object's way
-    "reach": (0.0, 0.2), "obstacle": (0.0, 0.2), "push": (0.05, 0.2),
-}  # fmt: skip
+    "reach": (0.0, 0.2),
+    "obstacle": (0.0, 0.2),
+    "push": (0.05, 0.2),
+}
 
 STATE_NAMES = (
-    "joint0", "joint1", "joint0_vel", "joint1_vel", "tip_x", "tip_y", "block_x", "block_y", "block_vx", "block_vy",
-)  # fmt: skip
+    "joint0",
+    "joint1",
+    "joint0_vel",
+    "joint1_vel",
+    "tip_x",
+    "tip_y",
+    "block_x",
+    "block_y",
+    "block_vx",
+    "block_vy",
+)
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
-HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.21, 0.21, 4.8, 4.6)  # in random data; angles: of cosine, sine
+HALF_RANGE = (
+    1.0,
+    1.0,
+    17.0,
+    14.0,
+    0.21,
+    0.21,
+    0.21,
+    0.21,
+    4.8,
+    4.6,
+)  # in random data; angles: of cosine, sine
 
 
 def arm_points(
@@ -81,7 +109,9 @@ def target_ring(spec: EnvSpec) -> tuple[float, float]:
     """Radii between which targets are drawn, m: those of the task, as far as this arm and its object can get."""
     inner, outer = TARGET_RING[spec.task]
     inner, reach = max(inner, hole(spec.physics)), sum(spec.physics.link_lengths)
-    return inner, min(outer, reach, room(spec.physics)) if spec.task == "push" else min(outer, reach)
+    return inner, min(outer, reach, room(spec.physics)) if spec.task == "push" else min(
+        outer, reach
+    )
 
 
 def hole(physics: Physics) -> float:
@@ -106,12 +136,16 @@ def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
     """
     spec = EnvSpec.parse(env_id)
     if not spec.has_block:
-        raise ValueError(f"{env_id} has no block; closest_gap needs an obstacle or push environment")
+        raise ValueError(
+            f"{env_id} has no block; closest_gap needs an obstacle or push environment"
+        )
     states = np.asarray(states, np.float64)
     block = states[..., 6:8]
     elbow, capsule_end, tip = arm_points(states[..., :2], spec.physics.link_lengths)
     distance = np.minimum(
-        np.minimum(_to_segment(block, np.zeros_like(elbow), elbow), _to_segment(block, elbow, capsule_end)),
+        np.minimum(
+            _to_segment(block, np.zeros_like(elbow), elbow), _to_segment(block, elbow, capsule_end)
+        ),
         np.linalg.norm(block - tip, axis=-1),
     )
     return distance - (ARM_RADIUS + spec.physics.object_radius)

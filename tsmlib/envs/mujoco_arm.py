@@ -17,7 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import Unpack
 
-if sys.platform == "linux":  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
+if (
+    sys.platform == "linux"
+):  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
     os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
 
 import gymnasium.envs.mujoco
@@ -45,12 +47,24 @@ from tsmlib.envs.unstable import SimulationUnstable
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move
 TIMESTEP = 0.00125  # s, of the variants (the basic arm keeps 0.01 s): a fingertip at 30 m/s cannot step past the block
-CONTACT_TIME = 2 * TIMESTEP  # s; the stiffest contact that is stable at this time step, and critically damped
-WALL_TIME = 6 * TIMESTEP  # s, of the wall's spring: returns 0.38 to 0.53 of the speed, depending on when the step falls
-RIGID = (0.999, 0.9999, 0.001, 0.5, 2)  # solimp: what remains of a squeeze at full torque is below 0.1 mm
+CONTACT_TIME = (
+    2 * TIMESTEP
+)  # s; the stiffest contact that is stable at this time step, and critically damped
+WALL_TIME = (
+    6 * TIMESTEP
+)  # s, of the wall's spring: returns 0.38 to 0.53 of the speed, depending on when the step falls
+RIGID = (
+    0.999,
+    0.9999,
+    0.001,
+    0.5,
+    2,
+)  # solimp: what remains of a squeeze at full torque is below 0.1 mm
 MAX_SPEED = 1e3  # rad/s or m/s; full torque held for a whole episode reaches 180 rad/s
 IMAGE_SIZE = 480  # pixels
-CHUNK = 256  # episodes handed to MuJoCo together: 256 episodes of 100 steps of 16 substeps are 30 MB
+CHUNK = (
+    256  # episodes handed to MuJoCo together: 256 episodes of 100 steps of 16 substeps are 30 MB
+)
 
 _gl_works = True  # until the first failure to get a context
 
@@ -70,7 +84,9 @@ def load_model(env_id: str) -> mujoco.MjModel:
             _add_block(spec, arm.physics, moving=arm.task == "push")
         _change_arm(spec, arm.physics)
         model = spec.compile()
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_WARMSTART
+    )
     return model
 
 
@@ -78,13 +94,35 @@ def load_model(env_id: str) -> mujoco.MjModel:
 def physics_hash(env_id: str) -> str:
     """SHA-256 of the numbers that decide how an environment moves, as compiled; the same on every machine."""
     model = load_model(env_id)
-    found = hashlib.sha256(repr((model.opt.timestep, int(model.opt.integrator), model.opt.disableflags)).encode())
+    found = hashlib.sha256(
+        repr((model.opt.timestep, int(model.opt.integrator), model.opt.disableflags)).encode()
+    )
     for name in (
-        "opt.gravity", "body_mass", "body_inertia", "body_pos", "body_parentid", "jnt_type", "jnt_axis", "jnt_range",
-        "jnt_solref", "jnt_solimp", "dof_damping", "dof_armature", "geom_type", "geom_size", "geom_pos", "geom_bodyid",
-        "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_solref", "geom_solimp",
-        "actuator_gear", "actuator_ctrlrange",
-    ):  # fmt: skip
+        "opt.gravity",
+        "body_mass",
+        "body_inertia",
+        "body_pos",
+        "body_parentid",
+        "jnt_type",
+        "jnt_axis",
+        "jnt_range",
+        "jnt_solref",
+        "jnt_solimp",
+        "dof_damping",
+        "dof_armature",
+        "geom_type",
+        "geom_size",
+        "geom_pos",
+        "geom_bodyid",
+        "geom_contype",
+        "geom_conaffinity",
+        "geom_condim",
+        "geom_priority",
+        "geom_solref",
+        "geom_solimp",
+        "actuator_gear",
+        "actuator_ctrlrange",
+    ):
         values = np.asarray(operator.attrgetter(name)(model), np.float64)
         found.update(f"{name} {np.round(values, 9).ravel().tolist()}\n".encode())
     return found.hexdigest()
@@ -113,49 +151,91 @@ def _add_block(spec: mujoco.MjSpec, physics: Physics, *, moving: bool) -> None:
     """
     block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
     block.add_geom(
-        name="block", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[physics.object_radius, 0, 0], mass=physics.mass,
-        contype=1, conaffinity=0, condim=1, solref=[CONTACT_TIME, 1.0], solimp=RIGID, priority=1, group=3,
-    )  # fmt: skip
+        name="block",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[physics.object_radius, 0, 0],
+        mass=physics.mass,
+        contype=1,
+        conaffinity=0,
+        condim=1,
+        solref=[CONTACT_TIME, 1.0],
+        solimp=RIGID,
+        priority=1,
+        group=3,
+    )
     block.add_geom(
-        name="block_drawn", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[physics.object_radius, 0.012, 0], mass=0,
-        contype=0, conaffinity=0, rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
-    )  # fmt: skip
+        name="block_drawn",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[physics.object_radius, 0.012, 0],
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        rgba=[0.95, 0.7, 0.2, 1] if moving else [0.35, 0.35, 0.35, 1],
+    )
     if moving:
         for axis, name in enumerate("xy"):
             block.add_joint(
-                name=f"block_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis], armature=0.0,
-                damping=BLOCK_MASS / BLOCK_DECAY, limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-            )  # fmt: skip
+                name=f"block_{name}",
+                type=mujoco.mjtJoint.mjJNT_SLIDE,
+                axis=np.eye(3)[axis],
+                armature=0.0,
+                damping=BLOCK_MASS / BLOCK_DECAY,
+                limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+            )
         _add_walls(spec)
 
 
 def _add_walls(spec: mujoco.MjSpec) -> None:
     """Four walls from which the object bounces; the arm passes over them."""
     log_e = np.log(RESTITUTION)
-    damping_ratio = -log_e / np.hypot(np.pi, log_e)  # of the damped spring that returns this share of the speed
+    damping_ratio = -log_e / np.hypot(
+        np.pi, log_e
+    )  # of the damped spring that returns this share of the speed
     for name, axis, sign in (("east", 0, 1), ("north", 1, 1), ("west", 0, -1), ("south", 1, -1)):
         spec.worldbody.add_geom(
-            name=f"wall_{name}", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.3, 0.3, 0.01],
-            pos=sign * WALL * np.eye(3)[axis] + [0, 0, PLANE], zaxis=-sign * np.eye(3)[axis],
-            contype=0, conaffinity=1, condim=1, solref=[WALL_TIME, damping_ratio], solimp=RIGID,
-            priority=2, group=3,
-        )  # fmt: skip
+            name=f"wall_{name}",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[0.3, 0.3, 0.01],
+            pos=sign * WALL * np.eye(3)[axis] + [0, 0, PLANE],
+            zaxis=-sign * np.eye(3)[axis],
+            contype=0,
+            conaffinity=1,
+            condim=1,
+            solref=[WALL_TIME, damping_ratio],
+            solimp=RIGID,
+            priority=2,
+            group=3,
+        )
 
 
 class MujocoArm(ArmVectorEnv):
     """N arms in MuJoCo. ``threads`` simulate at once (default: the CPU cores there are, at most 8)."""
 
     def __init__(
-        self, num_envs: int, env_id: str, *, threads: int | None = None,
-        max_episode_steps: int = 100, render_mode: str | None = None, **changes: Unpack[Changes],
-    ) -> None:  # fmt: skip
-        super().__init__(num_envs, env_id, max_episode_steps=max_episode_steps, render_mode=render_mode, **changes)
+        self,
+        num_envs: int,
+        env_id: str,
+        *,
+        threads: int | None = None,
+        max_episode_steps: int = 100,
+        render_mode: str | None = None,
+        **changes: Unpack[Changes],
+    ) -> None:
+        super().__init__(
+            num_envs,
+            env_id,
+            max_episode_steps=max_episode_steps,
+            render_mode=render_mode,
+            **changes,
+        )
         self.model = load_model(self.env_id)
         self.frame_skip = round(DT / self.model.opt.timestep)
         threads = min(threads or min(os.cpu_count() or 1, 8), num_envs)
         self._data = [mujoco.MjData(self.model) for _ in range(threads)]
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
-        self._physics = np.zeros((num_envs, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        self._physics = np.zeros(
+            (num_envs, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        )
         self._obstacle = np.zeros((num_envs, 2))
         self._renderer: mujoco.Renderer | None = None
 
@@ -178,18 +258,24 @@ class MujocoArm(ArmVectorEnv):
         ends = np.empty_like(self._physics)
         for first in range(0, self.num_envs, CHUNK):
             part = slice(first, first + CHUNK)
-            physics, warned = self._advance(self._physics[part], self._obstacle[part], actions[part])
+            physics, warned = self._advance(
+                self._physics[part], self._obstacle[part], actions[part]
+            )
             try:
                 self._check(physics, self._physics[part, 0], first, warned)
             except SimulationUnstable as fault:
                 warning = self._warning(fault.episode, actions[fault.episode, : fault.step + 1])
-                raise SimulationUnstable(fault.env, fault.episode, fault.step, fault.reason + warning) from None
+                raise SimulationUnstable(
+                    fault.env, fault.episode, fault.step, fault.reason + warning
+                ) from None
             states[part] = self._to_states(physics, self._obstacle[part])
             ends[part] = physics[:, -1]
         self._physics = ends
         return states
 
-    def _advance(self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _advance(
+        self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps; whether the last one warned (n,).
 
         One more substep is taken and forgotten: an episode that stands still in it had a warning in the one before.
@@ -200,9 +286,13 @@ class MujocoArm(ArmVectorEnv):
         if self.task == "obstacle":
             spec |= mujoco.mjtState.mjSTATE_MOCAP_POS.value
             position = np.concatenate([obstacle, np.full((len(obstacle), 1), PLANE)], axis=1)
-            control = np.concatenate([control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2)
+            control = np.concatenate(
+                [control, np.repeat(position[:, None], control.shape[1], axis=1)], axis=2
+            )
         with without_log():
-            physics, _ = self._pool.rollout(self.model, self._data, start, control, control_spec=spec)
+            physics, _ = self._pool.rollout(
+                self.model, self._data, start, control, control_spec=spec
+            )
         warned = physics[:, -1, 0] == physics[:, -2, 0]
         return physics[:, self.frame_skip - 1 : -1 : self.frame_skip].copy(), warned
 
@@ -221,7 +311,9 @@ class MujocoArm(ArmVectorEnv):
     def _warning(self, episode: int, actions: np.ndarray) -> str:
         """What MuJoCo warns of when an episode is stepped again from where this call began, one substep at a time."""
         data = mujoco.MjData(self.model)
-        mujoco.mj_setState(self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_setState(
+            self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS
+        )
         if self.task == "obstacle":
             data.mocap_pos[0] = (*self._obstacle[episode], PLANE)
         with without_log():
@@ -234,7 +326,11 @@ class MujocoArm(ArmVectorEnv):
         return ""
 
     def _check(
-        self, physics: np.ndarray, start_time: np.ndarray, first: int, warned: np.ndarray | bool = False
+        self,
+        physics: np.ndarray,
+        start_time: np.ndarray,
+        first: int,
+        warned: np.ndarray | bool = False,
     ) -> None:
         """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond `MAX_SPEED`."""
         nq = self.model.nq
@@ -244,7 +340,10 @@ class MujocoArm(ArmVectorEnv):
         with np.errstate(invalid="ignore"):
             reasons = (
                 ("the state is not finite", ~np.isfinite(physics).all(axis=-1)),
-                (f"speed above {MAX_SPEED:g} rad/s", (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1)),
+                (
+                    f"speed above {MAX_SPEED:g} rad/s",
+                    (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1),
+                ),
                 ("MuJoCo stopped it", stopped),
             )
         wrong = reasons[0][1] | reasons[1][1] | reasons[2][1]
@@ -264,8 +363,12 @@ class MujocoArm(ArmVectorEnv):
         snapshot = np.asarray(snapshot, np.float64)
         expected = (self.num_envs, self._physics.shape[1] + 4)
         if snapshot.shape != expected:
-            raise ValueError(f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}")
-        self._physics, self._obstacle, self.target = (part.copy() for part in np.split(snapshot, [-4, -2], axis=1))
+            raise ValueError(
+                f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}"
+            )
+        self._physics, self._obstacle, self.target = (
+            part.copy() for part in np.split(snapshot, [-4, -2], axis=1)
+        )
         self._check(self._physics[:, None], self._physics[:, 0] - DT, 0)
         self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
         self._elapsed = round(self._physics[:, 0].max() / DT)
@@ -278,7 +381,10 @@ class MujocoArm(ArmVectorEnv):
                 return self._photograph(state, target)
             except Exception as error:  # without GL the failure depends on the driver: FatalError, AttributeError, ...
                 _gl_works = False
-                warnings.warn(f"MuJoCo cannot render here ({error}); drawing with matplotlib instead", stacklevel=2)
+                warnings.warn(
+                    f"MuJoCo cannot render here ({error}); drawing with matplotlib instead",
+                    stacklevel=2,
+                )
         return render_array(state, self.env_id, target)
 
     def _photograph(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -301,9 +407,13 @@ class MujocoArm(ArmVectorEnv):
         if self.task != "reach":  # the variants have no target body
             scene = self._renderer.scene
             mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.009),
-                np.array([*target, 3 * PLANE]), np.eye(3).ravel(), np.array([0.9, 0.2, 0.2, 1.0], np.float32),
-            )  # fmt: skip
+                scene.geoms[scene.ngeom],
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                np.full(3, 0.009),
+                np.array([*target, 3 * PLANE]),
+                np.eye(3).ravel(),
+                np.array([0.9, 0.2, 0.2, 1.0], np.float32),
+            )
             scene.ngeom += 1
         return self._renderer.render()
 

@@ -45,7 +45,9 @@ class Bulk:
         self._pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
         self._kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         self._size = mujoco.mj_stateSize(self.model, self._kind)
-        applied = mujoco.mjtState.mjSTATE_QFRC_APPLIED.value | mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
+        applied = (
+            mujoco.mjtState.mjSTATE_QFRC_APPLIED.value | mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
+        )
         self._watched = self._kind | applied
         self.only_observes = not last_substep and never_ends(type(env))
 
@@ -82,7 +84,9 @@ class Bulk:
         first, warm = starts[:, : self._size], starts[:, self._size :]
         control = np.repeat(actions.astype(np.float64), self.frame_skip, axis=1)
         with without_log():
-            states, _ = self._pool.rollout(self.model, self._data, first, control, initial_warmstart=warm)
+            states, _ = self._pool.rollout(
+                self.model, self._data, first, control, initial_warmstart=warm
+            )
         return np.concatenate([first[:, None], states], axis=1)
 
     def observed(self, env: gymnasium.Env, physics: np.ndarray) -> list[np.ndarray]:
@@ -98,24 +102,41 @@ class Bulk:
 
     @contextmanager
     def playing(
-        self, env: gymnasium.Env, physics: np.ndarray, actions: np.ndarray, *, fill: float | None = None
+        self,
+        env: gymnasium.Env,
+        physics: np.ndarray,
+        actions: np.ndarray,
+        *,
+        fill: float | None = None,
     ) -> Iterator[None]:
         """Within, each ``step`` of ``env`` sets the next of ``physics``. fill: a value for all that follows from it."""
         import mujoco
 
         simulated: Any = env.unwrapped
         model, data, kind, skip = simulated.model, simulated.data, self._kind, self.frame_skip
-        reached = np.zeros((len(actions) + 1, mujoco.mj_stateSize(model, self._watched)))  # and no force by hand
+        reached = np.zeros(
+            (len(actions) + 1, mujoco.mj_stateSize(model, self._watched))
+        )  # and no force by hand
         reached[:, : self._size] = physics[::skip]
         expected = [row.tobytes() for row in reached]
-        now, after, last = np.empty_like(reached[0]), list(physics[skip::skip].copy()), physics[skip - 1 :: skip].copy()
+        now, after, last = (
+            np.empty_like(reached[0]),
+            list(physics[skip::skip].copy()),
+            physics[skip - 1 :: skip].copy(),
+        )
         clock = physics[0, 0] + skip * model.opt.timestep * np.arange(len(reached))
-        sound = int((np.abs(reached[:, 0] - clock) < model.opt.timestep / 2).cumprod().sum()) - 1  # steps
+        sound = (
+            int((np.abs(reached[:, 0] - clock) < model.opt.timestep / 2).cumprod().sum()) - 1
+        )  # steps
         step = 0
 
         def do_simulation(control: np.ndarray, n_frames: int) -> None:
             nonlocal step
-            if n_frames != skip or step >= len(actions) or not np.array_equal(control, actions[step]):
+            if (
+                n_frames != skip
+                or step >= len(actions)
+                or not np.array_equal(control, actions[step])
+            ):
                 raise Mismatch("its actuators get something else than its actions")
             mujoco.mj_getState(model, data, now, self._watched)
             if now.tobytes() != expected[step]:
@@ -156,9 +177,15 @@ def never_ends(kind: type) -> bool:
     if not kind.__module__.startswith("gymnasium.envs.mujoco."):
         return False
     source = ast.parse(textwrap.dedent(inspect.getsource(kind.step)))  # type: ignore[attr-defined]
-    ends = [node.value.elts[2:4] if isinstance(node.value, ast.Tuple) else [] for node in ast.walk(source)
-            if isinstance(node, ast.Return)]  # fmt: skip
-    return all(len(pair) == 2 and all(isinstance(e, ast.Constant) and e.value is False for e in pair) for pair in ends)
+    ends = [
+        node.value.elts[2:4] if isinstance(node.value, ast.Tuple) else []
+        for node in ast.walk(source)
+        if isinstance(node, ast.Return)
+    ]
+    return all(
+        len(pair) == 2 and all(isinstance(e, ast.Constant) and e.value is False for e in pair)
+        for pair in ends
+    )
 
 
 @cache
@@ -166,13 +193,31 @@ def derived() -> tuple[str, ...]:
     """Arrays of MuJoCo's data that follow from positions, velocities and controls, those of constraints left out."""
     import mujoco
 
-    given = {"qpos", "qvel", "act", "ctrl", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "mocap_pos",
-             "mocap_quat", "userdata", "history", "plugin_state"}  # fmt: skip
+    given = {
+        "qpos",
+        "qvel",
+        "act",
+        "ctrl",
+        "qacc_warmstart",
+        "qfrc_applied",
+        "xfrc_applied",
+        "mocap_pos",
+        "mocap_quat",
+        "userdata",
+        "history",
+        "plugin_state",
+    }
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     found = {
-        name: getattr(data, name) for name in dir(data) if not name.startswith(("_", "efc_")) and name not in given
+        name: getattr(data, name)
+        for name in dir(data)
+        if not name.startswith(("_", "efc_")) and name not in given
     }
-    return tuple(n for n, array in found.items() if isinstance(array, np.ndarray) and array.dtype == np.float64)
+    return tuple(
+        n
+        for n, array in found.items()
+        if isinstance(array, np.ndarray) and array.dtype == np.float64
+    )
 
 
 def arrays(data: Any) -> dict[str, np.ndarray]:

@@ -40,7 +40,9 @@ class Physics:
         for name, (low, high, unit) in RANGES.items():
             (value,) = _numbers(name, (getattr(self, name),), "a number")
             if not low <= value <= high:
-                raise ValueError(f"{name} is {value:g}{unit}; expected {low:g} to {high:g}{unit} ({_usual(name)})")
+                raise ValueError(
+                    f"{name} is {value:g}{unit}; expected {low:g} to {high:g}{unit} ({_usual(name)})"
+                )
             object.__setattr__(self, name, value)
         lengths = _numbers("link_lengths", self.link_lengths, "two numbers")
         if len(lengths) != 2 or min(lengths) < SHORTEST or sum(lengths) > LONGEST + 1e-9:
@@ -53,7 +55,11 @@ class Physics:
     @property
     def changed(self) -> Changes:
         """The values that are not the standard arm's."""
-        found = {name: getattr(self, name) for name, usual in STANDARD.items() if getattr(self, name) != usual}
+        found = {
+            name: getattr(self, name)
+            for name, usual in STANDARD.items()
+            if getattr(self, name) != usual
+        }
         return cast(Changes, found)
 
     @property
@@ -71,27 +77,44 @@ class Physics:
         return ", ".join(found)
 
 
-SHORTEST, LONGEST = 0.06, 0.24  # m: a link; both together, so that the fingertip stays within the walls
+SHORTEST, LONGEST = (
+    0.06,
+    0.24,
+)  # m: a link; both together, so that the fingertip stays within the walls
 RANGES = {
-    "mass": (0.25, 4.0, " kg"), "damping": (0.5, 4.0, " N m s/rad"),
-    "object_radius": (0.02, 0.05, " m"), "torque_gain": (0.25, 1.25, ""),
-}  # fmt: skip
+    "mass": (0.25, 4.0, " kg"),
+    "damping": (0.5, 4.0, " N m s/rad"),
+    "object_radius": (0.02, 0.05, " m"),
+    "torque_gain": (0.25, 1.25, ""),
+}
 STANDARD: dict[str, object] = {field.name: field.default for field in fields(Physics)}
 _WORDS = {
-    "mass": "mass", "damping": "damping", "link_lengths": "links", "object_radius": "radius", "torque_gain": "gain",
-}  # fmt: skip
+    "mass": "mass",
+    "damping": "damping",
+    "link_lengths": "links",
+    "object_radius": "radius",
+    "torque_gain": "gain",
+}
 _LABELS = {
-    "mass": ("mass",), "damping": ("damping",), "link_lengths": ("upper link", "lower link"),
-    "object_radius": ("object",), "torque_gain": ("torque",),
-}  # fmt: skip
-PATTERN = "".join(rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values())  # of ``Physics.word``, a group for each
+    "mass": ("mass",),
+    "damping": ("damping",),
+    "link_lengths": ("upper link", "lower link"),
+    "object_radius": ("object",),
+    "torque_gain": ("torque",),
+}
+PATTERN = "".join(
+    rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values()
+)  # of ``Physics.word``, a group for each
 
 
 def parse(groups: Iterable[str | None]) -> Changes:
     """The values in the groups of ``PATTERN``. ValueError where one is no number."""
     given = {name: text for name, text in zip(_WORDS, groups, strict=True) if text}
     values = {name: tuple(map(float, text.split("x"))) for name, text in given.items()}
-    return cast(Changes, {name: value if name == "link_lengths" else value[0] for name, value in values.items()})
+    return cast(
+        Changes,
+        {name: value if name == "link_lengths" else value[0] for name, value in values.items()},
+    )
 
 
 def _several(value: object) -> tuple[float, ...]:
@@ -99,7 +122,11 @@ def _several(value: object) -> tuple[float, ...]:
 
 
 def _spelled(value: object) -> str:
-    return "x".join(map(_spelled, value)) if isinstance(value, tuple) else repr(value).removesuffix(".0")
+    return (
+        "x".join(map(_spelled, value))
+        if isinstance(value, tuple)
+        else repr(value).removesuffix(".0")
+    )
 
 
 def _numbers(name: str, given: object, expected: str) -> tuple[float, ...]:

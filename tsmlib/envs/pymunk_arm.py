@@ -19,7 +19,15 @@ import pymunk
 
 from tsmlib.envs import geometry
 from tsmlib.envs.arm import ArmVectorEnv
-from tsmlib.envs.geometry import ARM_RADIUS, BLOCK_DECAY, BLOCK_MASS, DT, ELBOW_LIMIT, WALL, capsule_length
+from tsmlib.envs.geometry import (
+    ARM_RADIUS,
+    BLOCK_DECAY,
+    BLOCK_MASS,
+    DT,
+    ELBOW_LIMIT,
+    WALL,
+    capsule_length,
+)
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
@@ -38,7 +46,11 @@ MAX_ANGLE = 1e6  # rad; beyond it, floats no longer resolve the fingertip well
 MAX_JOINT_SPEED = 1e3  # rad/s; full torque throughout reaches about 200
 MAX_BLOCK_SPEED = 100.0  # m/s
 
-ARM, BLOCK, WALLS = 0b001, 0b010, 0b100  # the arm meets the block only, and passes over the walls and itself
+ARM, BLOCK, WALLS = (
+    0b001,
+    0b010,
+    0b100,
+)  # the arm meets the block only, and passes over the walls and itself
 
 
 def physics_hash(env_id: str) -> str:
@@ -48,10 +60,28 @@ def physics_hash(env_id: str) -> str:
     # Nothing slides and there are no walls but on push; the others keep the numbers that their files were made with.
     decay, wall = (geometry.slide_time(physics), WALL) if arm.task == "push" else (0.2, 0.28)
     numbers = (
-        env_id, DT, SUBSTEPS, ITERATIONS, SLOP, STIFF, geometry.GEAR * physics.torque_gain, lengths,
-        capsule_length(lengths), ARM_RADIUS, ARMATURE, physics.damping, ELBOW_MASS, ANCHOR_MASS, ELBOW_LIMIT,
-        physics.object_radius, physics.mass, decay, geometry.FRICTION, geometry.RESTITUTION, wall,
-    )  # fmt: skip
+        env_id,
+        DT,
+        SUBSTEPS,
+        ITERATIONS,
+        SLOP,
+        STIFF,
+        geometry.GEAR * physics.torque_gain,
+        lengths,
+        capsule_length(lengths),
+        ARM_RADIUS,
+        ARMATURE,
+        physics.damping,
+        ELBOW_MASS,
+        ANCHOR_MASS,
+        ELBOW_LIMIT,
+        physics.object_radius,
+        physics.mass,
+        decay,
+        geometry.FRICTION,
+        geometry.RESTITUTION,
+        wall,
+    )
     return hashlib.sha256(repr(numbers).encode()).hexdigest()
 
 
@@ -70,7 +100,10 @@ class PymunkArm(ArmVectorEnv):
         states = np.empty((*actions.shape[:2], len(self.names)))
         history = np.concatenate([self._history, actions], axis=1)
         over = self._history.shape[1] < self.max_episode_steps <= history.shape[1]
-        live, self._live = self._live, [None] * self.num_envs  # after a fault every episode is replayed
+        live, self._live = (
+            self._live,
+            [None] * self.num_envs,
+        )  # after a fault every episode is replayed
         for i, torques in enumerate((geometry.GEAR * self.physics.torque_gain * actions).tolist()):
             episode = live[i] or self._replayed(i)
             for t, (shoulder, elbow) in enumerate(torques):
@@ -78,14 +111,18 @@ class PymunkArm(ArmVectorEnv):
                 if reason := _fault(state):
                     raise SimulationUnstable(self.env_id, i, t, reason)
                 states[i, t] = state
-            live[i] = None if over else episode  # at the time limit the space, about 150 kB, is given back
+            live[i] = (
+                None if over else episode
+            )  # at the time limit the space, about 150 kB, is given back
         self._live, self._history = live, history
         return states
 
     def _replayed(self, i: int) -> _Episode:
         """Episode i, built at its start and brought to the present."""
         episode = _Episode(self.task, self.physics, self._starts[i].tolist())
-        for shoulder, elbow in (geometry.GEAR * self.physics.torque_gain * self._history[i]).tolist():
+        for shoulder, elbow in (
+            geometry.GEAR * self.physics.torque_gain * self._history[i]
+        ).tolist():
             episode.step(shoulder, elbow)
         return episode
 
@@ -136,11 +173,18 @@ class _Episode:
         tip_x = first * math.cos(q) + second * math.cos(reach)
         tip_y = first * math.sin(q) + second * math.sin(reach)
         arm = (q, reach - q, w, link2.angular_velocity - w, tip_x, tip_y)
-        return (*arm, *self.block.position, *self.block.velocity) if self.block else arm + self.obstacle
+        return (
+            (*arm, *self.block.position, *self.block.velocity)
+            if self.block
+            else arm + self.obstacle
+        )
 
     def _add_arm(self, q0: float, q1: float, dq0: float, dq1: float) -> None:
         (length, second), damping = self.physics.link_lengths, self.physics.damping
-        self.link1, self.link2 = pymunk.Body(ANCHOR_MASS, ARMATURE), pymunk.Body(ELBOW_MASS, ARMATURE)
+        self.link1, self.link2 = (
+            pymunk.Body(ANCHOR_MASS, ARMATURE),
+            pymunk.Body(ELBOW_MASS, ARMATURE),
+        )
         self.link1.angle, self.link1.angular_velocity = q0, dq0
         self.link2.angle, self.link2.angular_velocity = q0 + q1, dq0 + dq1
         self.link2.position = length * math.cos(q0), length * math.sin(q0)
@@ -148,16 +192,22 @@ class _Episode:
         elbow = pymunk.PivotJoint(self.link1, self.link2, (length, 0.0), (0.0, 0.0))
         limit = pymunk.RotaryLimitJoint(self.link1, self.link2, -ELBOW_LIMIT, ELBOW_LIMIT)
         elbow.error_bias = limit.error_bias = STIFF
-        shoulder_damper = pymunk.DampedRotarySpring(self.space.static_body, self.link1, 0.0, 0.0, damping)
+        shoulder_damper = pymunk.DampedRotarySpring(
+            self.space.static_body, self.link1, 0.0, 0.0, damping
+        )
         elbow_damper = pymunk.DampedRotarySpring(self.link1, self.link2, 0.0, 0.0, damping)
         shapes = (
             pymunk.Segment(self.link1, (0.0, 0.0), (length, 0.0), ARM_RADIUS),
-            pymunk.Segment(self.link2, (0.0, 0.0), (capsule_length(self.physics.link_lengths), 0.0), ARM_RADIUS),
+            pymunk.Segment(
+                self.link2, (0.0, 0.0), (capsule_length(self.physics.link_lengths), 0.0), ARM_RADIUS
+            ),
             pymunk.Circle(self.link2, ARM_RADIUS, (second, 0.0)),  # the fingertip
         )
         for shape in shapes:
             shape.filter = pymunk.ShapeFilter(categories=ARM, mask=BLOCK)
-            shape.friction = 1.0  # Chipmunk multiplies the friction, and the elasticity, of the two surfaces
+            shape.friction = (
+                1.0  # Chipmunk multiplies the friction, and the elasticity, of the two surfaces
+            )
         self.space.add(self.link1, self.link2, elbow, limit, shoulder_damper, elbow_damper, *shapes)
 
     def _add_block(self, position: tuple[float, float], velocity: tuple[float, float]) -> None:
@@ -165,9 +215,16 @@ class _Episode:
         self.block.position, self.block.velocity = position, velocity
         self.space.add(self.block)
         self._add_disc(self.block, (0.0, 0.0))
-        for anchor in ((FAR, 0.0), (0.0, FAR)):  # a dashpot along x and one along y: drag without a callback
+        for anchor in (
+            (FAR, 0.0),
+            (0.0, FAR),
+        ):  # a dashpot along x and one along y: drag without a callback
             drag = BLOCK_MASS / BLOCK_DECAY
-            self.space.add(pymunk.DampedSpring(self.space.static_body, self.block, anchor, (0.0, 0.0), 0.0, 0.0, drag))
+            self.space.add(
+                pymunk.DampedSpring(
+                    self.space.static_body, self.block, anchor, (0.0, 0.0), 0.0, 0.0, drag
+                )
+            )
 
     def _add_disc(self, body: pymunk.Body, centre: tuple[float, float]) -> None:
         disc = pymunk.Circle(body, self.physics.object_radius, centre)

@@ -50,7 +50,11 @@ def draw_scene(
 
     if background:
         solid = task == "push"  # elsewhere the frame is only there to look at
-        ax.add_patch(Rectangle((-EXTENT, -EXTENT), 2 * EXTENT, 2 * EXTENT, fc=STEEL if solid else FRAME, ec="none"))
+        ax.add_patch(
+            Rectangle(
+                (-EXTENT, -EXTENT), 2 * EXTENT, 2 * EXTENT, fc=STEEL if solid else FRAME, ec="none"
+            )
+        )
         ax.add_patch(Rectangle((-WALL, -WALL), 2 * WALL, 2 * WALL, fc=FLOOR, ec="none"))
         reach = sum(lengths)
         ax.add_patch(Circle((0, 0), reach, fc="none", ec=FRAME, lw=0.8, ls=(0, (4, 3)), zorder=1.1))
@@ -59,23 +63,51 @@ def draw_scene(
     for path, colour in ((tip_path, TIP), (block_path, BLOCK)):
         if path is not None:
             path = np.asarray(path)
-            ax.plot(path[:, 0], path[:, 1], color=colour, lw=1.6, alpha=0.8, solid_capstyle="round", zorder=2)
+            ax.plot(
+                path[:, 0],
+                path[:, 1],
+                color=colour,
+                lw=1.6,
+                alpha=0.8,
+                solid_capstyle="round",
+                zorder=2,
+            )
     if target is not None:
         _target(ax, np.asarray(target), radius if task == "push" else 1.2 * ARM_RADIUS)
     if task != "reach":
         fixed = task == "obstacle"
         face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
-        ax.add_patch(Circle((state[6], state[7]), radius, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3))
+        ax.add_patch(
+            Circle((state[6], state[7]), radius, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3)
+        )
         if fixed:  # a bolt: it does not move
-            ax.add_patch(Circle((state[6], state[7]), 0.25 * radius, fc=INK, ec="none", alpha=alpha, zorder=3))
+            ax.add_patch(
+                Circle(
+                    (state[6], state[7]), 0.25 * radius, fc=INK, ec="none", alpha=alpha, zorder=3
+                )
+            )
     elbow, _, tip = arm_points(state[:2], lengths)
-    ax.add_patch(Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9))  # the pedestal
+    ax.add_patch(
+        Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9)
+    )  # the pedestal
     _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)
-    ax.add_patch(Circle((tip[0], tip[1]), 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3))
+    ax.add_patch(
+        Circle(
+            (tip[0], tip[1]), 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3
+        )
+    )
     for joint in (np.zeros(2), elbow):
         ax.add_patch(
-            Circle((joint[0], joint[1]), 0.5 * ARM_RADIUS, fc="white", ec=INK, lw=0.8, alpha=alpha, zorder=4.4)
+            Circle(
+                (joint[0], joint[1]),
+                0.5 * ARM_RADIUS,
+                fc="white",
+                ec=INK,
+                lw=0.8,
+                alpha=alpha,
+                zorder=4.4,
+            )
         )
 
 
@@ -103,12 +135,16 @@ def render_array(
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     draw_scene(ax, state, env_id, target, tip_path=tip_path, block_path=block_path)
     if note:
-        ax.text(0.02 - WALL, 0.02 - WALL, note, color=INK, fontsize=11, family="DejaVu Sans", zorder=6)
+        ax.text(
+            0.02 - WALL, 0.02 - WALL, note, color=INK, fontsize=11, family="DejaVu Sans", zorder=6
+        )
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _capsule(ax: Axes, start: np.ndarray, end: np.ndarray, colour: str, alpha: float, zorder: float) -> None:
+def _capsule(
+    ax: Axes, start: np.ndarray, end: np.ndarray, colour: str, alpha: float, zorder: float
+) -> None:
     """A link with round ends, its true width in metres."""
     from matplotlib.patches import Polygon
 
@@ -118,7 +154,17 @@ def _capsule(ax: Axes, start: np.ndarray, end: np.ndarray, colour: str, alpha: f
         centre + ARM_RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         for centre, angle in ((end, along + half), (start, along + np.pi + half))
     ]
-    ax.add_patch(Polygon(np.concatenate(rim), fc=colour, ec=INK, lw=0.9, alpha=alpha, zorder=zorder, joinstyle="round"))
+    ax.add_patch(
+        Polygon(
+            np.concatenate(rim),
+            fc=colour,
+            ec=INK,
+            lw=0.9,
+            alpha=alpha,
+            zorder=zorder,
+            joinstyle="round",
+        )
+    )
 
 
 def _target(ax: Axes, centre: np.ndarray, radius: float) -> None:
@@ -128,4 +174,10 @@ def _target(ax: Axes, centre: np.ndarray, radius: float) -> None:
     ax.add_patch(Circle((centre[0], centre[1]), radius, fc="none", ec=TARGET, lw=1.6, zorder=5))
     arm = 0.5 * min(radius, 2 * ARM_RADIUS)
     for dx, dy in ((arm, 0.0), (0.0, arm)):
-        ax.plot(centre[0] + np.array([-dx, dx]), centre[1] + np.array([-dy, dy]), color=TARGET, lw=1.6, zorder=5)
+        ax.plot(
+            centre[0] + np.array([-dx, dx]),
+            centre[1] + np.array([-dy, dy]),
+            color=TARGET,
+            lw=1.6,
+            zorder=5,
+        )

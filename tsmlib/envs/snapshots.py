@@ -80,7 +80,9 @@ def restore(env: gymnasium.Env, snapshot: Snapshot) -> None:
         import mujoco
 
         simulated: Any = env.unwrapped
-        mujoco.mj_setState(simulated.model, simulated.data, snapshot.physics, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_setState(
+            simulated.model, simulated.data, snapshot.physics, mujoco.mjtState.mjSTATE_INTEGRATION
+        )
         for name, value in snapshot.derived.items():
             present = getattr(simulated.data, name)
             if present.shape == value.shape:  # others are as long as there are contacts
@@ -111,7 +113,9 @@ def abilities(env: gymnasium.Env) -> Abilities:
     spec = env.spec
     if spec is None:  # nothing says which arguments it was made with
         return _tried(env)
-    key = repr((spec.id, spec.kwargs, spec.additional_wrappers, [type(layer) for layer in _layers(env)]))
+    key = repr(
+        (spec.id, spec.kwargs, spec.additional_wrappers, [type(layer) for layer in _layers(env)])
+    )
     if key not in _known:
         _known[key] = _tried(env)
     return _known[key]
@@ -186,12 +190,16 @@ def _bulk(env: gymnasium.Env, actions: np.ndarray) -> tuple[Bulk | None, str]:
         else:
             env.reset(seed=3)
             seen = bulk.observed(env, bulk.physics(bulk.start(env)[None], actions[None])[0])
-            bulk.only_observes &= np.array_equal(seen[: len(stepped[0])], [step.observation for step in stepped[0]])
+            bulk.only_observes &= np.array_equal(
+                seen[: len(stepped[0])], [step.observation for step in stepped[0]]
+            )
             return bulk, ""
     return None, "its observations, rewards or ends differ from those of stepping"
 
 
-def _in_bulk(env: gymnasium.Env, bulk: Bulk, seed: int, actions: np.ndarray, fill: float | None = None) -> list[Step]:
+def _in_bulk(
+    env: gymnasium.Env, bulk: Bulk, seed: int, actions: np.ndarray, fill: float | None = None
+) -> list[Step]:
     env.reset(seed=seed)
     physics = bulk.physics(bulk.start(env)[None], actions[None])
     with bulk.playing(env, physics[0], actions, fill=fill):
@@ -213,7 +221,9 @@ def _copied(value: object) -> object:
         return value.copy()
     if isinstance(value, np.random.Generator):
         return _Drawn(type(value.bit_generator), value.bit_generator.state)
-    if type(value) is dict and all(isinstance(part, (*_FIXED, np.ndarray)) for part in value.values()):
+    if type(value) is dict and all(
+        isinstance(part, (*_FIXED, np.ndarray)) for part in value.values()
+    ):
         return {name: _copied(part) for name, part in value.items()}
     if type(value) in (list, tuple) and all(isinstance(part, _FIXED) for part in value):  # type: ignore[attr-defined]
         return value[:]  # type: ignore[index]

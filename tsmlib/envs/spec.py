@@ -33,7 +33,7 @@ _NOTHING_TO_CHANGE: dict[TaskName, dict[str, str]] = {
 _CHANGED = {
     "push": "the physics of pushing changed (a free object slows down by e in 0.05 s, before in 0.2 s; walls at 0.24 m "
     "from the shoulder, before at 0.28 m; first poses in every direction; T = 100 steps, before 50)"
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ class EnvSpec:
                 or f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them, "
                 "nor a variant()"
             )
-        spec = replace(_PLAIN[f"{arm}-v{version}"], noise=float(noise or 0.0), delay=int(delay or 0))
+        spec = replace(
+            _PLAIN[f"{arm}-v{version}"], noise=float(noise or 0.0), delay=int(delay or 0)
+        )
         spec = spec.varied(**physics.parse(changed))
         if any(changed) and spec.id != env_id:
             raise ValueError(f"{env_id} is written {spec.id}")
@@ -72,13 +74,18 @@ class EnvSpec:
         allowed = [name for name in STANDARD if name not in _NOTHING_TO_CHANGE[self.task]]
         if refused := [name for name in changes if name not in allowed]:
             why = _NOTHING_TO_CHANGE[self.task].get(refused[0], "there is no such quantity")
-            raise ValueError(f"{refused[0]} of {self.id} cannot be chosen: {why}. It takes {', '.join(allowed)}")
+            raise ValueError(
+                f"{refused[0]} of {self.id} cannot be chosen: {why}. It takes {', '.join(allowed)}"
+            )
         return replace(self, physics=replace(self.physics, **changes))
 
     @property
     def name(self) -> str:
         """Name in folders and titles: ``"ReacherPush"``, ``"ReacherPush-mass2"``, ``"Reacher-delay5"``."""
-        noise, delay = f"-noise{self.noise:g}" if self.noise else "", f"-delay{self.delay}" if self.delay else ""
+        noise, delay = (
+            f"-noise{self.noise:g}" if self.noise else "",
+            f"-delay{self.delay}" if self.delay else "",
+        )
         return f"{_ARMS[self.simulator][self.task]}{self.physics.word}{noise}{delay}"
 
     @property
@@ -107,7 +114,10 @@ class EnvSpec:
         return 10 if self.has_block else 6
 
 
-_VECTOR_ARMS = {"mujoco": "tsmlib.envs.mujoco_arm:MujocoArm", "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm"}
+_VECTOR_ARMS = {
+    "mujoco": "tsmlib.envs.mujoco_arm:MujocoArm",
+    "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm",
+}
 
 
 def _register(spec: EnvSpec) -> None:
@@ -119,10 +129,21 @@ def _register(spec: EnvSpec) -> None:
     if spec != spec.arm:
         made_by = ("tsmlib.envs.wrappers:imperfect_arm", "tsmlib.envs.wrappers:imperfect_arms")
         kwargs |= {"noise": spec.noise, "delay": spec.delay}
-    register(spec.id, entry_point=made_by[0], vector_entry_point=made_by[1], kwargs=kwargs, max_episode_steps=100)
+    register(
+        spec.id,
+        entry_point=made_by[0],
+        vector_entry_point=made_by[1],
+        kwargs=kwargs,
+        max_episode_steps=100,
+    )
 
 
-_PLAIN = {spec.id: spec for sim in get_args(Simulator) for task in get_args(TaskName) for spec in [EnvSpec(sim, task)]}
+_PLAIN = {
+    spec.id: spec
+    for sim in get_args(Simulator)
+    for task in get_args(TaskName)
+    for spec in [EnvSpec(sim, task)]
+}
 ENV_IDS = tuple(_PLAIN)
 MUJOCO_IDS, PYMUNK_IDS = ENV_IDS[:3], ENV_IDS[3:]
 
@@ -133,7 +154,9 @@ def gone(env_id: str) -> str:
     for spec in _PLAIN.values():
         if arm == f"tsm/{spec.name}" and int(version) < _VERSION[spec.task]:
             present = replace(
-                spec.varied(**physics.parse(changed)), noise=float(noise or 0.0), delay=int(delay or 0)
+                spec.varied(**physics.parse(changed)),
+                noise=float(noise or 0.0),
+                delay=int(delay or 0),
             ).id
             return f"{env_id} is gone: {_CHANGED[spec.task]}. {present} took its place"
     return ""
@@ -141,7 +164,9 @@ def gone(env_id: str) -> str:
 
 def _parts(env_id: str) -> tuple[str, tuple[str | None, ...], str | None, str | None, str]:
     """Arm, changed physics, noise, delay and version as they stand in an id; empty where it is none."""
-    parts = re.fullmatch(rf"(.*?){physics.PATTERN}(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v([0-9]+)", env_id)
+    parts = re.fullmatch(
+        rf"(.*?){physics.PATTERN}(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v([0-9]+)", env_id
+    )
     if not parts:
         return "", (None,) * len(STANDARD), None, None, ""
     arm, *changed, noise, delay, version = parts.groups()

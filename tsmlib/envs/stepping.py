@@ -29,9 +29,7 @@ from tsmlib.envs.unstable import SimulationUnstable
 
 Seeds = int | Sequence[int] | None  # of the first episode, those after it following; or of each
 
-SUPPORTED = (
-    "supported are observations that are a Box of one dimension, and actions that are one too, with finite bounds"
-)
+SUPPORTED = "supported are observations that are a Box of one dimension, and actions that are one too, with finite bounds"
 
 
 class UnsupportedEnvironment(ValueError):
@@ -119,14 +117,20 @@ def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
 def require_supported(env_id: str, observations: Space, actions: Space) -> tuple[Box, Box]:
     """Both spaces, flat and bounded as they have to be; UnsupportedEnvironment, naming what is supported."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
-        kind = "images" if isinstance(observations, Box) and len(observations.shape) in (2, 3) else "not flat"
+        kind = (
+            "images"
+            if isinstance(observations, Box) and len(observations.shape) in (2, 3)
+            else "not flat"
+        )
         raise UnsupportedEnvironment(
             f"observations of {env_id} are {kind}, {observations!s:.100}; {SUPPORTED}. Wrap it, for example in "
             "gymnasium.wrappers.FlattenObservation, or in one that gives its features"
         )
     if not isinstance(actions, Box) or len(actions.shape) != 1:
         kind = "discrete" if not isinstance(actions, Box) else "not flat"
-        raise UnsupportedEnvironment(f"actions of {env_id} are {kind}, {actions!s:.100}; {SUPPORTED}")
+        raise UnsupportedEnvironment(
+            f"actions of {env_id} are {kind}, {actions!s:.100}; {SUPPORTED}"
+        )
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
         raise UnsupportedEnvironment(
             f"actions of {env_id} have no bounds, {actions!s:.100}; {SUPPORTED}. Give it some by "
@@ -149,7 +153,11 @@ class Arms:
         arms: Any = env.unwrapped
         self.env: Any = env
         self.id, self.dt = arms.spec.id, arms.dt
-        self.names, self.units, self.angles = tuple(arms.names), tuple(arms.units), tuple(arms.angles)
+        self.names, self.units, self.angles = (
+            tuple(arms.names),
+            tuple(arms.units),
+            tuple(arms.angles),
+        )
         self.action_dim = arms.single_action_space.shape[0]
         self.path = "bulk simulation"
         self.steps = np.zeros(env.num_envs, np.int64)
@@ -172,7 +180,9 @@ class Arms:
 class _Described:
     """What is the same however an environment is stepped: its description, and the episodes so far."""
 
-    def __init__(self, env_id: str, described: Any, observations: Space, actions: Space, n: int) -> None:
+    def __init__(
+        self, env_id: str, described: Any, observations: Space, actions: Space, n: int
+    ) -> None:
         self.id, self.num_envs = env_id, n
         self.space, self.actions = require_supported(env_id, observations, actions)
         dx = self.space.shape[0]
@@ -196,15 +206,26 @@ class _Described:
             )
         if seed is None:
             seed = secrets.randbits(31)
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else [int(s) for s in seed]
+        seeds = (
+            [seed + i for i in range(self.num_envs)]
+            if isinstance(seed, int)
+            else [int(s) for s in seed]
+        )
         if len(seeds) != self.num_envs:
-            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} episodes of {self.id}; expected one each")
+            raise ValueError(
+                f"{len(seeds)} seeds for {self.num_envs} episodes of {self.id}; expected one each"
+            )
         return seeds
 
     def _commands(self, actions: np.ndarray) -> np.ndarray:
         """Actions (N, T, du) as the environment takes them; ValueError where they are something else."""
-        if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (self.num_envs, self.action_dim):
-            raise ValueError(f"actions are {actions.shape}; {self.id} expected ({self.num_envs}, T, {self.action_dim})")
+        if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (
+            self.num_envs,
+            self.action_dim,
+        ):
+            raise ValueError(
+                f"actions are {actions.shape}; {self.id} expected ({self.num_envs}, T, {self.action_dim})"
+            )
         if not np.isfinite(actions).all():
             raise ValueError(f"an action for {self.id} is not finite; nothing was simulated")
         return within_bounds(actions, self.actions)
@@ -214,7 +235,9 @@ class _Described:
         wrong = ~np.isfinite(states)
         if wrong.any():
             t, d = np.argwhere(wrong)[0].tolist()
-            raise SimulationUnstable(self.id, i, int(self.steps[i]) + t, f"{self.names[d]} is {states[t, d]}")
+            raise SimulationUnstable(
+                self.id, i, int(self.steps[i]) + t, f"{self.names[d]} is {states[t, d]}"
+            )
 
     def _checked(self, observation: object) -> np.ndarray:
         found = np.asarray(observation)
@@ -229,13 +252,19 @@ class _Described:
 class Stepping(_Described):
     """Episodes that are each stepped in a copy of their own; or ``n`` of them in one copy, from snapshots."""
 
-    def __init__(self, envs: Sequence[gymnasium.Env], n: int | None = None, *, returns: bool = False) -> None:
+    def __init__(
+        self, envs: Sequence[gymnasium.Env], n: int | None = None, *, returns: bool = False
+    ) -> None:
         first = envs[0]
         env_id = first.spec.id if first.spec else type(first.unwrapped).__name__
-        super().__init__(env_id, first.unwrapped, first.observation_space, first.action_space, n or len(envs))
+        super().__init__(
+            env_id, first.unwrapped, first.observation_space, first.action_space, n or len(envs)
+        )
         self.envs, self.shared = envs, n is not None
         known = abilities(first)
-        alike = len(envs) == 1 or (first.spec is not None and all(env.spec == first.spec for env in envs))
+        alike = len(envs) == 1 or (
+            first.spec is not None and all(env.spec == first.spec for env in envs)
+        )
         self.bulk = known.bulk if alike else None
         why = known.why or "it cannot be told that its copies are alike"
         self.path = "bulk simulation (mujoco.rollout)" if self.bulk else f"stepping: {why}"
@@ -257,7 +286,9 @@ class Stepping(_Described):
         states = np.repeat(self.last[:, None], actions.shape[1], axis=1)
         running = np.flatnonzero(~self.ended) if actions.shape[1] else np.arange(0)
         for i, steps in zip(
-            running.tolist(), self._simulated(running, commands[running], self.keeps_returns), strict=True
+            running.tolist(),
+            self._simulated(running, commands[running], self.keeps_returns),
+            strict=True,
         ):
             self._fill(states[i], steps)
             self._require_finite(states[i, : len(steps)], i)
@@ -277,11 +308,15 @@ class Stepping(_Described):
         commands = within_bounds(actions, self.actions).reshape(n * self.num_envs, horizon, -1)
         episodes = np.tile(np.arange(self.num_envs), n)
         rows = np.flatnonzero(~self.ended[episodes])
-        for row, steps in zip(rows, self._simulated(episodes[rows], commands[rows], False), strict=True):
+        for row, steps in zip(
+            rows, self._simulated(episodes[rows], commands[rows], False), strict=True
+        ):
             self._fill(states[row], steps)
         return states.reshape(n, self.num_envs, horizon, -1)
 
-    def _simulated(self, episodes: np.ndarray, commands: np.ndarray, rewards: bool) -> Iterator[list[Step]]:
+    def _simulated(
+        self, episodes: np.ndarray, commands: np.ndarray, rewards: bool
+    ) -> Iterator[list[Step]]:
         """What each of ``episodes`` (n,) does under commands (n, T, du); its environment is left where it came to.
 
         rewards: whether they are asked for; else they may be NaN.
@@ -295,13 +330,17 @@ class Stepping(_Described):
             for i, each, simulated in zip(episodes[part], commands[part], physics, strict=True):
                 yield self._played(i, each, simulated, rewards)
 
-    def _played(self, i: int, commands: np.ndarray, physics: np.ndarray | None, rewards: bool) -> list[Step]:
+    def _played(
+        self, i: int, commands: np.ndarray, physics: np.ndarray | None, rewards: bool
+    ) -> list[Step]:
         """The steps of one episode, from bulk physics where they turn out to be its own."""
         env = self._enter(i)
         if physics is None or self.bulk is None:
             return play(env, commands)
         if self.bulk.only_observes and not rewards and (left := steps_left(env)) is not None:
-            seen = self.bulk.observed(env, physics[: min(left, len(commands)) * self.bulk.frame_skip + 1])
+            seen = self.bulk.observed(
+                env, physics[: min(left, len(commands)) * self.bulk.frame_skip + 1]
+            )
             spend(env, len(seen))
             return [Step(x, np.nan, False, k + 1 == left) for k, x in enumerate(seen)]
         before = save(env, derived=self.derived) if self.snapshots[i] is None else self.snapshots[i]
@@ -345,8 +384,12 @@ class Vectorised(_Described):
         spec = env.spec or env.unwrapped.spec
         env_id = spec.id if spec else type(env.unwrapped).__name__
         copies = getattr(env.unwrapped, "envs", None)
-        described = copies[0].unwrapped if copies else gymnasium.make(spec.id).unwrapped if spec else env
-        super().__init__(env_id, described, env.single_observation_space, env.single_action_space, env.num_envs)
+        described = (
+            copies[0].unwrapped if copies else gymnasium.make(spec.id).unwrapped if spec else env
+        )
+        super().__init__(
+            env_id, described, env.single_observation_space, env.single_action_space, env.num_envs
+        )
         self.env, self.path = env, "stepping: its copies are stepped together"
         self.mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
 
@@ -379,7 +422,9 @@ class Vectorised(_Described):
             for i in np.flatnonzero(~self.ended):
                 seen = observed[i]
                 if over[i] and self.mode == AutoresetMode.SAME_STEP:
-                    seen = info["final_obs"][i]  # what was observed is the next episode's first state
+                    seen = info["final_obs"][
+                        i
+                    ]  # what was observed is the next episode's first state
                 states[i, t:] = self._checked(seen)
                 self._require_finite(states[i, t : t + 1], int(i))
                 self.returns[i] += rewards[i]
@@ -423,7 +468,9 @@ def _dt(env_id: str, env: Any) -> float:
         return float(found)
     if fps:
         return 1.0 / float(fps)
-    warnings.warn(f"{env_id} does not say how long a step is; one step counts as one second", stacklevel=4)
+    warnings.warn(
+        f"{env_id} does not say how long a step is; one step counts as one second", stacklevel=4
+    )
     return 1.0
 
 
@@ -436,7 +483,11 @@ def continued(env_id: str, seeds: Sequence[int], actions: np.ndarray) -> Steppin
     known = abilities(one)
     if not known.restores:
         one.close()
-        why = "its state cannot be saved and set" if known.repeats else "the same seed and actions do not repeat it"
+        why = (
+            "its state cannot be saved and set"
+            if known.repeats
+            else "the same seed and actions do not repeat it"
+        )
         raise UnsupportedEnvironment(
             f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, tsmlib.model_predictor"
         )

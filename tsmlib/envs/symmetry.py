@@ -40,7 +40,9 @@ def symmetric(data: Trajectories) -> Trajectories:
     """Episodes with all their symmetric copies (``copies``), the episodes themselves first."""
     if copies(data.env) == 1:
         return data
-    states, actions = zip((data.states, data.actions), mirrored(data.states, data.actions), strict=True)
+    states, actions = zip(
+        (data.states, data.actions), mirrored(data.states, data.actions), strict=True
+    )
     return replace(
         data,
         states=np.concatenate([turned(each, quarters) for quarters in range(4) for each in states]),

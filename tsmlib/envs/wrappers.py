@@ -13,7 +13,9 @@ from tsmlib.envs.geometry import HALF_RANGE
 from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
 
-NOISE_STREAM = 2**32 - 1  # keeps the noise apart from the starts and targets of any reset, counted from 0, of this seed
+NOISE_STREAM = (
+    2**32 - 1
+)  # keeps the noise apart from the starts and targets of any reset, counted from 0, of this seed
 
 
 class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
@@ -32,12 +34,16 @@ class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
             raise ValueError(f"sigma is {sigma}; expected a finite number of at least 0")
         expected = env.observation_space.shape
         if self.scale.shape != expected:
-            raise ValueError(f"scale is {self.scale.shape}; expected {expected}, one half range per state dimension")
+            raise ValueError(
+                f"scale is {self.scale.shape}; expected {expected}, one half range per state dimension"
+            )
         if not (np.isfinite(self.scale).all() and (self.scale >= 0.0).all()):
             raise ValueError(f"scale is {self.scale}; expected finite half ranges of at least 0")
         self._noise = np.random.default_rng()
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         if seed is not None:
             self._noise = np.random.default_rng([seed, NOISE_STREAM])
         state, info = self.env.reset(seed=seed, options=options)
@@ -64,11 +70,15 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
         if isinstance(tau, bool) or not isinstance(tau, int | np.integer) or tau < 0:
             raise ValueError(f"tau is {tau!r}; expected a whole number of steps, at least 0")
         if not isinstance(env.action_space, gymnasium.spaces.Box):
-            raise ValueError(f"the action space is {env.action_space}; expected a Box, where zero means no torque")
+            raise ValueError(
+                f"the action space is {env.action_space}; expected a Box, where zero means no torque"
+            )
         self.tau, self._nothing = int(tau), np.zeros_like(env.action_space.low)
         self._on_the_way: deque[np.ndarray] = deque()
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         self._on_the_way = deque([self._nothing] * self.tau)
         return self.env.reset(seed=seed, options=options)
 
@@ -100,9 +110,13 @@ class ImperfectArms(VectorWrapper):
         """The true states (N, t + 1, dx) since the last reset."""
         return np.concatenate(self._seen, axis=1)
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         if seed is not None:
-            self._noise = [np.random.default_rng([seed, NOISE_STREAM, i]) for i in range(self.num_envs)]
+            self._noise = [
+                np.random.default_rng([seed, NOISE_STREAM, i]) for i in range(self.num_envs)
+            ]
         states, info = self._arms.reset(seed=seed, options=options)
         self._seen, self._on_the_way = [states[:, None]], np.zeros_like(self._on_the_way)
         return self._observed(states[:, None])[:, 0], info | {"state": states}
@@ -116,13 +130,23 @@ class ImperfectArms(VectorWrapper):
         self._seen.append(states)
         return self._observed(states)
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """As the arms', with the noisy states; ``info["state"]`` (N, dx) holds the true ones."""
-        given = np.concatenate([self._on_the_way, self._arms.checked(np.asarray(actions)[:, None])], axis=1)
+        given = np.concatenate(
+            [self._on_the_way, self._arms.checked(np.asarray(actions)[:, None])], axis=1
+        )
         states, reward, terminated, truncated, info = self._arms.step(given[:, 0])
         self._on_the_way = given[:, 1:]
         self._seen.append(states[:, None])
-        return self._observed(states[:, None])[:, 0], reward, terminated, truncated, info | {"state": states}
+        return (
+            self._observed(states[:, None])[:, 0],
+            reward,
+            terminated,
+            truncated,
+            info | {"state": states},
+        )
 
     def _observed(self, states: np.ndarray) -> np.ndarray:
         if not self.sigma:
@@ -132,20 +156,36 @@ class ImperfectArms(VectorWrapper):
 
 
 def imperfect_arm(
-    env_id: str, noise: float, delay: int, render_mode: str | None = None, **changes: Unpack[Changes]
+    env_id: str,
+    noise: float,
+    delay: int,
+    render_mode: str | None = None,
+    **changes: Unpack[Changes],
 ) -> ActionDelay:
     """One arm behind both wrappers, as Gymnasium makes it."""
-    arm = gymnasium.make(env_id, disable_env_checker=True, render_mode=render_mode, **changes).unwrapped
+    arm = gymnasium.make(
+        env_id, disable_env_checker=True, render_mode=render_mode, **changes
+    ).unwrapped
     return ActionDelay(SensorNoise(arm, noise, _half_range(env_id)), delay)
 
 
 def imperfect_arms(
-    num_envs: int, env_id: str, noise: float, delay: int, *,
-    max_episode_steps: int = 100, render_mode: str | None = None, **changes: Unpack[Changes],
-) -> ImperfectArms:  # fmt: skip
+    num_envs: int,
+    env_id: str,
+    noise: float,
+    delay: int,
+    *,
+    max_episode_steps: int = 100,
+    render_mode: str | None = None,
+    **changes: Unpack[Changes],
+) -> ImperfectArms:
     """N arms with both, as Gymnasium makes them."""
     arms = gymnasium.make_vec(
-        env_id, num_envs=num_envs, max_episode_steps=max_episode_steps, render_mode=render_mode, **changes
+        env_id,
+        num_envs=num_envs,
+        max_episode_steps=max_episode_steps,
+        render_mode=render_mode,
+        **changes,
     )
     return ImperfectArms(arms, sigma=noise, scale=_half_range(env_id), tau=delay)
 

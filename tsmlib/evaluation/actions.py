@@ -35,14 +35,22 @@ def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """Frequencies (F,) in Hz and the power (B, F) of torques (B, T, du): T times what each adds to their squares."""
     steps = actions.shape[1]
     power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)
-    power[:, 1 : (steps + 1) // 2] *= 2  # all but the constant part and the highest of even T have a mirror image
+    power[:, 1 : (steps + 1) // 2] *= (
+        2  # all but the constant part and the highest of even T have a mirror image
+    )
     return torch.fft.rfftfreq(steps, dt).double(), power
 
 
 @torch.no_grad()
 def sample_actions(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
     """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0); on the generator's device."""
-    z = torch.randn(n, -(-horizon // prior.segment_len), prior.latent_dim, generator=generator, device=generator.device)
+    z = torch.randn(
+        n,
+        -(-horizon // prior.segment_len),
+        prior.latent_dim,
+        generator=generator,
+        device=generator.device,
+    )
     return prior.plan(_rest(prior, n), *on_device_of(prior, z))[:, :horizon].to(z.device)
 
 
@@ -63,7 +71,10 @@ def rebuilt(prior: ActionPrior, window: Window) -> tuple[float, float]:
     """
     past, true = on_device_of(prior, window.past.actions, window.future.actions)
     z, _ = prior.encode(true)
-    off = (((prior.decode(past, codes) - true) / prior.std).square().mean().sqrt() for codes in (z, z.roll(7, 0)))
+    off = (
+        ((prior.decode(past, codes) - true) / prior.std).square().mean().sqrt()
+        for codes in (z, z.roll(7, 0))
+    )
     return float(next(off)), float(next(off))
 
 

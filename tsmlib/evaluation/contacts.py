@@ -41,7 +41,9 @@ def first_episodes(test: Trajectories, *, after: int) -> dict[str, Trajectories]
         touched = closest_gap(test.states, test.env) < 0.001
     ever = touched.any(1)
     chosen = {"contact": ever & ~touched[:, : after + 1].any(1), "free": ~ever}
-    return {kind: test.take(np.flatnonzero(among)[:1]) for kind, among in chosen.items() if among.any()}
+    return {
+        kind: test.take(np.flatnonzero(among)[:1]) for kind, among in chosen.items() if among.any()
+    }
 
 
 WITHIN = 2  # steps by which a predicted contact may be early or late
@@ -61,7 +63,9 @@ def windows_before_contact(
     """
     near = closest_gap(test.states, test.env) < NEAR
     begin = near.argmax(1) - LEAD  # the state that is observed last
-    episodes = np.flatnonzero(near.any(1) & (begin >= model.past_len) & (begin + horizon <= test.steps))
+    episodes = np.flatnonzero(
+        near.any(1) & (begin >= model.past_len) & (begin + horizon <= test.steps)
+    )
     if not len(episodes):
         raise ValueError(
             f"none of the {len(test)} episodes of {test.env} has a first touch between steps {model.past_len + LEAD} "
@@ -70,7 +74,10 @@ def windows_before_contact(
     first = torch.from_numpy(begin[episodes]) - model.past_len
     window = windows(test.padded(0), torch.from_numpy(episodes), first, model.past_len, horizon)
     generator = torch.Generator().manual_seed(seed)
-    drawn = [rollout(model, window.past, window.future.actions, generator=generator) for _ in range(samples)]
+    drawn = [
+        rollout(model, window.past, window.future.actions, generator=generator)
+        for _ in range(samples)
+    ]
     return SampledFutures(test.env, window, torch.stack(drawn)), episodes
 
 
@@ -94,15 +101,21 @@ def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
     """
     past, truth = seen.window.past.states[:, -2:], seen.window.future.states
     every = torch.cat([truth[None], seen.samples])  # (1 + S, N, T, dx)
-    states = torch.cat([past.expand(len(every), *past.shape), every], dim=2).numpy()  # two states before the first step
+    states = torch.cat(
+        [past.expand(len(every), *past.shape), every], dim=2
+    ).numpy()  # two states before the first step
     physics = EnvSpec.parse(seen.env).physics
     decay = slide_time(physics)
     slides = decay * (1 - math.exp(-DT / decay))
     position, velocity = states[..., 6:8], states[..., 8:10]
     reached = np.maximum(
-        np.abs(position[..., 1:, :]).max(-1), np.abs(position[..., :-1, :] + slides * velocity[..., :-1, :]).max(-1)
+        np.abs(position[..., 1:, :]).max(-1),
+        np.abs(position[..., :-1, :] + slides * velocity[..., :-1, :]).max(-1),
     )
-    near = {"object": closest_gap(states[..., 1:, :], seen.env) < NEAR, "wall": room(physics) - reached < NEAR}
+    near = {
+        "object": closest_gap(states[..., 1:, :], seen.env) < NEAR,
+        "wall": room(physics) - reached < NEAR,
+    }
     begins = {event: torch.from_numpy(at[..., 1:] & ~at[..., :-1]) for event, at in near.items()}
     return {event: (at[0], at[1:]) for event, at in begins.items()}
 
@@ -121,7 +134,9 @@ def recall(truth: Tensor, samples: Tensor, steps: range) -> dict[str, float]:
     return {
         "n": n,
         "recall": float(found.sum() / (n * len(samples))) if n else math.nan,
-        "majority": float(((_around(samples).float().mean(0) >= 0.5) & true).sum() / n) if n else math.nan,
+        "majority": float(((_around(samples).float().mean(0) >= 0.5) & true).sum() / n)
+        if n
+        else math.nan,
         "precision": float(right.sum() / predicted.sum()) if predicted.any() else math.nan,
     }
 
@@ -170,20 +185,26 @@ class Deflections:
             return self.travel, self.travel
         mean = self._mean.angle()
         around = torch.exp(1j * (self.off - mean)).angle()  # in (-pi, pi]
-        edges = torch.nanquantile(around, torch.tensor([(1 - level) / 2, (1 + level) / 2]), dim=0) + mean
+        edges = (
+            torch.nanquantile(around, torch.tensor([(1 - level) / 2, (1 + level) / 2]), dim=0)
+            + mean
+        )
         return torch.rad2deg(edges[0]), torch.rad2deg(edges[1])
 
     @property
     def _mean(self) -> Tensor:
-        return torch.polar(torch.ones_like(self.off), self.off.nan_to_num()).where(~self.off.isnan(), 0).sum(0) / (
-            ~self.off.isnan()
-        ).sum(0)
+        return torch.polar(torch.ones_like(self.off), self.off.nan_to_num()).where(
+            ~self.off.isnan(), 0
+        ).sum(0) / (~self.off.isnan()).sum(0)
 
 
 def deflections(seen: SampledFutures) -> Deflections:
     """From windows of ``windows_before_contact``: the way of the object until AHEAD steps after its first touch."""
     start, step = seen.window.past.states[:, -1, BLOCK], LEAD - 1 + AHEAD
-    ways = [states[..., [step, -1], BLOCK] - start[:, None] for states in (seen.window.future.states, seen.samples)]
+    ways = [
+        states[..., [step, -1], BLOCK] - start[:, None]
+        for states in (seen.window.future.states, seen.samples)
+    ]
     moves = [way[..., 0, :].norm(dim=-1) > 0.01 for way in ways]
     true, sampled = (torch.view_as_complex(way[..., 0, :].contiguous()) for way in ways)
     off = (sampled / true).angle().where(moves[1], torch.nan)

@@ -28,7 +28,10 @@ def autocorrelation(series: np.ndarray, lag: int) -> np.ndarray:
         raise ValueError(
             f"lag is {lag}, expected 1 to {series.shape[1] - 1}: the episodes have {series.shape[1]} steps"
         )
-    sides = (np.asarray(side, np.float64).reshape(-1, series.shape[2]) for side in (series[:, :-lag], series[:, lag:]))
+    sides = (
+        np.asarray(side, np.float64).reshape(-1, series.shape[2])
+        for side in (series[:, :-lag], series[:, lag:])
+    )
     before, after = (side - side.mean(0) for side in sides)
     return (before * after).mean(0) / np.sqrt(np.square(before).mean(0) * np.square(after).mean(0))
 

@@ -39,18 +39,27 @@ def rmse(difference: np.ndarray) -> float:
 
 
 def model_errors(
-    model: DynamicsModel, noisy: Trajectories, clean: Trajectories, *, samples: int = 32, progress: str = ""
+    model: DynamicsModel,
+    noisy: Trajectories,
+    clean: Trajectories,
+    *,
+    samples: int = 32,
+    progress: str = "",
 ) -> np.ndarray:
     """Errors (N, K, dx) of a model's mean to the clean states, over K = 10 steps after noisy pasts (``STARTS``).
 
     clean: the same episodes without noise. ValueError where their torques differ.
     """
     _require_same(noisy, clean)
-    mean = sample_states(model, noisy, samples=samples, horizon=10, starts=STARTS, progress=progress).mean(0)
+    mean = sample_states(
+        model, noisy, samples=samples, horizon=10, starts=STARTS, progress=progress
+    ).mean(0)
     return errors(mean.numpy(), _segments(clean.states[:, 1:]))
 
 
-def filter_errors(estimate: KalmanFilter, noisy: Trajectories, clean: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+def filter_errors(
+    estimate: KalmanFilter, noisy: Trajectories, clean: Trajectories
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the filter at ``STARTS``: of the present state (N, dx), and of the K = 10 predicted ones (N, K, dx)."""
     _require_same(noisy, clean)
     means = estimate.means(noisy)
@@ -61,7 +70,9 @@ def filter_errors(estimate: KalmanFilter, noisy: Trajectories, clean: Trajectori
     for step in range(10):
         x = estimate.predicted(x, actions[:, step])
         ahead.append(estimate.with_tip(x))
-    return errors(estimate.with_tip(now), truth), errors(np.stack(ahead, 1), _segments(clean.states[:, 1:]))
+    return errors(estimate.with_tip(now), truth), errors(
+        np.stack(ahead, 1), _segments(clean.states[:, 1:])
+    )
 
 
 def exponential_errors(keep: float, noisy: Trajectories, clean: Trajectories) -> np.ndarray:
@@ -77,7 +88,9 @@ def exponential_errors(keep: float, noisy: Trajectories, clean: Trajectories) ->
 
 def tuned_exponential(noisy: Trajectories, clean: Trajectories) -> float:
     """The best ``keep`` of eleven for validation episodes."""
-    return min(np.linspace(0, 0.9, 11), key=lambda keep: rmse(exponential_errors(keep, noisy, clean)))
+    return min(
+        np.linspace(0, 0.9, 11), key=lambda keep: rmse(exponential_errors(keep, noisy, clean))
+    )
 
 
 @dataclass(frozen=True)
@@ -99,7 +112,9 @@ class KalmanFilter:
         """The filter whose dynamics are fitted to clean episodes."""
         before = clean.states[:, :-1, :4].reshape(-1, 4)
         inputs = np.concatenate(
-            [before, clean.actions.reshape(len(before), -1), np.ones((len(before), 1))], 1, dtype=np.float64
+            [before, clean.actions.reshape(len(before), -1), np.ones((len(before), 1))],
+            1,
+            dtype=np.float64,
         )
         after = clean.states[:, 1:, :4].reshape(-1, 4).astype(np.float64)
         transition = np.linalg.lstsq(inputs, after, rcond=None)[0]
@@ -122,13 +137,18 @@ class KalmanFilter:
     def means(self, noisy: Trajectories) -> np.ndarray:
         """Estimates (N, T + 1, 4) of each present state, given all observations until then."""
         noise = np.diag(np.square(self.sigma * np.array(HALF_RANGE[:6])))
-        x, covariance = noisy.states[:, 0, :4].astype(np.float64), np.tile(noise[:4, :4], (len(noisy), 1, 1))
+        x, covariance = (
+            noisy.states[:, 0, :4].astype(np.float64),
+            np.tile(noise[:4, :4], (len(noisy), 1, 1)),
+        )
         found = [x]
         a = self.transition[:4].T
         for step in range(noisy.horizon):
             x = self.predicted(x, noisy.actions[:, step])
             covariance = a @ covariance @ a.T + self.weight * self.process
-            h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1)  # (N, 6, 4)
+            h = np.concatenate(
+                [np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1
+            )  # (N, 6, 4)
             seen = noisy.states[:, step + 1] - self.with_tip(x)
             gain = covariance @ h.mT @ np.linalg.inv(h @ covariance @ h.mT + noise)
             x = x + (gain @ seen[..., None])[..., 0]

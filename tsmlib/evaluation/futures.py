@@ -16,7 +16,11 @@ from tsmlib.models.tsm import TSM
 from tsmlib.trajectory import Segment, Trajectories, Window, windows
 
 Coded = TSM | RecurrentTSM  # one code for H steps: ``decode``, ``code_len``, ``latent_dim``
-STARTS = (10, 40, 70)  # steps at which the windows begin; with HORIZON they hold every step of an episode once
+STARTS = (
+    10,
+    40,
+    70,
+)  # steps at which the windows begin; with HORIZON they hold every step of an episode once
 HORIZON = 30
 
 
@@ -39,12 +43,22 @@ class SampledFutures:
 
 
 def sample_futures(
-    model: Coded, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0, progress: str = ""
+    model: Coded,
+    test: Trajectories,
+    *,
+    samples: int,
+    horizon: int = HORIZON,
+    seed: int = 0,
+    progress: str = "",
 ) -> SampledFutures:
     """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
     test.require_equal_lengths("a look at the futures of every episode")
-    drawn = sample_states(model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress)
+    drawn = sample_states(
+        model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress
+    )
     episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
     before = max(0, model.past_len - min(STARTS))  # a longer past begins before the episode
     begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len + before
-    return SampledFutures(test.env, windows(test.padded(before), episodes, begin, model.past_len, horizon), drawn)
+    return SampledFutures(
+        test.env, windows(test.padded(before), episodes, begin, model.past_len, horizon), drawn
+    )

@@ -22,7 +22,9 @@ from tsmlib.trajectory import Segment
 ROUNDING = 1e-6  # relative: a deviation below it is that of float32
 
 
-def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *, step: float = 1e-7) -> list[float]:
+def relative_errors(
+    value: Callable[[], Tensor], variables: Sequence[Tensor], *, step: float = 1e-7
+) -> list[float]:
     """Errors of derivatives by autograd against central differences, relative to the former, one number per variable.
 
     value: a function of no arguments that gives a number; variables: leaves of type float64 that it reads, as they are
@@ -34,8 +36,12 @@ def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *,
     draw, found = torch.Generator().manual_seed(5), []
     for i, (variable, gradient) in enumerate(zip(variables, gradients, strict=True)):
         if gradient is None or not gradient.norm() > 0:
-            raise ValueError(f"variable {i}, {tuple(variable.shape)}, has no gradient: the value does not depend on it")
-        direction = gradient / gradient.norm() + 0.1 * torch.randn(gradient.shape, generator=draw).to(gradient)
+            raise ValueError(
+                f"variable {i}, {tuple(variable.shape)}, has no gradient: the value does not depend on it"
+            )
+        direction = gradient / gradient.norm() + 0.1 * torch.randn(
+            gradient.shape, generator=draw
+        ).to(gradient)
         ends = []
         for sign in (1, -1):
             with torch.no_grad():
@@ -47,7 +53,9 @@ def relative_errors(value: Callable[[], Tensor], variables: Sequence[Tensor], *,
     return found
 
 
-def of_return(task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0) -> dict[str, float]:
+def of_return(
+    task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0
+) -> dict[str, float]:
     """The largest of ``relative_errors`` of the expected return of ``task`` through model, prior and reward, by what
     it is a function of: random codes, random torques, the weights of the model, the weights of the prior.
 
@@ -67,10 +75,15 @@ def of_return(task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0
             return expected_return(predict(actions), actions, task.reward).sum()
 
         word = "codes" if isinstance(space, LatentActions) else "torques"
-        return {part: max(relative_errors(value, some)) for part, some in {word: [point], **parts}.items()}
+        return {
+            part: max(relative_errors(value, some))
+            for part, some in {word: [point], **parts}.items()
+        }
 
     weights = {"model": _playing(net), "prior": _playing(prior)}
-    return errors(LatentActions(prior, task.horizon), weights) | errors(DirectActions(task.horizon), {})
+    return errors(LatentActions(prior, task.horizon), weights) | errors(
+        DirectActions(task.horizon), {}
+    )
 
 
 def _playing(net: nn.Module) -> list[Tensor]:
@@ -78,7 +91,9 @@ def _playing(net: nn.Module) -> list[Tensor]:
     return [p for key, p in net.named_parameters() if not key.startswith("encoder")]
 
 
-def signal(task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int = 32, seed: int = 0) -> Tensor:
+def signal(
+    task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int = 32, seed: int = 0
+) -> Tensor:
     """Signal to noise of the gradient that a planner follows: |mean| / standard deviation over ``samples`` samples of
     the model, for each variable; of these the geometric mean, at one random point of ``space`` per start: (B,).
 
@@ -90,7 +105,9 @@ def signal(task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int
         parameters = points.clone().requires_grad_()
         actions = space.decode(parameters)
         states = model_predictor(model, past, samples=1, seed=seed + 1 + i)(actions)
-        (slope,) = torch.autograd.grad(expected_return(states, actions, task.reward).sum(), parameters)
+        (slope,) = torch.autograd.grad(
+            expected_return(states, actions, task.reward).sum(), parameters
+        )
         gradients.append(slope[0].flatten(1).double())
     drawn = torch.stack(gradients)  # (S, B, variables)
     mean, deviation = drawn.mean(0).abs(), drawn.std(0)

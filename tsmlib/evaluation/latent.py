@@ -23,7 +23,9 @@ from tsmlib.rewards import BLOCK
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
 
-ACTIVE = 0.01  # variance of a unit's posterior mean above which it counts as active (Burda et al., 2016)
+ACTIVE = (
+    0.01  # variance of a unit's posterior mean above which it counts as active (Burda et al., 2016)
+)
 
 
 def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
@@ -44,7 +46,9 @@ def total_effects(model: Coded, window: Window, generator: torch.Generator) -> T
     the decoder does with a code however it was trained; the encoder has no part in it.
     """
     past, actions = window.past, window.future.actions[:, : model.code_len]
-    z, again = (standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2))
+    z, again = (
+        standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2)
+    )
     states = model.decode(past, actions, z)
     moved = []
     for i in range(model.latent_dim):
@@ -69,7 +73,9 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
     }
     errors = {}
     for word, z in codes.items():
-        difference = model.features.difference(model.decode(window.past, future.actions, z), future.states)
+        difference = model.features.difference(
+            model.decode(window.past, future.actions, z), future.states
+        )
         errors[word] = difference.square().mean((1, 2)).sqrt()
     return errors
 
@@ -92,7 +98,9 @@ def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
     return math.sqrt(by_step.mean()) if some.any() else math.nan
 
 
-def by_spread(variance: Tensor, squared: Tensor, *, groups: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def by_spread(
+    variance: Tensor, squared: Tensor, *, groups: int = 10
+) -> tuple[np.ndarray, np.ndarray]:
     """Spread and error (groups,) of windows sorted by their spread and cut into equal groups, smallest first."""
     spread, error = variance.mean(1), squared.mean(1)
     parts = [part for part in spread.argsort().tensor_split(groups) if len(part)]
@@ -117,7 +125,9 @@ def widest(seen: SampledFutures, model: Coded, codes: Tensor, steps: int) -> Win
     """The window (N = 1) in which the object's place after ``steps`` differs most under some codes (n, dz): by the
     largest distance from that under the first of them; of equal windows the first."""
     windows = [_alone(seen.window, i) for i in range(len(seen.window.past.states))]
-    ends = torch.stack([decode_codes(model, one, codes, steps)[:, -1, BLOCK] for one in windows])  # (N, n, 2)
+    ends = torch.stack(
+        [decode_codes(model, one, codes, steps)[:, -1, BLOCK] for one in windows]
+    )  # (N, n, 2)
     return windows[int((ends - ends[:, :1]).norm(dim=-1).amax(1).argmax())]
 
 

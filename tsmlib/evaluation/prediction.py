@@ -48,7 +48,12 @@ class Scores:
 
     def calibration(self, where: Tensor | None = None) -> Tensor:
         """Observed coverage (19,) of the central intervals of ``LEVELS``, over all steps or those of ``where``."""
-        return torch.stack([_mean(coverage(self.pit, float(level)).flatten(), _flat(where, self)) for level in LEVELS])
+        return torch.stack(
+            [
+                _mean(coverage(self.pit, float(level)).flatten(), _flat(where, self))
+                for level in LEVELS
+            ]
+        )
 
 
 @torch.no_grad()
@@ -74,20 +79,33 @@ def score(
     Raises ValueError where model, test and validation data are not of one kind, naming both sides.
     """
     _require_fit(features, test, validation, samples)
-    rollouts = partial(_rollouts, model, samples=samples, horizon=horizon, starts=starts, progress=progress)
+    rollouts = partial(
+        _rollouts, model, samples=samples, horizon=horizon, starts=starts, progress=progress
+    )
     low, high = physical_range(test, validation)
     held = list(rollouts(validation, key=(1, seed)))
     drawn = torch.cat([scored(features, states) for states, _ in held], 1)
-    fitted = fit(drawn, torch.cat([scored(features, truth) for _, truth in held]), copies=samples, seed=seed)
+    fitted = fit(
+        drawn, torch.cat([scored(features, truth) for _, truth in held]), copies=samples, seed=seed
+    )
     del held, drawn
     parts: list[tuple[dict[str, Tensor], Tensor, Tensor]] = []
     for states, truth in rollouts(test, key=(0, seed)):
-        outside = ((states >= low) & (states <= high)).logical_not().any(-1).any(-1).float().mean(0)  # NaN is outside
+        outside = (
+            ((states >= low) & (states <= high)).logical_not().any(-1).any(-1).float().mean(0)
+        )  # NaN is outside
         generator = generator_of(2, seed, len(parts))
-        values, pit = measure(scored(features, states), scored(features, truth), fitted, samples, generator)
+        values, pit = measure(
+            scored(features, states), scored(features, truth), fitted, samples, generator
+        )
         parts.append((values, pit, outside))
     values = {metric: torch.cat([part[0][metric] for part in parts]) for metric in parts[0][0]}
-    return Scores(values, torch.cat([part[1] for part in parts]), torch.cat([part[2] for part in parts]), fitted)
+    return Scores(
+        values,
+        torch.cat([part[1] for part in parts]),
+        torch.cat([part[2] for part in parts]),
+        fitted,
+    )
 
 
 @torch.no_grad()
@@ -99,15 +117,29 @@ def ways_apart(model: DynamicsModel, window: Window, *, seed: int = 0) -> dict[s
     """
     past, actions = window.past, window.future.actions
     step = model.begin(past)
-    both = {"steps": (predict_segment(model, past, actions), torch.stack([step(u) for u in actions.unbind(1)], dim=1))}
+    both = {
+        "steps": (
+            predict_segment(model, past, actions),
+            torch.stack([step(u) for u in actions.unbind(1)], dim=1),
+        )
+    }
     if isinstance(model, TSM):
-        z = torch.randn(len(actions), model.latent_dim, generator=torch.Generator().manual_seed(seed))
+        z = torch.randn(
+            len(actions), model.latent_dim, generator=torch.Generator().manual_seed(seed)
+        )
         states = model.decode(past, actions, z)
-        both["teacher forcing"] = states, model.decode_teacher_forced(Window(past, Segment(states, actions)), z)
-    return {way: float(((x - again) / (1 + x.abs())).abs().max()) for way, (x, again) in both.items()}
+        both["teacher forcing"] = (
+            states,
+            model.decode_teacher_forced(Window(past, Segment(states, actions)), z),
+        )
+    return {
+        way: float(((x - again) / (1 + x.abs())).abs().max()) for way, (x, again) in both.items()
+    }
 
 
-def _require_fit(features: Features, test: Trajectories, validation: Trajectories, samples: int) -> None:
+def _require_fit(
+    features: Features, test: Trajectories, validation: Trajectories, samples: int
+) -> None:
     """ValueError unless all of it belongs together."""
     if samples < 1:
         raise ValueError(f"samples is {samples}, expected at least 1")
@@ -140,7 +172,15 @@ def sample_states(
     Column k holds the prediction of x_{start + k + 1}. N counts as in ``score``.
     A deterministic model gives one sample, whatever S.
     """
-    blocks = _rollouts(model, data, samples=samples, horizon=horizon, starts=starts, key=(0, seed), progress=progress)
+    blocks = _rollouts(
+        model,
+        data,
+        samples=samples,
+        horizon=horizon,
+        starts=starts,
+        key=(0, seed),
+        progress=progress,
+    )
     return torch.cat([states for states, _ in blocks], dim=1)
 
 
@@ -188,22 +228,36 @@ def _rollouts(
             f"starts {list(starts)} and horizon {horizon} do not fit: at least one step is observed first, and "
             f"episodes have {data.horizon}"
         )
-    inside = torch.from_numpy(data.steps[:, None] >= np.array(starts) + horizon).flatten()  # (N len(starts),)
+    inside = torch.from_numpy(
+        data.steps[:, None] >= np.array(starts) + horizon
+    ).flatten()  # (N len(starts),)
     past_len = as_dynamics(model).past_len
     before = max(0, past_len - min(starts))  # steps that the model looks back beyond the first one
     whole, stochastic = data.padded(before), as_dynamics(model).stochastic
-    past = Segment(*(torch.cat([part[:, before + s - past_len : before + s] for s in starts], 1) for part in whole))
+    past = Segment(
+        *(
+            torch.cat([part[:, before + s - past_len : before + s] for s in starts], 1)
+            for part in whole
+        )
+    )
     past = Segment(*(part.reshape(-1, past_len, part.shape[-1])[inside] for part in past))
-    actions, truth = (cut(part[:, before:], starts, horizon)[inside] for part in (whole.actions, whole.states))
+    actions, truth = (
+        cut(part[:, before:], starts, horizon)[inside] for part in (whole.actions, whole.states)
+    )
     rows = torch.arange(len(truth))
     if not stochastic:
-        point = torch.cat([rollout(model, Segment(*(p[b] for p in past)), actions[b]) for b in rows.split(ROWS)])
+        point = torch.cat(
+            [rollout(model, Segment(*(p[b] for p in past)), actions[b]) for b in rows.split(ROWS)]
+        )
     blocks = rows.split(max(1, ROWS // samples))
     for index, block in enumerate(tqdm(blocks, desc=progress, disable=not progress)):
         if stochastic:
             many = block.repeat(samples)  # (S * n,)
             states = rollout(
-                model, Segment(*(part[many] for part in past)), actions[many], generator=generator_of(*key, index)
+                model,
+                Segment(*(part[many] for part in past)),
+                actions[many],
+                generator=generator_of(*key, index),
             )
             yield states.unflatten(0, (samples, len(block))), truth[block]
         else:

@@ -29,7 +29,9 @@ from tsmlib.sampling import generator_of
 
 SHIFTS = 4  # pairs (s, s + 1), ..., (s, s + 4) of samples estimate the spread E|X - X'|
 LEVELS = torch.arange(1, 20) / 20  # 0.05 .. 0.95, the nominal levels of a calibration curve
-NOISE = torch.cat([torch.zeros(1), torch.logspace(-3, 0.5, 22)])  # residual standard deviations to choose from
+NOISE = torch.cat(
+    [torch.zeros(1), torch.logspace(-3, 0.5, 22)]
+)  # residual standard deviations to choose from
 FLOORS = torch.logspace(-8, 4, 121)
 
 
@@ -48,9 +50,12 @@ def fit(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> Fitted
     """Everything that ``measure`` takes from validation data. copies: of a deterministic model's sample."""
     horizon = (truth - samples.mean(0)).square().mean(0)
     return Fitted(
-        floor=fit_floor(samples, truth), shared=fit_shared(samples, truth), horizon=horizon.clamp_min(FLOORS[0]),
-        own=fit_own(samples, truth), noise=fit_noise(samples, truth, copies=copies, seed=seed),
-    )  # fmt: skip
+        floor=fit_floor(samples, truth),
+        shared=fit_shared(samples, truth),
+        horizon=horizon.clamp_min(FLOORS[0]),
+        own=fit_own(samples, truth),
+        noise=fit_noise(samples, truth, copies=copies, seed=seed),
+    )
 
 
 def fit_floor(samples: Tensor, truth: Tensor) -> float:
@@ -80,8 +85,12 @@ def fit_own(samples: Tensor, truth: Tensor, *, iterations: int = 30) -> Tensor:
     for step, variance in enumerate(start):
         squares = (samples[:, :, step] - truth[:, step]).square()  # (S, N, D)
         for _ in range(iterations):
-            share = (squares @ (-0.5 / variance)).softmax(0)  # (S, N): whose sample the truth may have come from
-            variance = torch.einsum("sn,snd->d", share, squares).div(len(truth)).clamp_min(FLOORS[0])
+            share = (squares @ (-0.5 / variance)).softmax(
+                0
+            )  # (S, N): whose sample the truth may have come from
+            variance = (
+                torch.einsum("sn,snd->d", share, squares).div(len(truth)).clamp_min(FLOORS[0])
+            )
         variances.append(variance)
     return torch.stack(variances)
 
@@ -134,7 +143,9 @@ def gaussian(error: Tensor, variance: Tensor) -> Tensor:
 
 def spread(samples: Tensor) -> Tensor:
     """Variance (N, T, D) of the samples; that of a single one is zero."""
-    return (samples - samples.mean(0)).square_().sum(0) / max(1, len(samples) - 1)  # ten times as fast as var
+    return (samples - samples.mean(0)).square_().sum(0) / max(
+        1, len(samples) - 1
+    )  # ten times as fast as var
 
 
 def fit_loss(samples: int, dims: int) -> float:
@@ -168,7 +179,10 @@ def distances(samples: Tensor, truth: Tensor, *, shifts: int = SHIFTS) -> tuple[
     energy, crps = (part.mean(0) for part in _lengths(samples - truth))
     last = min(shifts, len(samples) - 1)
     for shift in range(1, last + 1):
-        parts = (_lengths(samples[shift:] - samples[:-shift]), _lengths(samples[:shift] - samples[-shift:]))
+        parts = (
+            _lengths(samples[shift:] - samples[:-shift]),
+            _lengths(samples[:shift] - samples[-shift:]),
+        )
         for total, lengths in zip((energy, crps), zip(*parts, strict=True), strict=True):
             total -= sum(part.sum(0) for part in lengths) / (2 * last * len(samples))
     return energy, crps

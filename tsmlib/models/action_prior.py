@@ -52,7 +52,9 @@ class ActionPrior(Configured):
         self.latent_dim = latent_dim
         self.beta = beta
         self.encoder = Encoder(action_dim, segment_len, latent_dim)
-        self.decoder = CausalDecoder(action_dim, action_dim, latent_dim, channels=channels, dilations=dilations)
+        self.decoder = CausalDecoder(
+            action_dim, action_dim, latent_dim, channels=channels, dilations=dilations
+        )
         self.register_buffer("std", torch.ones(action_dim))
 
     @classmethod
@@ -113,7 +115,9 @@ class ActionPrior(Configured):
         past, loss = window.past.actions, window.past.actions.new_zeros(())
         for future in whole_segments(window.future.actions, self.segment_len):
             mean, log_variance = self.encode(future)
-            decoded = self.decode(past[:, -self.past_len :], sample_posterior(mean, log_variance, generator))
+            decoded = self.decode(
+                past[:, -self.past_len :], sample_posterior(mean, log_variance, generator)
+            )
             error = ((decoded - future) / self.std).square().sum((1, 2))
             loss = loss + (error + self.beta * kl_from_standard_normal(mean, log_variance)).mean()
             past = decoded

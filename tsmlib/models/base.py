@@ -80,31 +80,47 @@ class Adapted:
 
     def __init__(self, model: SegmentModel) -> None:
         name = type(model).__name__
-        if missing := [word for word in ("segment_len", "predict_segment") if not hasattr(model, word)]:
-            raise TypeError(f"{name} cannot predict: it has no {' and no '.join(missing)}. {_LEAST}")
+        if missing := [
+            word for word in ("segment_len", "predict_segment") if not hasattr(model, word)
+        ]:
+            raise TypeError(
+                f"{name} cannot predict: it has no {' and no '.join(missing)}. {_LEAST}"
+            )
         if type(model.segment_len) is not int or model.segment_len < 1:
-            raise TypeError(f"segment_len of {name} is {model.segment_len!r:.80}; expected a positive int. {_LEAST}")
+            raise TypeError(
+                f"segment_len of {name} is {model.segment_len!r:.80}; expected a positive int. {_LEAST}"
+            )
         self.model, self.segment_len = model, model.segment_len
         self.samples = "generator" in inspect.signature(model.predict_segment).parameters
         self.past_len: int = getattr(model, "past_len", model.segment_len)
         self.stochastic: bool = getattr(model, "stochastic", self.samples)
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         if not self.samples:
             return self._checked(past, actions)
-        if generator is None or isinstance(generator, NoNoise):  # which tells a model with members whose mode is asked
+        if generator is None or isinstance(
+            generator, NoNoise
+        ):  # which tells a model with members whose mode is asked
             return self._checked(past, actions, generator=generator)
-        return torch.cat([  # one after the other, since parts may share a generator, which is set back between them
-            self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own)
-            for rows, own in by_generator(len(actions), generator)
-        ])  # fmt: skip
+        return torch.cat(
+            [  # one after the other, since parts may share a generator, which is set back between them
+                self._checked(Segment(*(x[rows] for x in past)), actions[rows], generator=own)
+                for rows, own in by_generator(len(actions), generator)
+            ]
+        )
 
     def _checked(self, past: Segment, actions: Tensor, **noise: Noise | None) -> Tensor:
         """The model's own prediction; TypeError where it is of another shape."""
         states = self.model.predict_segment(past, actions, **noise)
         expected = (*actions.shape[:2], past.states.shape[2])
         if not isinstance(states, Tensor) or states.shape != expected:
-            found = f"a tensor {tuple(states.shape)}" if isinstance(states, Tensor) else f"a {type(states).__name__}"
+            found = (
+                f"a tensor {tuple(states.shape)}"
+                if isinstance(states, Tensor)
+                else f"a {type(states).__name__}"
+            )
             raise TypeError(
                 f"predict_segment of {type(self.model).__name__} gave {found} for actions {tuple(actions.shape)}; "
                 f"expected states {expected}"
@@ -140,7 +156,9 @@ def as_dynamics(model: Model) -> DynamicsModel:
     return cast(DynamicsModel, model if hasattr(model, "begin") else Adapted(model))
 
 
-def predict_segment(model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+def predict_segment(
+    model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None
+) -> Tensor:
     """States (B, K, dx) under ``actions`` (B, K <= H, du). No generator: the mode; with one: a sample."""
     model = as_dynamics(model)
     if isinstance(model, SegmentModel):
@@ -149,7 +167,9 @@ def predict_segment(model: Model, past: Segment, actions: Tensor, *, generator: 
     return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
 
 
-def rollout(model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+def rollout(
+    model: Model, past: Segment, actions: Tensor, *, generator: Noise | None = None
+) -> Tensor:
     """Segments chained over a horizon: ``actions`` (B, T, du) -> states (B, T, dx), physical units (section 3).
 
     Each predicted segment becomes the past of the next one. The past must hold at least ``model.past_len`` steps. What
@@ -175,13 +195,18 @@ def stepper(model: Model, past: Segment, *, generator: Noise | None = None) -> S
     draws the noise of a segment at once, ``rollout`` for no more steps than there are, so that samples of it are the
     same where a rollout is of whole segments; after that, they are others of the same distribution.
     """
-    recent, adapted = [deque(part.unbind(1), maxlen=_past_len(model, past)) for part in past], as_dynamics(model)
+    recent, adapted = (
+        [deque(part.unbind(1), maxlen=_past_len(model, past)) for part in past],
+        as_dynamics(model),
+    )
     taken, running = 0, None
 
     def step(u: Tensor) -> Tensor:
         nonlocal running, taken
         if running is None or taken % model.segment_len == 0:
-            running = adapted.begin(Segment(*(torch.stack(tuple(part), dim=1) for part in recent)), generator=generator)
+            running = adapted.begin(
+                Segment(*(torch.stack(tuple(part), dim=1) for part in recent)), generator=generator
+            )
         x, taken = running(u), taken + 1
         for part, latest in zip(recent, (x, u), strict=True):
             part.append(latest)

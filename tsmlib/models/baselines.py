@@ -27,7 +27,13 @@ class OneStep(Featured, Configured):
     segment_len, past_len, stochastic = 1, 1, False
 
     def __init__(
-        self, state_dim: int, action_dim: int, *, angles: tuple[int, ...] = (), hidden: int = 200, layers: int = 3
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        angles: tuple[int, ...] = (),
+        hidden: int = 200,
+        layers: int = 3,
     ) -> None:
         super().__init__()
         self.features = Features(state_dim, tuple(angles))
@@ -94,13 +100,17 @@ class LSTM(Featured, Configured):
         """Warm the hidden state up on the past (B, L, .), then carry it. There is nothing to draw."""
         return self._recurrent().begin(past)
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
         return chunked(self._decode, *past, actions)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor) -> Tensor:
         recurrent, u = self._recurrent(), actions.transpose(0, 1)
-        states, _ = recurrent.run(states[:, -1], recurrent.read(Segment(states, before)), u, u[..., :0])
+        states, _ = recurrent.run(
+            states[:, -1], recurrent.read(Segment(states, before)), u, u[..., :0]
+        )
         return states.transpose(0, 1)  # (B, K, dx)
 
     def _recurrent(self) -> Recurrent:

@@ -76,7 +76,9 @@ class _Standardised(nn.Module):
         log_deviation = self.codes.log_deviation
         if rows.ndim == 2:
             return torch.cat([means / log_deviation.exp()[:, None], log_variances])
-        return torch.cat([(means - self.codes.mean) / log_deviation.exp(), log_variances - 2 * log_deviation])
+        return torch.cat(
+            [(means - self.codes.mean) / log_deviation.exp(), log_variances - 2 * log_deviation]
+        )
 
 
 @contextmanager

@@ -30,7 +30,9 @@ class Configured(nn.Module):
             given = signature.bind(self, *args, **options)
             given.apply_defaults()
             names = given.arguments.keys() - {"self", "seed"} - passed_on
-            self._config = {name: _json(value) for name, value in given.arguments.items() if name in names}
+            self._config = {
+                name: _json(value) for name, value in given.arguments.items() if name in names
+            }
 
         cls.__init__ = recording  # type: ignore[method-assign, assignment]
 

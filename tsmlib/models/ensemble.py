@@ -41,18 +41,28 @@ class Ensemble(Featured, Configured, EnsembleModel):
         super().__init__()
         self.gaussian, self.members, self.segment_len = gaussian, members, segment_len
         self.features = Features(state_dim, tuple(angles))
-        widths = [self.features.dim + action_dim, *[hidden] * layers, state_dim * (2 if gaussian else 1)]
+        widths = [
+            self.features.dim + action_dim,
+            *[hidden] * layers,
+            state_dim * (2 if gaussian else 1),
+        ]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for i, o in pairwise(widths):
             drawn = [nn.Linear(i, o) for _ in range(members)]
-            self.weights.append(nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn])))  # (M, i, o)
-            self.biases.append(nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn])))  # (M, 1, o)
+            self.weights.append(
+                nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn]))
+            )  # (M, i, o)
+            self.biases.append(
+                nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn]))
+            )  # (M, 1, o)
         self.output_layers = (f"weights.{layers}", f"biases.{layers}")
         if gaussian:  # limits of the stated log variance, learned as in PETS
             self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
             self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
 
-    def increments(self, x: Tensor, u: Tensor, which: slice = slice(None)) -> tuple[Tensor, Tensor | None]:
+    def increments(
+        self, x: Tensor, u: Tensor, which: slice = slice(None)
+    ) -> tuple[Tensor, Tensor | None]:
         """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``.
 
         which: the members asked, M of them.
@@ -74,7 +84,9 @@ class Ensemble(Featured, Configured, EnsembleModel):
         """
         return self._begin(past, self.segment_len, generator)
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, with noise drawn for as many steps as there are."""
         step = self._begin(past, actions.shape[1], generator)
         return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
@@ -83,7 +95,11 @@ class Ensemble(Featured, Configured, EnsembleModel):
         """Rows are sorted into one block per member, of equal size, so that a step is one batched product."""
         x, rows, taken, which = past.states[:, -1], len(past.states), 0, slice(None)
         if generator is None:
-            place, noise, block = torch.arange(rows, device=x.device).repeat(self.members), None, rows
+            place, noise, block = (
+                torch.arange(rows, device=x.device).repeat(self.members),
+                None,
+                rows,
+            )
         else:
             member = draw_members(self.members, rows, generator, x)
             noise = standard_normal((rows, steps if self.gaussian else 0, x.shape[1]), generator, x)
@@ -92,13 +108,17 @@ class Ensemble(Featured, Configured, EnsembleModel):
             counts = member.bincount()
             order, block = member.argsort(stable=True), int(counts.max())
             rank = torch.arange(rows, device=x.device) - (counts.cumsum(0) - counts)[member[order]]
-            slot = torch.empty_like(member).index_copy(0, order, member[order] * block + rank)  # of each row
+            slot = torch.empty_like(member).index_copy(
+                0, order, member[order] * block + rank
+            )  # of each row
             place = torch.zeros(len(counts) * block, dtype=torch.long, device=x.device)
             place = place.index_copy(0, slot[order], order)
 
         def step(u: Tensor) -> Tensor:
             nonlocal x, taken
-            rows_x, rows_u = (part.index_select(0, place).unflatten(0, (-1, block)) for part in (x, u))
+            rows_x, rows_u = (
+                part.index_select(0, place).unflatten(0, (-1, block)) for part in (x, u)
+            )
             mean, log_variance = self.increments(rows_x, rows_u, which)  # (M, block, dx)
             if noise is None:
                 change = mean.mean(0)
@@ -118,7 +138,9 @@ class Ensemble(Featured, Configured, EnsembleModel):
         The tuples of the batch are dealt out to the members at random.
         """
         future = window.future
-        tuples = [part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)]
+        tuples = [
+            part.flatten(0, 1) for part in (states_before(window), future.actions, future.states)
+        ]
         share = -(-len(tuples[0]) // self.members)
         index = random_indices(len(tuples[0]), (self.members, share), generator, tuples[0].device)
         x, u, after = (part[index] for part in tuples)
@@ -128,4 +150,7 @@ class Ensemble(Featured, Configured, EnsembleModel):
             return error.sum(-1).mean()
         log_variance = self.features.moving_part(log_variance)
         likelihood = 0.5 * (error * (-log_variance).exp() + log_variance).sum(-1).mean()
-        return likelihood + 0.01 * self.features.moving_part(self.log_variance_max - self.log_variance_min).sum()
+        return (
+            likelihood
+            + 0.01 * self.features.moving_part(self.log_variance_max - self.log_variance_min).sum()
+        )

@@ -31,10 +31,15 @@ class Features(nn.Module):
         self.others = [d for d in range(state_dim) if d not in angles]
         self.dim = state_dim + len(angles)
         self._settled: tuple[slice | Tensor, slice | Tensor] | None = None
-        self._parts: tuple[slice | Tensor | list[int], ...] = (_columns(self.angles), _columns(self.others))
+        self._parts: tuple[slice | Tensor | list[int], ...] = (
+            _columns(self.angles),
+            _columns(self.others),
+        )
         self.register_buffer("mean", torch.zeros(self.dim))
         self.register_buffer("std", torch.ones(self.dim))
-        self.register_buffer("step_std", torch.zeros(state_dim))  # of x_{t+1} - x_t, physical units; 0 until fitted
+        self.register_buffer(
+            "step_std", torch.zeros(state_dim)
+        )  # of x_{t+1} - x_t, physical units; 0 until fitted
 
     def fit(self, states: Tensor, lengths: Sequence[int] = ()) -> Features:
         """Take the statistics of training states (N, T + 1, dx); padding beyond ``lengths`` has no part."""
@@ -48,7 +53,9 @@ class Features(nn.Module):
         std = raw.std(0)
         self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
         step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
-        self.step_std.copy_(torch.where(step_std > 1e-3 * step_rms, step_std, step_rms))  # a clock's steps are alike
+        self.step_std.copy_(
+            torch.where(step_std > 1e-3 * step_rms, step_std, step_rms)
+        )  # a clock's steps are alike
         return self
 
     def require_states(self, data: Trajectories, expected: str) -> None:
@@ -84,7 +91,11 @@ class Features(nn.Module):
 
         def fixed(index: list[int]) -> slice | Tensor:
             at = _columns(index)
-            return at if isinstance(at, slice) else torch.tensor(at, dtype=torch.long).to(self.std.device)
+            return (
+                at
+                if isinstance(at, slice)
+                else torch.tensor(at, dtype=torch.long).to(self.std.device)
+            )
 
         moving, scored = (some.nonzero()[:, 0].tolist() for some in (self.moving, self.scored))
         self._settled = fixed(moving), fixed(scored)

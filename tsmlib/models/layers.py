@@ -28,7 +28,9 @@ def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     """``compute`` of so few rows at a time that what lies between its steps stays in a CPU's cache."""
     if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
         return compute(*rows)
-    return torch.cat([compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)])
+    return torch.cat(
+        [compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)]
+    )
 
 
 def whole_segments(future: Tensor, segment_len: int) -> tuple[Tensor, ...]:
@@ -47,10 +49,16 @@ class BatchedLinear(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__()
-        bound = inputs**-0.5 if inputs else 0.0  # of no input, a target of a task without targets, as torch has it
+        bound = (
+            inputs**-0.5 if inputs else 0.0
+        )  # of no input, a target of a task without targets, as torch has it
 
         def drawn(*shape: int) -> nn.Parameter:
-            return nn.Parameter(torch.stack([torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]))
+            return nn.Parameter(
+                torch.stack(
+                    [torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]
+                )
+            )
 
         self.weight = drawn(inputs, outputs)  # (M, in, out)
         self.bias = drawn(1, outputs)  # (M, 1, out)
@@ -68,7 +76,9 @@ class GatedLayer(nn.Module):
     (B, C) and one of M models (M, B, C). taps: W_f and W_g, 2 C -> 2 C; out: 1x1, residual and skip, C -> 2 C.
     """
 
-    def __init__(self, taps: nn.Module, out: nn.Module, *, residual: bool = True, skip: bool = True) -> None:
+    def __init__(
+        self, taps: nn.Module, out: nn.Module, *, residual: bool = True, skip: bool = True
+    ) -> None:
         super().__init__()
         self.residual, self.skip = residual, skip  # without them only for an ablation (section 3.1)
         self.taps, self.out = taps, out
@@ -77,13 +87,18 @@ class GatedLayer(nn.Module):
         """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
         filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
         residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
-        return now + residual if self.residual else residual, skip if self.skip else torch.zeros_like(skip)
+        return (
+            now + residual if self.residual else residual,
+            skip if self.skip else torch.zeros_like(skip),
+        )
 
 
 Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (..., C), oldest first
 
 
-def advance(inlet: nn.Module, layers: nn.ModuleList, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
+def advance(
+    inlet: nn.Module, layers: nn.ModuleList, inputs: Tensor, codes: Tensor, cache: Cache
+) -> Tensor:
     """One position: inputs (..., input_dim), V z of all layers -> sum of the skips (..., C). Moves ``cache`` on."""
     s, skips = inlet(inputs), []
     for layer, code, window in zip(layers, codes.chunk(len(layers), dim=-1), cache, strict=True):
@@ -127,12 +142,16 @@ class CausalDecoder(Configured):
         self.dilations = tuple(dilations)
         self.layers = nn.ModuleList(
             GatedLayer(
-                nn.Linear(2 * channels, 2 * channels), nn.Linear(channels, 2 * channels),
-                residual=not plain, skip=not plain or last,
+                nn.Linear(2 * channels, 2 * channels),
+                nn.Linear(channels, 2 * channels),
+                residual=not plain,
+                skip=not plain or last,
             )
             for last in [*[False] * (len(dilations) - 1), True]
-        )  # fmt: skip
-        self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)  # V_f, V_g of every layer
+        )
+        self.codes = nn.Linear(
+            latent_dim, 2 * channels * len(dilations), bias=False
+        )  # V_f, V_g of every layer
         self.state_skip = state_skip
         if state_skip:
             widths = [channels + input_dim, state_skip, state_skip]
@@ -140,7 +159,9 @@ class CausalDecoder(Configured):
             self.head = nn.Sequential(*inner, nn.Linear(state_skip, output_dim))
         else:
             head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
-            self.head = nn.Sequential(nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim))
+            self.head = nn.Sequential(
+                nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim)
+            )
 
     def forward(self, inputs: Tensor, z: Tensor, n: int | None = None) -> Tensor:
         """(B, P, input_dim), (B, dz) -> (B, n, output_dim): at the last ``n`` positions, or at all."""
@@ -186,10 +207,14 @@ class CausalDecoder(Configured):
         s = self.inlet(inputs[:, inputs.shape[1] - owed[0] :])  # (B, P, C)
         layer_inputs, skips = [s], []
         codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
-        for layer, dilation, code, now in zip(self.layers, self.dilations, codes, owed[1:], strict=True):
+        for layer, dilation, code, now in zip(
+            self.layers, self.dilations, codes, owed[1:], strict=True
+        ):
             if layer is self.layers[-1] and not n:
                 break
-            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[:, :now]  # zeros before the first position
+            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[
+                :, :now
+            ]  # zeros before the first position
             s, skip = layer(earlier, s[:, s.shape[1] - now :], code)
             layer_inputs.append(s)
             skips.append(skip[:, now - n :])
@@ -197,7 +222,9 @@ class CausalDecoder(Configured):
 
 
 @cache
-def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.device) -> tuple[Tensor, ...]:
+def _owed_to_last(
+    dilations: tuple[int, ...], n_positions: int, device: torch.device
+) -> tuple[Tensor, ...]:
     """For each layer, what the last position sees of its inputs: indices of those at t - d, then of those at t.
 
     Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed. Kept,
@@ -220,7 +247,9 @@ def _owed_to_last(dilations: tuple[int, ...], n_positions: int, device: torch.de
 class Encoder(nn.Module):
     """Q(Z | segment): 1-D convolutions over time with ReLU, flattened and projected to mean and log variance."""
 
-    def __init__(self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32) -> None:
+    def __init__(
+        self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32
+    ) -> None:
         super().__init__()
         first, second = (nn.Conv1d(size, channels, 3, padding=1) for size in (input_dim, channels))
         self.convolutions = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
@@ -228,7 +257,9 @@ class Encoder(nn.Module):
 
     def forward(self, segment: Tensor) -> tuple[Tensor, Tensor]:
         """(B, H, input_dim) -> mean and log variance of Z, (B, dz) each."""
-        mean, log_variance = self.project(self.convolutions(segment.transpose(1, 2)).flatten(1)).chunk(2, dim=-1)
+        mean, log_variance = self.project(
+            self.convolutions(segment.transpose(1, 2)).flatten(1)
+        ).chunk(2, dim=-1)
         return mean, log_variance
 
 

@@ -47,15 +47,21 @@ class Mixture(nn.Module, EnsembleModel):
         super().__init__()
         self.models = tuple(models)
         if not self.models:
-            raise ValueError("a mixture of no models; expected at least one, as in Mixture([one, another])")
+            raise ValueError(
+                "a mixture of no models; expected at least one, as in Mixture([one, another])"
+            )
         dynamics = [as_dynamics(model) for model in self.models]
         self.parts = nn.ModuleList([model for model in self.models if isinstance(model, nn.Module)])
         self.members, self.past_len = len(self.models), max(model.past_len for model in dynamics)
         self.stochastic = self.members > 1 or dynamics[0].stochastic
         states = {(len(features.step_std), tuple(features.angles)) for features in self._known()}
         if len(states) > 1:
-            found = " and ".join(f"{n} dimensions with angles {list(angles)}" for n, angles in sorted(states))
-            raise ValueError(f"models predict states of {found}; expected models of one environment")
+            found = " and ".join(
+                f"{n} dimensions with angles {list(angles)}" for n, angles in sorted(states)
+            )
+            raise ValueError(
+                f"models predict states of {found}; expected models of one environment"
+            )
 
     def _known(self) -> list[Features]:
         """The statistics of those models that have some."""
@@ -69,14 +75,20 @@ class Mixture(nn.Module, EnsembleModel):
         AttributeError without any: then scores need features of their own (``tsmlib.score``).
         """
         if not (known := self._known()):
-            raise AttributeError("no model of this mixture has features (statistics of its training data)")
+            raise AttributeError(
+                "no model of this mixture has features (statistics of its training data)"
+            )
         return known[0]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Read the past (B, L, .). No generator: the mode; with one: a sample."""
         shares = list(self._shares(past.states, generator))
         steps = [
-            stepper(self.models[share.member], Segment(*(part[share.rows] for part in past)), generator=share.noise)
+            stepper(
+                self.models[share.member],
+                Segment(*(part[share.rows] for part in past)),
+                generator=share.noise,
+            )
             for share in shares
         ]
 
@@ -86,25 +98,33 @@ class Mixture(nn.Module, EnsembleModel):
 
         return step
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """States (B, K, dx) under ``actions`` (B, K, du)."""
         shares = list(self._shares(past.states, generator))
         states = [
             rollout(
-                self.models[share.member], Segment(*(part[share.rows] for part in past)), actions[share.rows],
+                self.models[share.member],
+                Segment(*(part[share.rows] for part in past)),
+                actions[share.rows],
                 generator=share.noise,
             )
             for share in shares
-        ]  # fmt: skip
+        ]
         return _joined(states, shares, mode=generator is None)
 
     def loss(self, *_: object) -> NoReturn:
         """TypeError: what is trained is each model."""
-        raise TypeError("a Mixture is not trained; train or fine-tune each of its models, then make it of them")
+        raise TypeError(
+            "a Mixture is not trained; train or fine-tune each of its models, then make it of them"
+        )
 
     def config(self) -> NoReturn:
         """TypeError: what is stored is each model."""
-        raise TypeError("a Mixture is not stored; save each of its models, then make it of what load_model gives")
+        raise TypeError(
+            "a Mixture is not stored; save each of its models, then make it of what load_model gives"
+        )
 
     def _shares(self, like: Tensor, noise: Noise | None) -> Iterator[_Share]:
         """The rows of each member, for the mode all of them."""
@@ -112,9 +132,12 @@ class Mixture(nn.Module, EnsembleModel):
         if noise is None:
             yield from (_Share(rows, k, None) for k in range(self.members))
         elif isinstance(noise, SeparateNoise):
-            for part, own in zip(rows.split(len(rows) // len(noise.generators)), noise.generators, strict=True):
+            for part, own in zip(
+                rows.split(len(rows) // len(noise.generators)), noise.generators, strict=True
+            ):
                 yield from (
-                    _Share(part[share.rows], share.member, share.noise) for share in self._shares(like[part], own)
+                    _Share(part[share.rows], share.member, share.noise)
+                    for share in self._shares(like[part], own)
                 )
         else:
             member = draw_members(self.members, len(rows), noise, like[:, 0])
@@ -128,13 +151,21 @@ def _of_share(noise: Noise, chosen: Tensor) -> torch.Generator | SharedNoise:
     chosen: (B,), which rows they are. Rows that share noise are chosen together.
     """
     if not isinstance(noise, (torch.Generator, SharedNoise)):
-        raise TypeError(f"a Mixture draws by a generator or SharedNoise, not by {type(noise).__name__}")
+        raise TypeError(
+            f"a Mixture draws by a generator or SharedNoise, not by {type(noise).__name__}"
+        )
     source = noise.generator if isinstance(noise, SharedNoise) else noise
     if not isinstance(source, torch.Generator):
-        raise TypeError("found several generators in SharedNoise; a Mixture takes one: SharedNoise(generator, period)")
+        raise TypeError(
+            "found several generators in SharedNoise; a Mixture takes one: SharedNoise(generator, period)"
+        )
     seed = int(torch.randint(2**62, (), generator=source, device=source.device))
     own = torch.Generator(device=source.device).manual_seed(seed)
-    return SharedNoise(own, int(chosen[: noise.period].sum())) if isinstance(noise, SharedNoise) else own
+    return (
+        SharedNoise(own, int(chosen[: noise.period].sum()))
+        if isinstance(noise, SharedNoise)
+        else own
+    )
 
 
 def _joined(states: Sequence[Tensor], shares: Sequence[_Share], *, mode: bool) -> Tensor:

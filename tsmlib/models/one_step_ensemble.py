@@ -23,7 +23,9 @@ class OneStepEnsemble(EnsembleModel, ABC):
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
         """(M, R, dx), (M, R, du) -> mean and standard deviation, None for none, of the increments (M, R, dx)."""
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx).
 
         No generator: every step takes the mean of all members. With one: each row keeps a member of its own, and
@@ -35,7 +37,9 @@ class OneStepEnsemble(EnsembleModel, ABC):
         else:
             member = draw_members(self.members, n_rows, generator, start)
             groups = [(member == m).nonzero()[:, 0] for m in range(self.members)]
-            rows = pad_sequence(groups, batch_first=True, padding_value=-1)  # (M, R), -1 where a group is shorter
+            rows = pad_sequence(
+                groups, batch_first=True, padding_value=-1
+            )  # (M, R), -1 where a group is shorter
         real, rows = rows >= 0, rows.clamp(min=0)
         x, states = start[rows], []
         for u in actions.unbind(1):

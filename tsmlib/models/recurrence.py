@@ -64,16 +64,23 @@ class Recurrent:
 
     @classmethod
     def of(
-        cls, features: Features, cell: nn.Linear, out: nn.Linear, *, hidden: nn.Linear | None = None,
+        cls,
+        features: Features,
+        cell: nn.Linear,
+        out: nn.Linear,
+        *,
+        hidden: nn.Linear | None = None,
         codes: nn.Linear | None = None,
-    ) -> Recurrent:  # fmt: skip
+    ) -> Recurrent:
         """From layers: cell [s, u, h] -> q, codes z -> q, hidden [h, s, u] -> m, out [m] or [h] -> increments."""
         n = cell.out_features // 4
         seen, h = cell.weight.T.split([cell.in_features - n, n])
         w = torch.cat([*([codes.weight.T] if codes else []), h, seen, cell.bias[None]])
         v = torch.cat([out.weight.T, out.bias[None]])
         if hidden is None:
-            v = torch.cat([v.new_zeros(len(seen), v.shape[1]), v.roll(1, 0)])  # the head sees h alone
+            v = torch.cat(
+                [v.new_zeros(len(seen), v.shape[1]), v.roll(1, 0)]
+            )  # the head sees h alone
             return cls(features, w, None, cls._arranged(features, v))
         h, seen = hidden.weight.T.split([n, hidden.in_features - n])
         u = torch.cat([seen, hidden.bias[None], h])
@@ -95,7 +102,9 @@ class Recurrent:
     def read(self, past: Segment) -> Memory:
         """The memory after a past (B, L, .), all but its last state, with z = 0 and nothing before it."""
         s, u = self.features(past.states[:, :-1]), past.actions[:, 1:]
-        given = torch.cat([s, u, torch.ones_like(u[..., :1])], dim=-1).transpose(0, 1)  # (L - 1, B, .)
+        given = torch.cat([s, u, torch.ones_like(u[..., :1])], dim=-1).transpose(
+            0, 1
+        )  # (L - 1, B, .)
         n = self.cell.shape[1] // 4
         cell = self.cell[len(self.cell) - n - given.shape[2] :]
         h = c = past.states.new_zeros(len(past.states), n)
@@ -104,7 +113,17 @@ class Recurrent:
             return memory
         keep = torch.is_grad_enabled()
         _, h, c = Recurrence.apply(
-            keep, self._product_type(h), self.features, None, h, c, given[..., :0], given, cell, None, None
+            keep,
+            self._product_type(h),
+            self.features,
+            None,
+            h,
+            c,
+            given[..., :0],
+            given,
+            cell,
+            None,
+            None,
         )
         return h, c
 
@@ -120,7 +139,9 @@ class Recurrent:
 
         return step
 
-    def run(self, x: Tensor, memory: Memory, actions: Tensor, codes: Tensor) -> tuple[Tensor, Memory]:
+    def run(
+        self, x: Tensor, memory: Memory, actions: Tensor, codes: Tensor
+    ) -> tuple[Tensor, Memory]:
         """From states (B, dx) under actions (T, B, du) and codes (T, B, dz), the states (T, B, dx) and the memory."""
         order = self.features.angles + self.features.others
         given = torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
@@ -130,17 +151,33 @@ class Recurrent:
         else:
             keep = torch.is_grad_enabled()
             states, h, c = Recurrence.apply(
-                keep, self._product_type(x), self.features, x, *memory, codes, given, self.cell, self.hidden, self.out
+                keep,
+                self._product_type(x),
+                self.features,
+                x,
+                *memory,
+                codes,
+                given,
+                self.cell,
+                self.hidden,
+                self.out,
             )
         back = sorted(range(len(order)), key=order.__getitem__)
         return states if order == back else states[..., back], (h, c)
 
-    def _stepped(self, x: Tensor | None, memory: Memory, given: Tensor, codes: Tensor) -> tuple[Tensor, Memory]:
+    def _stepped(
+        self, x: Tensor | None, memory: Memory, given: Tensor, codes: Tensor
+    ) -> tuple[Tensor, Memory]:
         """As ``Recurrence``, by one operation after the other; what does not depend on the step before, all at once."""
         h, c = memory
         kind = self._product_type(h)
         with torch.autocast(h.device.type, enabled=False):
-            n, dz, known, seen = h.shape[1], codes.shape[2], given.shape[2], 0 if x is None else self.features.dim
+            n, dz, known, seen = (
+                h.shape[1],
+                codes.shape[2],
+                given.shape[2],
+                0 if x is None else self.features.dim,
+            )
             rows = self.cell[len(self.cell) - known - n - seen - dz :].to(kind)
             of_z, of_h, of_s, of_given = rows.split([dz, n, seen, known])
 
@@ -180,12 +217,28 @@ class Recurrence(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, keep: bool, kind: torch.dtype, features: Features, x: Tensor | None, h: Tensor, c: Tensor,
-        codes: Tensor, given: Tensor, cell: Tensor, hidden: Tensor | None, out: Tensor | None,
-    ) -> tuple[Tensor | None, Tensor, Tensor]:  # fmt: skip
+        ctx: Any,
+        keep: bool,
+        kind: torch.dtype,
+        features: Features,
+        x: Tensor | None,
+        h: Tensor,
+        c: Tensor,
+        codes: Tensor,
+        given: Tensor,
+        cell: Tensor,
+        hidden: Tensor | None,
+        out: Tensor | None,
+    ) -> tuple[Tensor | None, Tensor, Tensor]:
         (steps, batch, dz), n, after = codes.shape, h.shape[1], len(cell)
         kept, inner = steps if keep else min(1, steps), 0 if hidden is None else hidden.shape[1]
-        sizes = [dz, n, after - dz - n - given.shape[2], given.shape[2], n]  # [z, h_{t-1}, s, [u, 1], h_t]
+        sizes = [
+            dz,
+            n,
+            after - dz - n - given.shape[2],
+            given.shape[2],
+            n,
+        ]  # [z, h_{t-1}, s, [u, 1], h_t]
         # Zeros: products in bfloat16 read the part of a row that they are given up to the next multiple of 32 columns
         # (oneDNN on AMX), and what is no number there spreads.
         rows = h.new_zeros(kept, batch, sum(sizes), dtype=kind)
@@ -194,17 +247,31 @@ class Recurrence(torch.autograd.Function):
         tanhs, cells = h.new_empty(2, kept, batch, n).unbind(0)
         sigmoids, active = h.new_empty(kept, batch, inner), h.new_ones(kept, batch, inner + 1)
         same, piece = kind == h.dtype, torch.empty_like(h)
-        states, start, minus = None if x is None else x.new_empty(steps, *x.shape), (x, c), h.new_full((), -1.0)
+        states, start, minus = (
+            None if x is None else x.new_empty(steps, *x.shape),
+            (x, c),
+            h.new_full((), -1.0),
+        )
         _, row_h, row_s, _, row_out = _each(rows, sizes)
         qs, places, outputs = gates.unbind(0), sigmoids.unbind(0), active.unbind(0)
-        (ins, _), (_, tails), parts = _each(rows, [after, n]), _each(rows, [dz + n, -1]), _each(gates, [n] * 4)
+        (ins, _), (_, tails), parts = (
+            _each(rows, [after, n]),
+            _each(rows, [dz + n, -1]),
+            _each(gates, [n] * 4),
+        )
         for t in range(steps):
             if (k := t % kept) == 0:
-                rows[..., :dz], rows[..., after - given.shape[2] : after] = codes[t : t + kept], given[t : t + kept]
+                rows[..., :dz], rows[..., after - given.shape[2] : after] = (
+                    codes[t : t + kept],
+                    given[t : t + kept],
+                )
             row_h[k].copy_(h)
             if x is not None:
                 _see(features, x, row_s[k])
-            q, (forget, write, read, new) = _product(ins[k], cell, qs[k]), (part[k] for part in parts)
+            q, (forget, write, read, new) = (
+                _product(ins[k], cell, qs[k]),
+                (part[k] for part in parts),
+            )
             new.mul_(2)  # tanh(q) = 2 sigmoid(2 q) - 1, which processors compute faster
             q.sigmoid_()
             torch.add(minus, new, alpha=2, out=new)
@@ -222,20 +289,31 @@ class Recurrence(torch.autograd.Function):
                 s.mul_(torch.sigmoid(s, out=places[k]))
             x = torch.addmm(x, tail, out, out=states[t])
         if keep:
-            ctx.save_for_backward(*start, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active)
+            ctx.save_for_backward(
+                *start, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active
+            )
             ctx.features, ctx.sizes = features, sizes
         return states, h.clone(), c.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, dstates: Tensor, dh: Tensor, dc: Tensor) -> tuple[Tensor | None, ...]:
-        x, c, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active = ctx.saved_tensors
+        x, c, states, cell, hidden, out, rows, gates, tanhs, cells, sigmoids, active = (
+            ctx.saved_tensors
+        )
         (steps, batch, width), n = rows.shape, dh.shape[1]
         of_codes, of_given = ctx.needs_input_grad[6:8]
         dz, seen, after = ctx.sizes[0], sum(ctx.sizes[:2]), len(cell)
-        first, last = 0 if of_codes else dz, after if of_given else sum(ctx.sizes[:3])  # columns that have a gradient
+        first, last = (
+            0 if of_codes else dz,
+            after if of_given else sum(ctx.sizes[:3]),
+        )  # columns that have a gradient
         dh, dc, piece, back = dh.clone(), dc.clone(), torch.empty_like(dh), cell[first:last].T
-        drow, dq, ds = dh.new_zeros(batch, width), torch.empty_like(gates), torch.empty_like(sigmoids)
+        drow, dq, ds = (
+            dh.new_zeros(batch, width),
+            torch.empty_like(gates),
+            torch.empty_like(sigmoids),
+        )
         row_z, row_h, row_s, row_given, row_out = drow.split(ctx.sizes, dim=1)
         front, tail, products = drow[:, :seen], drow[:, seen:], drow[:, first:last]
         dcodes = dh.new_empty(steps, batch, dz) if of_codes else None
@@ -265,7 +343,9 @@ class Recurrence(torch.autograd.Function):
             dforget, dwrite, dread, dnew = (part[t] for part in dparts)
             dc += tanh_backward(torch.mul(dh, read, out=piece), tanh, grad_input=piece)
             sigmoid_backward(torch.mul(dh, tanh, out=piece), read, grad_input=dread)
-            sigmoid_backward(torch.mul(dc, cells[t - 1] if t else c, out=piece), forget, grad_input=dforget)
+            sigmoid_backward(
+                torch.mul(dc, cells[t - 1] if t else c, out=piece), forget, grad_input=dforget
+            )
             sigmoid_backward(torch.mul(dc, new, out=piece), write, grad_input=dwrite)
             tanh_backward(torch.mul(dc, write, out=piece), new, grad_input=dnew)
             dc *= forget
@@ -292,24 +372,35 @@ class Recurrence(torch.autograd.Function):
 
 def _product(a: Tensor, b: Tensor, out: Tensor) -> Tensor:
     """a b in the type of b, written into ``out``, which may be of another."""
-    return torch.mm(a, b, out=out) if out.dtype == b.dtype else out.copy_(torch.mm(a.to(b.dtype), b))
+    return (
+        torch.mm(a, b, out=out) if out.dtype == b.dtype else out.copy_(torch.mm(a.to(b.dtype), b))
+    )
 
 
 def _added(x: Tensor, a: Tensor, b: Tensor, out: Tensor) -> Tensor:
     """x + a b, the product in the type of b, written into ``out``."""
-    return torch.addmm(x, a, b, out=out) if x.dtype == b.dtype else torch.add(x, torch.mm(a.to(b.dtype), b), out=out)
+    return (
+        torch.addmm(x, a, b, out=out)
+        if x.dtype == b.dtype
+        else torch.add(x, torch.mm(a.to(b.dtype), b), out=out)
+    )
 
 
 def _gradient(rows: Tensor, d: Tensor) -> Tensor:
     """Of a weight: rows (k, T B) times gradients (T, B, m) in the type of the rows, as (k, m) in that of d."""
-    product = torch.mm(rows, d.flatten(0, 1).to(rows.dtype), out=rows.new_empty(len(rows), d.shape[2]))  # no autocast
+    product = torch.mm(
+        rows, d.flatten(0, 1).to(rows.dtype), out=rows.new_empty(len(rows), d.shape[2])
+    )  # no autocast
     return product.to(d.dtype)
 
 
 def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
     """Parts of the last dimension, each as one view per step; -1: what is left."""
     left = buffer.shape[-1] - sum(size for size in sizes if size > 0)
-    return [part.unbind(0) for part in buffer.split([left if size < 0 else size for size in sizes], dim=-1)]
+    return [
+        part.unbind(0)
+        for part in buffer.split([left if size < 0 else size for size in sizes], dim=-1)
+    ]
 
 
 def _features(features: Features, x: Tensor) -> Tensor:

@@ -37,13 +37,22 @@ class Decoder(nn.Module):
         self.head = nn.Sequential(nn.Linear(hidden + seen, hidden), nn.SiLU(), out)
         with torch.no_grad():
             self.cell.bias[:hidden] = 1.0  # forget gates start open
-            out.weight.mul_(0.1)  # and predictions near standing still, so that long windows stay finite
-            self.codes.weight.mul_(0.1)  # so that the mode, learned first, is not lost when samples are drawn
+            out.weight.mul_(
+                0.1
+            )  # and predictions near standing still, so that long windows stay finite
+            self.codes.weight.mul_(
+                0.1
+            )  # so that the mode, learned first, is not lost when samples are drawn
 
     def over(self, features: Features) -> Recurrent:
         """As it runs."""
         hidden, _, out = self.head
-        layers = dict(cell=self.cell, codes=self.codes, hidden=cast(nn.Linear, hidden), out=cast(nn.Linear, out))
+        layers = dict(
+            cell=self.cell,
+            codes=self.codes,
+            hidden=cast(nn.Linear, hidden),
+            out=cast(nn.Linear, out),
+        )
         return Recurrent.of(features, **layers)
 
 
@@ -79,7 +88,9 @@ class RecurrentTSM(Featured, Configured):
         seen = self.features.dim + action_dim
         self.decoder = Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim)
         self.output_layers = ("decoder.head",)
-        self.adam_only = ("decoder.codes",)  # not Muon: its columns are the codes' dimensions, of which some go unused
+        self.adam_only = (
+            "decoder.codes",
+        )  # not Muon: its columns are the codes' dimensions, of which some go unused
 
     @property
     def code_layers(self) -> tuple[nn.Linear, list[nn.Linear]]:
@@ -101,9 +112,16 @@ class RecurrentTSM(Featured, Configured):
 
         return step
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
-        return chunked(self._decode, *past, actions, self._codes(past.states[:, -1], actions.shape[1], generator))
+        return chunked(
+            self._decode,
+            *past,
+            actions,
+            self._codes(past.states[:, -1], actions.shape[1], generator),
+        )
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """States (B, K, dx) under ``actions`` (B, K, du) and codes: free-running, each from the predicted one before.
@@ -147,7 +165,9 @@ class RecurrentTSM(Featured, Configured):
                 total = total + self.mode_weight * distance(samples[-1], truth)
         return total / len(parts)
 
-    def _run(self, decoder: Recurrent, x: Tensor, memory: Memory, actions: Tensor, z: Tensor) -> Tensor:
+    def _run(
+        self, decoder: Recurrent, x: Tensor, memory: Memory, actions: Tensor, z: Tensor
+    ) -> Tensor:
         """(B, dx), (B, K, du), (B, n, dz) -> (B, K, dx)."""
         each = z.transpose(0, 1)[:, None].expand(-1, self.code_len, -1, -1).flatten(0, 1)
         held = F.pad(each, (0, 0, 0, 0, 0, actions.shape[1]))
@@ -158,7 +178,9 @@ class RecurrentTSM(Featured, Configured):
         """Codes (B, n, dz) of so many steps, drawn one by one as by ``begin``; no generator: none, the mode."""
         if generator is None:
             return x.new_zeros(len(x), 0, self.latent_dim)
-        return torch.stack([self._draw(x, generator) for _ in range(0, steps, self.code_len)], dim=1)
+        return torch.stack(
+            [self._draw(x, generator) for _ in range(0, steps, self.code_len)], dim=1
+        )
 
     def _draw(self, x: Tensor, generator: Noise) -> Tensor:
         return standard_normal((len(x), self.latent_dim), generator, x)

@@ -57,14 +57,22 @@ class TSM(Featured, Configured):
         **decoder: Unpack[DecoderOptions],
     ) -> None:
         super().__init__()
-        self.segment_len = self.past_len = self.code_len = segment_len  # a code is held for a segment
+        self.segment_len = self.past_len = self.code_len = (
+            segment_len  # a code is held for a segment
+        )
         self.latent_dim = latent_dim
         self.beta = beta
         self.features = Features(state_dim, tuple(angles))
         self.full_encoder = full_encoder
-        seen = (self.features.dim + action_dim, 2 * segment_len) if full_encoder else (self.features.dim, segment_len)
+        seen = (
+            (self.features.dim + action_dim, 2 * segment_len)
+            if full_encoder
+            else (self.features.dim, segment_len)
+        )
         self.encoder = Encoder(*seen, latent_dim)
-        self.decoder = CausalDecoder(self.features.dim + action_dim, state_dim, latent_dim, **decoder)
+        self.decoder = CausalDecoder(
+            self.features.dim + action_dim, state_dim, latent_dim, **decoder
+        )
 
     @property
     def code_layers(self) -> tuple[nn.Linear, list[nn.Linear]]:
@@ -78,13 +86,17 @@ class TSM(Featured, Configured):
 
     def config(self) -> dict[str, Json]:
         options = DecoderOptions.__annotations__
-        return super().config() | {name: value for name, value in self.decoder.config().items() if name in options}
+        return super().config() | {
+            name: value for name, value in self.decoder.config().items() if name in options
+        }
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Read the past (B, L, .), with one code for the segment. No generator: z = 0; with one: z ~ N(0, I)."""
         return self._begin(past, self._code(past, generator))
 
-    def predict_segment(self, past: Segment, actions: Tensor, *, generator: Noise | None = None) -> Tensor:
+    def predict_segment(
+        self, past: Segment, actions: Tensor, *, generator: Noise | None = None
+    ) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
         return self.decode(past, actions, self._code(past, generator))
 
@@ -100,7 +112,9 @@ class TSM(Featured, Configured):
         """P(X+ | X-, U-, U+, z) with the true states as inputs, all positions at once: (B, K, dx)."""
         (past, future), n = window, window.future.actions.shape[1]
         before = torch.cat([past.states, future.states[:, :-1]], dim=1)  # x_{t-L+1} .. x_{t+K-1}
-        actions = torch.cat([past.actions[:, 1:], future.actions], dim=1)  # the action taken in each of them
+        actions = torch.cat(
+            [past.actions[:, 1:], future.actions], dim=1
+        )  # the action taken in each of them
         increments = self.decoder(self.inputs(before, actions), z, n)
         return before[:, -n:] + self.features.step_std * increments
 
@@ -128,7 +142,9 @@ class TSM(Featured, Configured):
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
             z, kl = self._posterior_code(past, future, generator)
-            error = self.features.increments(self.decode_teacher_forced(Window(past, future), z), future.states)
+            error = self.features.increments(
+                self.decode_teacher_forced(Window(past, future), z), future.states
+            )
             loss = loss + (error.square().sum((1, 2)) + self.beta * kl).mean()
             past = past.then(future).last(self.past_len)
         return loss
@@ -150,18 +166,26 @@ class TSM(Featured, Configured):
         pieces = (part.split(self.segment_len, dim=-2) for part in (drawn, truth))
         return torch.stack([energy_score(*piece) for piece in zip(*pieces, strict=True)]).sum()
 
-    def _posterior_code(self, past: Segment, future: Segment, generator: Noise) -> tuple[Tensor, Tensor]:
+    def _posterior_code(
+        self, past: Segment, future: Segment, generator: Noise
+    ) -> tuple[Tensor, Tensor]:
         """z ~ Q(Z | X+), or Q(Z | X+, X-, U-, U+), and its KL divergence from N(0, I): (B, dz), (B,)."""
         if self.full_encoder:
             whole = past.last(self.segment_len).then(future)
             mean, log_variance = self.encoder(self.inputs(whole.states, whole.actions))
         else:
             mean, log_variance = self.encode(future.states)
-        return sample_posterior(mean, log_variance, generator), kl_from_standard_normal(mean, log_variance)
+        return sample_posterior(mean, log_variance, generator), kl_from_standard_normal(
+            mean, log_variance
+        )
 
     def _code(self, past: Segment, generator: Noise | None) -> Tensor:
         shape = (len(past.states), self.latent_dim)
-        return past.states.new_zeros(shape) if generator is None else standard_normal(shape, generator, past.states)
+        return (
+            past.states.new_zeros(shape)
+            if generator is None
+            else standard_normal(shape, generator, past.states)
+        )
 
     def _begin(self, past: Segment, z: Tensor) -> Step:
         x, codes = past.states[:, -1], self.decoder.codes(z)

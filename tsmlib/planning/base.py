@@ -69,6 +69,8 @@ class Plan:
 class Planner(Protocol):
     """``adam``, ``cem`` or ``mppi``, with its settings bound by ``functools.partial``."""
 
-    def __call__(self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /) -> Plan:
+    def __call__(
+        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /
+    ) -> Plan:
         """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero. Never worse than it."""
         ...

@@ -125,11 +125,15 @@ def without_unstable(task: Task, run: Callable[[Task, list[int]], T]) -> Stable[
             left = task.take(kept)
 
 
-def _run(task: Task, controller: Controller, horizon: int, past_len: int = 10) -> tuple[Trajectories, Simulation]:
+def _run(
+    task: Task, controller: Controller, horizon: int, past_len: int = 10
+) -> tuple[Trajectories, Simulation]:
     """An episode from each of the task's starts, and the simulation that it ran in."""
     seed, states = (task.seeds, None) if task.begins_by_seed else (SENSORS, task.start)
     with closing(make_simulation(task.env, len(task), returns=True)) as run:
-        return collect(run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states), run
+        return collect(
+            run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states
+        ), run
 
 
 def mpc(
@@ -161,8 +165,14 @@ def mpc(
     """
     if every < 1:
         raise ValueError(f"every is {every}, expected a positive number of steps")
-    began, horizon, past_len = time.perf_counter(), task.horizon, 1 if model is None else as_dynamics(model).past_len
-    planning = _Replanning(task, model, planner, every, judge, seed, space, start=len(task), plan=plan)
+    began, horizon, past_len = (
+        time.perf_counter(),
+        task.horizon,
+        1 if model is None else as_dynamics(model).past_len,
+    )
+    planning = _Replanning(
+        task, model, planner, every, judge, seed, space, start=len(task), plan=plan
+    )
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
         def controller(past: Segment) -> Tensor:
@@ -175,9 +185,13 @@ def mpc(
     states = torch.cat(planning.rollouts, 2)[:, :, : seen.horizon]
     after = states[:, :, -1:].expand(-1, -1, horizon - seen.horizon, -1)
     made = Plan(
-        actions=actions, parameters=actions, states=torch.cat([states, after], 2),
-        predicted_return=returns[0], curve=returns, seconds=time.perf_counter() - began,
-    )  # fmt: skip
+        actions=actions,
+        parameters=actions,
+        states=torch.cat([states, after], 2),
+        predicted_return=returns[0],
+        curve=returns,
+        seconds=time.perf_counter() - began,
+    )
     return _measured(task, run, seen, actions, made)
 
 
@@ -200,7 +214,9 @@ class _Replanning:
 
     def __call__(self, past: Segment) -> Tensor:
         """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
-        reward = _whole_episode(self.task.reward, Segment(*(part[:, part.shape[1] - self.done :] for part in past)))
+        reward = _whole_episode(
+            self.task.reward, Segment(*(part[:, part.shape[1] - self.done :] for part in past))
+        )
         predict, fresh = self._predictors(past)
         plan, self.plan = self.plan or self.planner(predict, reward, self.space, self.start), None
         judged = reevaluate(plan, fresh, reward)
@@ -217,11 +233,15 @@ class _Replanning:
         """What candidates are judged by, and what the return of the finished plan is predicted with."""
         if self.model is None:
             simulator = simulator_predictor(
-                self.task, past.states[:, -1].numpy(), done=past.actions[:, past.actions.shape[1] - self.done :]
+                self.task,
+                past.states[:, -1].numpy(),
+                done=past.actions[:, past.actions.shape[1] - self.done :],
             )
             return simulator, simulator
         recent, seed = past.last(as_dynamics(self.model).past_len), self.seed + 2 * self.done
-        return self.judge(self.model, recent, seed=seed), fresh_predictor(self.model, recent, seed=seed + 1)
+        return self.judge(self.model, recent, seed=seed), fresh_predictor(
+            self.model, recent, seed=seed + 1
+        )
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
@@ -233,8 +253,12 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
     def total(states: Tensor, actions: Tensor) -> Tensor:
         done = so_far.states.shape[1]
         rest = (states, actions)
-        before = (part.expand(*new.shape[:-2], -1, -1) for part, new in zip(so_far, rest, strict=True))
-        per_step = rewarded(reward, *(torch.cat(pair, -2) for pair in zip(before, rest, strict=True)))
+        before = (
+            part.expand(*new.shape[:-2], -1, -1) for part, new in zip(so_far, rest, strict=True)
+        )
+        per_step = rewarded(
+            reward, *(torch.cat(pair, -2) for pair in zip(before, rest, strict=True))
+        )
         executed = per_step[..., :done].sum(-1, keepdim=True)
         return torch.cat([per_step[..., done : done + 1] + executed, per_step[..., done + 1 :]], -1)
 
@@ -246,10 +270,14 @@ def _whole_actions(seen: Trajectories, horizon: int) -> Tensor:
     return F.pad(torch.from_numpy(seen.actions), (0, 0, 0, horizon - seen.horizon))
 
 
-def _measured(task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None) -> Trial:
+def _measured(
+    task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None
+) -> Trial:
     """The trial that just ended in ``run``, of which the sensors said ``seen``; its last state repeats up to T."""
     missing = actions.shape[1] - seen.horizon
-    states = observed = torch.from_numpy(np.pad(seen.states, ((0, 0), (0, missing), (0, 0)), mode="edge"))
+    states = observed = torch.from_numpy(
+        np.pad(seen.states, ((0, 0), (0, missing), (0, 0)), mode="edge")
+    )
     arms = run.env if isinstance(run, Arms) else None
     if isinstance(arms, ImperfectArms) and arms.sigma:
         states = torch.from_numpy(arms.truth).float()

@@ -52,14 +52,18 @@ def adam(
         if not iteration:
             _check_gradient(states, returns)
         search.update(parameters.detach(), returns.detach())
-        (gradient,) = torch.autograd.grad(-returns.sum(), parameters)  # of what is searched alone, not of weights
+        (gradient,) = torch.autograd.grad(
+            -returns.sum(), parameters
+        )  # of what is searched alone, not of weights
         sound = torch.isfinite(gradient)
         if not iteration and not sound.all():
             raise FloatingPointError(
                 "the gradient of the return is not finite at the start; look for a root or a norm at zero in the "
                 "reward, and add a tiny constant under it"
             )
-        parameters.grad = gradient.where(sound, 0)  # where the model diverges later on, a restart stays
+        parameters.grad = gradient.where(
+            sound, 0
+        )  # where the model diverges later on, a restart stays
         optimizer.step()
     search.update(parameters.detach(), search.returns_of(parameters))
     return search.plan()
@@ -68,7 +72,9 @@ def adam(
 def _check_gradient(states: Tensor, returns: Tensor) -> None:
     instead = "plan with cem or mppi instead, which need no gradient"
     if not states.requires_grad:
-        raise ValueError(f"what predicts the states is not differentiable, as the true simulator is not; {instead}")
+        raise ValueError(
+            f"what predicts the states is not differentiable, as the true simulator is not; {instead}"
+        )
     slope = None
     if returns.requires_grad:
         (slope,) = torch.autograd.grad(returns.sum(), states, retain_graph=True, allow_unused=True)
@@ -106,12 +112,18 @@ def cem(
             "2 <= elites <= candidates, at least one iteration and a share from 0 to 1"
         )
 
-    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    def refit(
+        parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor
+    ) -> tuple[Tensor, Tensor]:
         chosen = returns.topk(elites, dim=0).indices  # (elites, B)
         elite = parameters.gather(0, _like(chosen, parameters).expand(-1, -1, *space.shape))
-        return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(0)
+        return keep * mean + (1 - keep) * elite.mean(0), keep * deviation + (1 - keep) * elite.std(
+            0
+        )
 
-    search = _Search(predict, reward, space, start, judged=max(elites, round(screened * candidates)))
+    search = _Search(
+        predict, reward, space, start, judged=max(elites, round(screened * candidates))
+    )
     return _sample(search, refit, candidates, iterations, seed, progress)
 
 
@@ -140,22 +152,30 @@ def mppi(
             "expected 2 or more, 1 or more, above 0, and above 0 to 1"
         )
 
-    def refit(parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    def refit(
+        parameters: Tensor, returns: Tensor, mean: Tensor, deviation: Tensor
+    ) -> tuple[Tensor, Tensor]:
         spread = returns.std(0).clamp(min=1e-9)
         weights = ((returns - returns.max(0).values) / (temperature * spread)).softmax(0)
         return (_like(weights, parameters) * parameters).sum(0), shrink * deviation
 
-    return _sample(_Search(predict, reward, space, start), refit, candidates, iterations, seed, progress)
+    return _sample(
+        _Search(predict, reward, space, start), refit, candidates, iterations, seed, progress
+    )
 
 
 Refit = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 @torch.no_grad()
-def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, seed: int, progress: str) -> Plan:
+def _sample(
+    search: _Search, refit: Refit, candidates: int, iterations: int, seed: int, progress: str
+) -> Plan:
     """Sample candidates around a mean and move mean and deviation by ``refit``; the best ever seen, or mean, wins."""
     generator, space = torch.Generator().manual_seed(seed), search.space
-    search.update(search.start, search.returns_of(search.start), needed=False)  # candidates may do what it cannot
+    search.update(
+        search.start, search.returns_of(search.start), needed=False
+    )  # candidates may do what it cannot
     mean = search.parameters
     deviation = torch.full_like(mean, space.scale)
     for iteration in tqdm(range(iterations), desc=progress, disable=not progress):
@@ -166,8 +186,12 @@ def _sample(search: _Search, refit: Refit, candidates: int, iterations: int, see
         # To the refit a candidate on which the model diverges is as bad as the worst, one that was sorted out worse.
         finite = torch.isfinite(returns)
         worst = returns.where(finite, torch.inf).amin(0).nan_to_num(posinf=0.0)
-        mean, deviation = refit(parameters, returns.where(finite, worst).where(judged, -torch.inf), mean, deviation)
-        search.update(torch.cat([parameters, mean[None]]), torch.cat([returns, search.returns_of(mean[None])]))
+        mean, deviation = refit(
+            parameters, returns.where(finite, worst).where(judged, -torch.inf), mean, deviation
+        )
+        search.update(
+            torch.cat([parameters, mean[None]]), torch.cat([returns, search.returns_of(mean[None])])
+        )
     return search.plan()
 
 
@@ -180,11 +204,17 @@ def _like(values: Tensor, parameters: Tensor) -> Tensor:
 def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
     """The same plan with its predicted return and states from fresh samples, which had no part in the choice."""
     states = predict(plan.actions[None])
-    return replace(plan, states=states[:, 0], predicted_return=expected_return(states, plan.actions[None], reward)[0])
+    return replace(
+        plan,
+        states=states[:, 0],
+        predicted_return=expected_return(states, plan.actions[None], reward)[0],
+    )
 
 
 @torch.no_grad()
-def plan_at(plan: Plan, iteration: int, predict: Predictor, reward: Reward, space: SearchSpace) -> Plan:
+def plan_at(
+    plan: Plan, iteration: int, predict: Predictor, reward: Reward, space: SearchSpace
+) -> Plan:
     """The plan as it was after ``iteration`` steps of its planner (0: its start).
 
     Its predicted return and states come from ``predict``: as in ``reevaluate``, give it samples of its own.
@@ -194,9 +224,12 @@ def plan_at(plan: Plan, iteration: int, predict: Predictor, reward: Reward, spac
         raise ValueError(f"the planner {steps}; there is no plan as of iteration {iteration}")
     parameters = plan.trace[iteration]
     found = replace(
-        plan, parameters=parameters, actions=space.decode(parameters[None])[0],
-        curve=plan.curve[: iteration + 1], trace=plan.trace[: iteration + 1],
-    )  # fmt: skip
+        plan,
+        parameters=parameters,
+        actions=space.decode(parameters[None])[0],
+        curve=plan.curve[: iteration + 1],
+        trace=plan.trace[: iteration + 1],
+    )
     return reevaluate(found, predict, reward)
 
 
@@ -226,7 +259,9 @@ def sampled_starts(
     """
     if not 1 <= keep <= candidates:
         raise ValueError(f"keep is {keep} of {candidates} candidates, expected 1 to {candidates}")
-    parameters = space.scale * space.noise(candidates, n_targets, torch.Generator().manual_seed(seed))
+    parameters = space.scale * space.noise(
+        candidates, n_targets, torch.Generator().manual_seed(seed)
+    )
     returns = evaluate(predict, reward, space, parameters)
     best = returns.where(torch.isfinite(returns), -torch.inf).topk(keep, dim=0).indices
     return parameters.gather(0, _like(best, parameters).expand(-1, -1, *space.shape))
@@ -248,7 +283,9 @@ def evaluate(
 
 def _decoded(space: SearchSpace, parameters: Tensor, *, rows: int = BLOCK) -> Tensor:
     """The actions (C, B, T, du) of parameters (C, B, *shape), decoded up to ``rows`` at a time."""
-    return torch.cat([space.decode(chunk) for chunk in parameters.split(max(1, rows // parameters.shape[1]))])
+    return torch.cat(
+        [space.decode(chunk) for chunk in parameters.split(max(1, rows // parameters.shape[1]))]
+    )
 
 
 def _returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
@@ -256,7 +293,9 @@ def _returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int =
     return _sample_returns(predict, reward, actions, rows=rows).mean(0)
 
 
-def _sample_returns(predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK) -> Tensor:
+def _sample_returns(
+    predict: Predictor, reward: Reward, actions: Tensor, *, rows: int = BLOCK
+) -> Tensor:
     """The return of each sample (S, C, B); rows: as of ``evaluate``."""
     chunks = actions.split(max(1, rows // actions.shape[1]))
     return torch.cat([rewarded(reward, predict(chunk), chunk).sum(-1) for chunk in chunks], dim=1)
@@ -269,12 +308,20 @@ class _Search:
     """
 
     def __init__(
-        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, *, judged: int = 0
+        self,
+        predict: Predictor,
+        reward: Reward,
+        space: SearchSpace,
+        start: Tensor | int,
+        *,
+        judged: int = 0,
     ) -> None:
         if isinstance(start, int):
             start = torch.zeros(1, start, *space.shape)
         if start.shape[2:] != space.shape or start.ndim != 2 + len(space.shape):
-            raise ValueError(f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})")
+            raise ValueError(
+                f"start is {tuple(start.shape)}, expected (C, B, {', '.join(map(str, space.shape))})"
+            )
         self.predict, self.reward, self.space, self.start = predict, reward, space, start
         self.judged = judged
         self.began = time.perf_counter()
@@ -324,7 +371,11 @@ class _Search:
         actions = self.space.decode(self.parameters[None])
         states = self.predict(actions)
         return Plan(
-            actions=actions[0], parameters=self.parameters, states=states[:, 0],
-            predicted_return=expected_return(states, actions, self.reward)[0], curve=torch.stack(self.curve),
-            seconds=time.perf_counter() - self.began, trace=torch.stack(self.trace),
-        )  # fmt: skip
+            actions=actions[0],
+            parameters=self.parameters,
+            states=states[:, 0],
+            predicted_return=expected_return(states, actions, self.reward)[0],
+            curve=torch.stack(self.curve),
+            seconds=time.perf_counter() - self.began,
+            trace=torch.stack(self.trace),
+        )

@@ -22,7 +22,9 @@ from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise
 from tsmlib.trajectory import Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
-JUDGING = 8  # samples beside the mode, by which a candidate is judged (benchmarks/settings, section 3)
+JUDGING = (
+    8  # samples beside the mode, by which a candidate is judged (benchmarks/settings, section 3)
+)
 
 
 def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
@@ -34,7 +36,9 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     ValueError for samples of a deterministic model.
     """
     if samples < 0:
-        raise ValueError(f"samples is {samples}, expected 0 (the mode) or a positive number of samples")
+        raise ValueError(
+            f"samples is {samples}, expected 0 (the mode) or a positive number of samples"
+        )
     if samples and not as_dynamics(model).stochastic:
         raise ValueError(
             f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
@@ -42,13 +46,17 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
         )
     if not samples and isinstance(model, Mixture):
         judges = (model_predictor(each, past) for each in model.models)
-        every = ([judge] if not isinstance(judge, EnsemblePredictor) else judge.each for judge in judges)
+        every = (
+            [judge] if not isinstance(judge, EnsemblePredictor) else judge.each for judge in judges
+        )
         return EnsemblePredictor(tuple(chain.from_iterable(every)))
     if not samples and members(model) > 1:
         n = members(model)
         alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))
         together = partial(_predict, model, past, n, partial(NoNoise, len(past.states)))
-        return EnsemblePredictor(tuple(partial(_predict, model, past, 1, noise) for noise in alone), together)
+        return EnsemblePredictor(
+            tuple(partial(_predict, model, past, 1, noise) for noise in alone), together
+        )
 
     def common() -> Noise:
         return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
@@ -56,7 +64,9 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     return partial(_predict, model, past, max(1, samples), common if samples else None)
 
 
-def expected_predictor(model: Model, past: Segment, *, samples: int = JUDGING, seed: int = 0) -> Predictor:
+def expected_predictor(
+    model: Model, past: Segment, *, samples: int = JUDGING, seed: int = 0
+) -> Predictor:
     """Predict for an expectation over the model's futures (Eqs. 2 and 3): its mode and ``samples`` samples.
 
     An ``EnsemblePredictor``, whose first member is the mode, so that ``cem(screened=0.25)`` sorts the candidates by the
@@ -67,7 +77,9 @@ def expected_predictor(model: Model, past: Segment, *, samples: int = JUDGING, s
     that is none of ``samples * seed`` and the ``samples - 1`` after it.
     """
     if samples < 1:
-        raise ValueError(f"samples is {samples}, expected at least 1; the mode alone is model_predictor(model, past)")
+        raise ValueError(
+            f"samples is {samples}, expected at least 1; the mode alone is model_predictor(model, past)"
+        )
     mode = model_predictor(model, past)
     if not as_dynamics(model).stochastic or isinstance(mode, EnsemblePredictor):
         return mode
@@ -92,10 +104,16 @@ class EnsemblePredictor:
 
     def __call__(self, actions: Tensor) -> Tensor:
         """(C, B, T, du) -> (S, C, B, T, dx)."""
-        return self.together(actions) if self.together else torch.cat([predict(actions) for predict in self.each])
+        return (
+            self.together(actions)
+            if self.together
+            else torch.cat([predict(actions) for predict in self.each])
+        )
 
 
-def _predict(model: Model, past: Segment, draws: int, noise: Callable[[], Noise] | None, actions: Tensor) -> Tensor:
+def _predict(
+    model: Model, past: Segment, draws: int, noise: Callable[[], Noise] | None, actions: Tensor
+) -> Tensor:
     """``draws`` rollouts of every candidate, or the mode without noise: (C, B, T, du) -> (S, C, B, T, dx)."""
     n, n_targets, _, du = actions.shape
     if du != past.actions.shape[2]:
@@ -114,10 +132,14 @@ def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FR
 
     ``seed`` must not be the planner's. A deterministic model has no samples: its one rollout predicts.
     """
-    return model_predictor(model, past, samples=samples if as_dynamics(model).stochastic else 0, seed=seed)
+    return model_predictor(
+        model, past, samples=samples if as_dynamics(model).stochastic else 0, seed=seed
+    )
 
 
-def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, done: Tensor | None = None) -> Predictor:
+def simulator_predictor(
+    env: str | Task, start: np.ndarray | None = None, *, done: Tensor | None = None
+) -> Predictor:
     """Predict by executing in the true simulator, in bulk: S = 1. Not differentiable.
 
     env: a task, from its starts; ``done`` (B, t, du): after these actions. Of an episode that ended the last state
@@ -145,13 +167,17 @@ def simulator_predictor(env: str | Task, start: np.ndarray | None = None, *, don
     if start is None and isinstance(env, Task):
         start = env.start if done is None or not done.shape[1] else _reached(env, done)
     if start is None:
-        raise ValueError(f"candidates in {name} have no common start; give start (B, dx), or a task")
+        raise ValueError(
+            f"candidates in {name} have no common start; give start (B, dx), or a task"
+        )
     make = cache(partial(make_simulation, name))
 
     def predict(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
         begin = np.tile(start, (n, 1))
-        seen = collect(make(n * n_targets), open_loop(actions.flatten(0, 1)), horizon=horizon, states=begin)
+        seen = collect(
+            make(n * n_targets), open_loop(actions.flatten(0, 1)), horizon=horizon, states=begin
+        )
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
 
     return predict

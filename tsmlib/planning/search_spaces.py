@@ -23,12 +23,19 @@ class DirectActions:
         return parameters.tanh()
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
-        (horizon, action_dim), settle = self.shape, 20  # steps until the smooth noise has its full variance
-        torques = smooth_torques(n * n_targets, settle + horizon, generator=generator, action_dim=action_dim, rms=0.1)
+        (horizon, action_dim), settle = (
+            self.shape,
+            20,
+        )  # steps until the smooth noise has its full variance
+        torques = smooth_torques(
+            n * n_targets, settle + horizon, generator=generator, action_dim=action_dim, rms=0.1
+        )
         return torques[:, settle:].unflatten(0, (n, n_targets)) / 0.1
 
     def after(self, parameters: Tensor, steps: int) -> tuple[DirectActions, Tensor]:
-        return DirectActions(self.shape[0] - steps, self.shape[1], rms=self.scale), parameters[:, steps:]
+        return DirectActions(self.shape[0] - steps, self.shape[1], rms=self.scale), parameters[
+            :, steps:
+        ]
 
 
 class LatentActions:
@@ -40,7 +47,9 @@ class LatentActions:
 
     scale = 1.0
 
-    def __init__(self, prior: ActionPrior, horizon: int, *, past: Tensor | None = None, whole: bool = True) -> None:
+    def __init__(
+        self, prior: ActionPrior, horizon: int, *, past: Tensor | None = None, whole: bool = True
+    ) -> None:
         n_segments = -(-horizon // prior.segment_len)
         if horizon < 1 or (whole and n_segments * prior.segment_len != horizon):
             raise ValueError(
@@ -70,7 +79,9 @@ class LatentActions:
         rest = actions[:, steps : steps + space.shape[0] * prior.segment_len]
         missing = space.shape[0] * prior.segment_len - rest.shape[1]
         rest = torch.cat([rest, rest[:, -1:].expand(-1, missing, -1)], dim=1)
-        codes, _ = prior.encode(*on_device_of(prior, rest.reshape(-1, prior.segment_len, rest.shape[2])))
+        codes, _ = prior.encode(
+            *on_device_of(prior, rest.reshape(-1, prior.segment_len, rest.shape[2]))
+        )
         return space, codes.to(parameters.device).unflatten(0, (len(rest), -1))
 
     def _whole(self, parameters: Tensor) -> Tensor:
@@ -83,4 +94,6 @@ class LatentActions:
     def _before(self, n_targets: int) -> Tensor:
         if self.past is not None:
             return self.past
-        return torch.zeros(n_targets, self.prior.past_len, len(self.prior.std), dtype=self.prior.std.dtype)
+        return torch.zeros(
+            n_targets, self.prior.past_len, len(self.prior.std), dtype=self.prior.std.dtype
+        )

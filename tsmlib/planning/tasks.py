@@ -24,7 +24,9 @@ HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
 
 
-Success = Callable[[Tensor], Tensor]  # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
+Success = Callable[
+    [Tensor], Tensor
+]  # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,9 +59,17 @@ class Task:
 
     @classmethod
     def from_env(
-        cls, env: str, *, n: int, horizon: int, reward: Reward, seed: int = 1000, success: Success | None = None,
-        tolerance: float | None = None, name: str = "",
-    ) -> Task:  # fmt: skip
+        cls,
+        env: str,
+        *,
+        n: int,
+        horizon: int,
+        reward: Reward,
+        seed: int = 1000,
+        success: Success | None = None,
+        tolerance: float | None = None,
+        name: str = "",
+    ) -> Task:
         """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
         states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
 
@@ -75,13 +85,26 @@ class Task:
         seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:
             start = begun.reset(seed=seed).astype(np.float32)
-        seeds = () if isinstance(begun, Arms) else tuple(range(seed, seed + n))  # an arm begins in any state
+        seeds = (
+            () if isinstance(begun, Arms) else tuple(range(seed, seed + n))
+        )  # an arm begins in any state
         task = cls(
-            name or env, env, start, torch.zeros(n, 0), lambda _: reward, None, horizon, tolerance or 0.0, seeds,
-            success, begun.action_dim,
-        )  # fmt: skip
+            name or env,
+            env,
+            start,
+            torch.zeros(n, 0),
+            lambda _: reward,
+            None,
+            horizon,
+            tolerance or 0.0,
+            seeds,
+            success,
+            begun.action_dim,
+        )
         if success is not None and tolerance is None:
-            away, _ = task.judged(torch.from_numpy(start)[:, None].expand(-1, horizon + 1, -1))  # standing still
+            away, _ = task.judged(
+                torch.from_numpy(start)[:, None].expand(-1, horizon + 1, -1)
+            )  # standing still
             if not away.isnan().all():
                 raise ValueError(
                     f"success of task {task.name!r} is a distance, {float(away[0]):.3g} at the first start, and no "
@@ -94,7 +117,16 @@ class Task:
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
         """The paper's task of an environment: to push the object to the target, or to reach it where there is none."""
         if EnvSpec.parse(env).task == "push":
-            return cls("push", env, start, target, rewards.push, rewards.BLOCK, HORIZON["push"], TOLERANCE["push"])
+            return cls(
+                "push",
+                env,
+                start,
+                target,
+                rewards.push,
+                rewards.BLOCK,
+                HORIZON["push"],
+                TOLERANCE["push"],
+            )
         return cls("reach", env, start, target, rewards.reach, rewards.TIP)
 
     def __post_init__(self) -> None:
@@ -107,15 +139,21 @@ class Task:
                 f"less, or register a longer one: gymnasium.register(id, ..., max_episode_steps={self.horizon})"
             )
         if self.seeds and len(self.seeds) != len(self):
-            raise ValueError(f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each")
+            raise ValueError(
+                f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each"
+            )
         if self.position is not None:
             require_reachable(self.env, self.start, self.target, self.position)
         # Standing still, in the shape in which planners ask.
         states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
-        found = rewarded(self.reward, states, states.new_zeros(1, len(self), self.horizon, self.action_dim))
+        found = rewarded(
+            self.reward, states, states.new_zeros(1, len(self), self.horizon, self.action_dim)
+        )
         if not torch.isfinite(found).all():
             body = "a robot" if self.position is None else "an arm"
-            raise ValueError(f"the reward of task {self.name!r} is infinite for {body} that stands still")
+            raise ValueError(
+                f"the reward of task {self.name!r} is infinite for {body} that stands still"
+            )
 
     def __len__(self) -> int:
         return len(self.start)
@@ -158,7 +196,11 @@ class Task:
             return nothing, None
         found = self.success(states)
         if not isinstance(found, Tensor) or found.shape != (len(self),):
-            what = f"a tensor {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+            what = (
+                f"a tensor {tuple(found.shape)}"
+                if isinstance(found, Tensor)
+                else f"a {type(found).__name__}"
+            )
             raise ValueError(
                 f"success of task {self.name!r} is {what} for states {tuple(states.shape)}; expected ({len(self)},), "
                 "bool or a distance"
@@ -173,10 +215,14 @@ class Task:
         """The first instances, or those of some indices; ValueError where there is none, or not as many."""
         chosen = int(chosen) if isinstance(chosen, np.integer) else chosen
         if isinstance(chosen, int) and not 1 <= chosen <= len(self):
-            raise ValueError(f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}")
+            raise ValueError(
+                f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}"
+            )
         each = list(range(chosen)) if isinstance(chosen, int) else list(chosen)
         if not each or not all(0 <= i < len(self) for i in each):
-            raise ValueError(f"targets {each} of {self.env} asked for; choose some from 0 to {len(self) - 1}")
+            raise ValueError(
+                f"targets {each} of {self.env} asked for; choose some from 0 to {len(self) - 1}"
+            )
         seeds = tuple(self.seeds[i] for i in each) if self.seeds else ()
         return replace(self, start=self.start[each], target=self.target[each], seeds=seeds)
 
@@ -191,7 +237,9 @@ def require_reachable(env: str, start: np.ndarray, target: Tensor, position: sli
     if position.stop > start.shape[1]:
         raise ValueError(f"there is nothing to push in {env}; its task is 'reach'")
     if target.shape != (len(start), 2):
-        raise ValueError(f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start")
+        raise ValueError(
+            f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start"
+        )
     physics = EnvSpec.parse(env).physics
     if position == rewards.TIP:
         reach, inner, away = sum(physics.link_lengths), hole(physics), target.norm(dim=1)

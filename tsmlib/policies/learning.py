@@ -34,7 +34,9 @@ from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.trajectory import Segment, initial_past
 
-Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]  # n -> starting states (n, dx), targets (n, dg)
+Draw = Callable[
+    [int, torch.Generator], tuple[Tensor, Tensor]
+]  # n -> starting states (n, dx), targets (n, dg)
 Measure = Callable[[Policy], Mapping[str, Tensor]]  # named numbers, one per copy (M,)
 NOT_FINITE = "the gradient of the return is not finite"
 
@@ -84,7 +86,9 @@ class LearningOptions:
     lr: float = 1e-3
     lr_decay: float = 0.9  # per 100 iterations
     lr_final: float = 1e-4
-    clip: float = 0.0  # norm that each copy's gradient is shortened to; 0: never, the paper states none
+    clip: float = (
+        0.0  # norm that each copy's gradient is shortened to; 0: never, the paper states none
+    )
     record_every: int = 100  # iterations; a checkpoint is written as often
 
     def __post_init__(self) -> None:
@@ -139,9 +143,16 @@ def learn_policy(
     in ``policy``, where states or gradients are not finite; StoreError for a checkpoint of another run or in use.
     """
     learner = Learner.of(
-        policy, model, reward, draw, options or LearningOptions(), seed,
-        measure=measure, callback=callback, checkpoint=checkpoint,
-    )  # fmt: skip
+        policy,
+        model,
+        reward,
+        draw,
+        options or LearningOptions(),
+        seed,
+        measure=measure,
+        callback=callback,
+        checkpoint=checkpoint,
+    )
     o, state, trained = learner.options, learner.state, learner.trained
     optimizer = state.optimizers["adam"]
     purpose = f"learning a policy, seed {seed}"
@@ -152,10 +163,14 @@ def learn_policy(
             began = time.process_time()
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate(iteration, o.lr, o.lr_decay, o.lr_final)
-            value = discounted(learner.rewards(iteration, o.episodes), o.gamma).mean(1)  # Eq. 4, (M,)
+            value = discounted(learner.rewards(iteration, o.episodes), o.gamma).mean(
+                1
+            )  # Eq. 4, (M,)
             optimizer.zero_grad(set_to_none=True)
             (-value.sum()).backward()
-            if not torch.isfinite(clip_gradients([p.grad for p in trained if p.grad is not None], o.clip)).all():
+            if not torch.isfinite(
+                clip_gradients([p.grad for p in trained if p.grad is not None], o.clip)
+            ).all():
                 raise state.stopped(NOT_FINITE, iteration)
             optimizer.step()
             state.step, state.seconds = iteration + 1, state.seconds + time.process_time() - began
@@ -183,20 +198,36 @@ class Learner:
 
     @classmethod
     def of(
-        cls, policy: Policy, model: Model, reward: Callable[[Tensor], Reward], draw: Draw, options: LearningOptions,
-        seed: int, *, measure: Measure | None = None, callback: Callback | None = None, checkpoint: Path | None = None,
-    ) -> Self:  # fmt: skip
+        cls,
+        policy: Policy,
+        model: Model,
+        reward: Callable[[Tensor], Reward],
+        draw: Draw,
+        options: LearningOptions,
+        seed: int,
+        *,
+        measure: Measure | None = None,
+        callback: Callback | None = None,
+        checkpoint: Path | None = None,
+    ) -> Self:
         """As learning starts: with statistics, and a new optimiser. Called by the two public functions, whose callers
         are shown a warning of ``_take_statistics``."""
         _take_statistics(policy, model)
-        optimizer = torch.optim.Adam([p for p in policy.parameters() if p.requires_grad], lr=options.lr)
+        optimizer = torch.optim.Adam(
+            [p for p in policy.parameters() if p.requires_grad], lr=options.lr
+        )
         identity = asdict(options) | dict(
-            policy=type(policy).__name__, copies=policy.copies, model=_digest(model),
-            reward=getattr(reward, "__name__", "reward"), seed=seed,
-        )  # fmt: skip
+            policy=type(policy).__name__,
+            copies=policy.copies,
+            model=_digest(model),
+            reward=getattr(reward, "__name__", "reward"),
+            seed=seed,
+        )
         if checkpoint is not None:
             identity["drawn"] = summary(draw)
-        state = TrainingState(policy, {"adam": optimizer}, LearningCurve(), options.iterations, identity, checkpoint)
+        state = TrainingState(
+            policy, {"adam": optimizer}, LearningCurve(), options.iterations, identity, checkpoint
+        )
         return cls(policy, model, reward, draw, options, seed, state, measure, callback)
 
     @property
@@ -208,16 +239,23 @@ class Learner:
         """Starts and targets (M n, .) of n episodes of each copy, and what draws their noise."""
         seeds = [(self.seed + m) * 1_000_003 + iteration for m in range(self.policy.copies)]
         generators = tuple(torch.Generator().manual_seed(seed) for seed in seeds)
-        start, target = (torch.cat(part) for part in zip(*(self.draw(n, g) for g in generators), strict=True))
+        start, target = (
+            torch.cat(part) for part in zip(*(self.draw(n, g) for g in generators), strict=True)
+        )
         return start, target, SeparateNoise(generators)
 
     def rewards(self, iteration: int, n: int) -> Tensor:
         """Rewards of each step of n episodes of each copy: (M, n, T)."""
         start, target, noise = self.episodes(iteration, n)
         seen = imagine(
-            self.policy, self.model, start, target, horizon=self.options.horizon, noise=self.options.noise,
+            self.policy,
+            self.model,
+            start,
+            target,
+            horizon=self.options.horizon,
+            noise=self.options.noise,
             generator=noise,
-        )  # fmt: skip
+        )
         return self.checked_rewards(target, seen, iteration)
 
     def checked_rewards(self, target: Tensor, seen: Segment, iteration: int) -> Tensor:
@@ -239,7 +277,9 @@ class Learner:
     def record(self) -> None:
         """A point of the curve; the present weights are those to go back to."""
         with torch.no_grad():
-            predicted = self.rewards(self.options.iterations, 50).sum(-1).mean(1)  # the same episodes every time
+            predicted = (
+                self.rewards(self.options.iterations, 50).sum(-1).mean(1)
+            )  # the same episodes every time
         curve = self.state.curve
         curve.iteration.append(self.state.step)
         curve.seconds.append(self.state.seconds)
@@ -248,17 +288,24 @@ class Learner:
             curve.measured.setdefault(name, []).append(values.tolist())
         self.state.keep(-predicted.mean().item())
         if self.callback is not None:
-            newest = {"predicted": curve.predicted[-1]} | {name: rows[-1] for name, rows in curve.measured.items()}
+            newest = {"predicted": curve.predicted[-1]} | {
+                name: rows[-1] for name, rows in curve.measured.items()
+            }
             means = {name: sum(values) / len(values) for name, values in newest.items()}
             self.callback(Progress(self.state.step, self.state.seconds, means))
 
 
 def discounted(rewards: Tensor, gamma: float) -> Tensor:
     """sum_t gamma^t r_t over the last dimension, the first step counted in full (Eq. 4 up to a factor gamma)."""
-    return (rewards * gamma ** torch.arange(rewards.shape[-1], dtype=rewards.dtype, device=rewards.device)).sum(-1)
+    return (
+        rewards
+        * gamma ** torch.arange(rewards.shape[-1], dtype=rewards.dtype, device=rewards.device)
+    ).sum(-1)
 
 
-def learning_rate(iteration: int, lr: float = 1e-3, decay: float = 0.9, final: float = 1e-4) -> float:
+def learning_rate(
+    iteration: int, lr: float = 1e-3, decay: float = 0.9, final: float = 1e-4
+) -> float:
     """``lr``, decayed every 100 iterations until it is ``final`` (A.3)."""
     return max(final, lr * decay ** (iteration // 100))
 
@@ -283,7 +330,10 @@ def summary(draw: Draw, n: int = 1000) -> dict[str, list[list[float]]]:
     """
     drawn = zip(("starts", "targets"), draw(n, torch.Generator().manual_seed(0)), strict=True)
     return {
-        name: [[round(x, 4) for x in part.tolist()] for part in (values.double().mean(0), values.double().std(0))]
+        name: [
+            [round(x, 4) for x in part.tolist()]
+            for part in (values.double().mean(0), values.double().std(0))
+        ]
         for name, values in drawn
     }
 
@@ -314,13 +364,19 @@ def _take_statistics(policy: Policy, model: Model) -> None:
 
 def _digest(model: Model) -> str:
     """Which model a policy was learned in, for its checkpoint."""
-    return artifacts.digest(model.state_dict()) if isinstance(model, nn.Module) else type(model).__name__
+    return (
+        artifacts.digest(model.state_dict())
+        if isinstance(model, nn.Module)
+        else type(model).__name__
+    )
 
 
 @contextmanager
 def _frozen(model: Model) -> Iterator[None]:
     """No gradients for the model's own weights."""
-    weights = [p for p in model.parameters() if p.requires_grad] if isinstance(model, nn.Module) else []
+    weights = (
+        [p for p in model.parameters() if p.requires_grad] if isinstance(model, nn.Module) else []
+    )
     for p in weights:
         p.requires_grad_(False)
     try:

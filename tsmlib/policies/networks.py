@@ -38,12 +38,23 @@ class Policy(Configured):
     output_dim: int
 
     def __init__(
-        self, state_dim: int, target_dim: int, *, angles: tuple[int, ...], target_std: float, copies: int
+        self,
+        state_dim: int,
+        target_dim: int,
+        *,
+        angles: tuple[int, ...],
+        target_std: float,
+        copies: int,
     ) -> None:
         if copies < 1:
             raise ValueError(f"copies is {copies}, expected at least 1")
         super().__init__()
-        self.state_dim, self.target_dim, self.target_std, self.copies = state_dim, target_dim, target_std, copies
+        self.state_dim, self.target_dim, self.target_std, self.copies = (
+            state_dim,
+            target_dim,
+            target_std,
+            copies,
+        )
         self.features = Features(state_dim, tuple(angles))
 
     def begin(self, past: Segment, target: Tensor) -> Act:
@@ -52,16 +63,27 @@ class Policy(Configured):
 
     def goals(self, past: Segment, target: Tensor) -> Tensor:
         """Targets (R, dg) as the network sees them, (M, B, dg). ValueError where they or ``past`` do not fit."""
-        (rows, steps, dim), name, needed, dg = past.states.shape, type(self).__name__, self.past_len, self.target_dim
+        (rows, steps, dim), name, needed, dg = (
+            past.states.shape,
+            type(self).__name__,
+            self.past_len,
+            self.target_dim,
+        )
         if dim != self.state_dim:
             wrong = f"states have {dim} dimensions, this {name} was made for {self.state_dim}: it belongs to another "
             raise ValueError(wrong + "environment")
         if steps < needed:
-            raise ValueError(f"the past holds {steps} steps, {name} needs {needed}; collect with past_len={needed}")
+            raise ValueError(
+                f"the past holds {steps} steps, {name} needs {needed}; collect with past_len={needed}"
+            )
         if rows % self.copies:
-            raise ValueError(f"{rows} episodes do not divide among {self.copies} copies of the policy")
+            raise ValueError(
+                f"{rows} episodes do not divide among {self.copies} copies of the policy"
+            )
         if target.shape != (rows, dg):
-            raise ValueError(f"targets are {tuple(target.shape)}, expected one per episode, ({rows}, {dg})")
+            raise ValueError(
+                f"targets are {tuple(target.shape)}, expected one per episode, ({rows}, {dg})"
+            )
         return self.by_copy(target / self.target_std)
 
     def by_copy(self, rows: Tensor) -> Tensor:
@@ -140,14 +162,21 @@ class SegmentPolicy(Policy):
         self.prior = deepcopy(prior) if isinstance(prior, ActionPrior) else ActionPrior(**prior)  # type: ignore[arg-type]
         self.prior.requires_grad_(False)
         self.action_dim, self.output_dim = len(self.prior.std), self.prior.latent_dim
-        self.past_len, self.dilations = max(1 + sum(dilations), self.prior.past_len), tuple(dilations)
+        self.past_len, self.dilations = (
+            max(1 + sum(dilations), self.prior.past_len),
+            tuple(dilations),
+        )
 
         generators = _generators(copies, seed)
         self.inlet = BatchedLinear(self.features.dim + self.action_dim, channels, generators)
-        taps = [BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations]  # drawn before all the outs
+        taps = [
+            BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations
+        ]  # drawn before all the outs
         outs = [BatchedLinear(channels, 2 * channels, generators) for _ in dilations]
         self.layers = nn.ModuleList(map(GatedLayer, taps, outs))
-        self.codes = BatchedLinear(target_dim, 2 * channels * len(dilations), generators)  # V_f, V_g of every layer
+        self.codes = BatchedLinear(
+            target_dim, 2 * channels * len(dilations), generators
+        )  # V_f, V_g of every layer
         self.head = BatchedLinear(channels, self.output_dim, generators)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
@@ -168,7 +197,9 @@ class SegmentPolicy(Policy):
         def act(x: Tensor, u: Tensor, noise: Tensor | None) -> Tensor:
             z = self.head(F.relu(read(x, u))).flatten(0, 1)  # (R, dz)
             actions.append(u)
-            return self.prior.first(torch.stack(tuple(actions), dim=1), z if noise is None else z + noise)
+            return self.prior.first(
+                torch.stack(tuple(actions), dim=1), z if noise is None else z + noise
+            )
 
         return act
 

@@ -21,12 +21,23 @@ import torch
 from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from tsmlib.storage.files import Json, PathLike, StoreError, dumps, loads, read_bytes, remedy, write_bytes
+from tsmlib.storage.files import (
+    Json,
+    PathLike,
+    StoreError,
+    dumps,
+    loads,
+    read_bytes,
+    remedy,
+    write_bytes,
+)
 from tsmlib.storage.provenance import provenance
 from tsmlib.trajectory import Trajectories, TrajectoryError
 
 SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
-LARGEST = 10_000  # size among a model's arguments, length of a list of them, and parameters of a model
+LARGEST = (
+    10_000  # size among a model's arguments, length of a list of them, and parameters of a model
+)
 
 _ZEROS = "0" * 64
 _MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
@@ -55,7 +66,13 @@ class Misfit(StoreError):
 # Arrays with a header ------------------------------------------------------------------------------------------------
 
 
-def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: str, header: Mapping[str, Json]) -> None:
+def save(
+    path: PathLike,
+    tensors: Mapping[str, Tensor | np.ndarray],
+    *,
+    kind: str,
+    header: Mapping[str, Json],
+) -> None:
     """Write named arrays and a JSON ``header`` to ``path`` (``*.safetensors``), replacing what was there in one step.
 
     kind: one word that ``load`` must ask for. header: plain JSON values; ``{"inputs": {path: sha256}}`` in it, paths
@@ -64,11 +81,20 @@ def save(path: PathLike, tensors: Mapping[str, Tensor | np.ndarray], *, kind: st
     """
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'.")
+        raise StoreError(
+            f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'."
+        )
     arrays = {name: _owned(value) for name, value in tensors.items()}
     _require_finite(path, arrays, "Nothing was written: check what computed them.")
     about = dumps(
-        path, {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind, "header": dict(header), "provenance": provenance()}
+        path,
+        {
+            "sha256": _ZEROS,
+            "schema": SCHEMA,
+            "kind": kind,
+            "header": dict(header),
+            "provenance": provenance(),
+        },
     )
     data = safetensors.torch.save(arrays, metadata={"tsmlib": about})
     at = data.index(_MARK) + len(_MARK)
@@ -124,7 +150,9 @@ def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         return dict(sorted(safetensors.torch.load(data).items())), about  # they come in any order
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path} is not a valid safetensors file: {error}. {remedy(path)}") from error
+        raise StoreError(
+            f"{path} is not a valid safetensors file: {error}. {remedy(path)}"
+        ) from error
 
 
 def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str, Any]]:
@@ -149,7 +177,9 @@ def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str,
         about: Any = loads(entry["__metadata__"]["tsmlib"])
         schema, holds, _ = about["schema"], about["kind"], {**about["header"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreError(f"{path} has a header that tsmlib cannot read ({error!r}). {remedy(path)}") from error
+        raise StoreError(
+            f"{path} has a header that tsmlib cannot read ({error!r}). {remedy(path)}"
+        ) from error
     if type(schema) is not int or not 1 <= schema <= SCHEMA:
         raise StoreError(
             f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
@@ -180,10 +210,18 @@ def _require_finite(path: Path, tensors: Mapping[str, Tensor], advice: str) -> N
 # Trajectories --------------------------------------------------------------------------------------------------------
 
 
-def save_trajectories(path: PathLike, trajectories: Trajectories, header: Mapping[str, Json] | None = None) -> None:
+def save_trajectories(
+    path: PathLike, trajectories: Trajectories, header: Mapping[str, Json] | None = None
+) -> None:
     """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, fingerprint, ...)."""
     t = trajectories
-    fields: dict[str, Json] = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
+    fields: dict[str, Json] = {
+        "env": t.env,
+        "dt": t.dt,
+        "names": t.names,
+        "units": t.units,
+        "angles": t.angles,
+    }
     fields |= {"lengths": t.lengths} if t.lengths else {}
     fields |= {"terminated": t.terminated} if t.terminated else {}
     arrays = {"states": t.states.astype(np.float32), "actions": t.actions.astype(np.float32)}
@@ -205,9 +243,13 @@ def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = Non
         words = [fields["env"], *fields["names"], *fields["units"]]
         size = tensors["states"].shape[-1]
         if not all(isinstance(word, str) for word in words) or not 0 < fields["dt"] < math.inf:
-            raise TypeError(f"expected texts as env, names and units and a dt above 0, found {fields!r:.200}")
+            raise TypeError(
+                f"expected texts as env, names and units and a dt above 0, found {fields!r:.200}"
+            )
         if not all(type(index) is int and 0 <= index < size for index in fields["angles"]):
-            raise TypeError(f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions")
+            raise TypeError(
+                f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions"
+            )
         arrays = (tensors["states"].numpy(), tensors["actions"].numpy())
         meaning = (tuple(fields[name]) for name in ("names", "units", "angles"))
         ends = (tuple(fields.get(name, ())) for name in ("lengths", "terminated"))
@@ -246,15 +288,23 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
     _require_finite(path, tensors, remedy(path))
     header = about["header"]
     if header.get("class") != cls.__name__:
-        raise StoreError(f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_OTHER}")
+        raise StoreError(
+            f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_OTHER}"
+        )
     try:
         config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
         planned = _planned_layout(cls, config)
-        differs = differences(layout(tensors), planned) + [f"{n} is unknown" for n in set(tensors) - set(planned)]
-    except Exception as error:  # what the file says goes to a constructor, which may fail in any way
+        differs = differences(layout(tensors), planned) + [
+            f"{n} is unknown" for n in set(tensors) - set(planned)
+        ]
+    except (
+        Exception
+    ) as error:  # what the file says goes to a constructor, which may fail in any way
         differs = [f"{error!r:.500}"]
     if differs:
-        raise StoreError(f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_OTHER}")
+        raise StoreError(
+            f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_OTHER}"
+        )
     require_fit(path, fingerprint, expect, about["schema"])
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
@@ -293,13 +343,17 @@ def _sizes(value: Json) -> Iterator[int]:
 # Comparison ----------------------------------------------------------------------------------------------------------
 
 
-def require_fit(path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int = SCHEMA) -> None:
+def require_fit(
+    path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int = SCHEMA
+) -> None:
     """Misfit naming both sides of every field of ``expect`` that ``found``, from the file, does not hold."""
     if differs := differences(found, expect or {}, only_stated=schema == 1):
         raise Misfit(f"{path} does not fit: {'; '.join(differs)}. {_OTHER}", found)
 
 
-def differences(found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False) -> list[str]:
+def differences(
+    found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False
+) -> list[str]:
     """Fields of ``expected`` that ``found``, from a file, does not hold, naming both sides.
 
     ``standard``, in either of both: values of fields that the other leaves out.
@@ -321,7 +375,8 @@ def differences(found: Mapping[str, Json], expected: Mapping[str, Json], *, only
 def layout(tensors: Mapping[str, Tensor]) -> dict[str, str]:
     """Type and shape of each array, in words."""
     return {
-        name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}" for name, tensor in tensors.items()
+        name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
+        for name, tensor in tensors.items()
     }
 
 

@@ -37,7 +37,9 @@ def write_bytes(path: PathLike, data: bytes) -> None:
     temporary = path.with_name(f".{path.name}{here}{threading.get_ident()}-{os.getpid()}")
     try:
         _make(path.parent)
-        for left in path.parent.glob(f".*{glob.escape(here)}*"):  # by a process of this machine that was killed
+        for left in path.parent.glob(
+            f".*{glob.escape(here)}*"
+        ):  # by a process of this machine that was killed
             if not alive(left.name.rpartition("-")[2]):
                 left.unlink(missing_ok=True)
         with open(temporary, "wb") as file:
@@ -61,7 +63,9 @@ def read_bytes(path: PathLike) -> bytes:
             raise OSError("it is a folder or a device, expected a file")
         return path.read_bytes()
     except FileNotFoundError:
-        raise StoreError(f"{path} does not exist. Check the name, or run the notebook that makes it.") from None
+        raise StoreError(
+            f"{path} does not exist. Check the name, or run the notebook that makes it."
+        ) from None
     except (OSError, ValueError) as error:
         raise StoreError(f"cannot read {path}: {error}. Check its name and permissions.") from error
 
@@ -82,7 +86,9 @@ def unpacked(path: Path, data: bytes) -> bytes:
     except (OSError, EOFError, zlib.error) as error:
         raise StoreError(f"{path} is damaged, or no gzip: {error}. {remedy(path)}") from error
     if len(found) > UNPACKED:
-        raise StoreError(f"{path} unpacks to more than {UNPACKED} bytes, expected fewer. {remedy(path)}")
+        raise StoreError(
+            f"{path} unpacks to more than {UNPACKED} bytes, expected fewer. {remedy(path)}"
+        )
     return found
 
 
@@ -119,7 +125,9 @@ def _sync(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = False) -> Iterator[None]:
+def writer_lock(
+    folder: PathLike, purpose: str, *, name: str = "", wait: bool = False
+) -> Iterator[None]:
     """Exclusive right to write in ``folder``, made if need be; it ends with this process, however that ends.
 
     name: of the part of the folder that is written, where others may write the rest; '' is all of it. wait: until
@@ -142,7 +150,9 @@ def writer_lock(folder: PathLike, purpose: str, *, name: str = "", wait: bool = 
     try:
         since = time.strftime("%F %T%z")
         with contextlib.suppress(OSError):  # a full disk: nameless, but locked
-            holder.write_text(f"pid {os.getpid()} on {socket.gethostname()}, {purpose}, since {since}")
+            holder.write_text(
+                f"pid {os.getpid()} on {socket.gethostname()}, {purpose}, since {since}"
+            )
         yield
     finally:
         with contextlib.suppress(OSError):
@@ -211,6 +221,10 @@ def dumps(path: Path, value: Json, indent: int | None = None) -> str:
 
     separators = (",", ":") if indent is None else None
     try:
-        return json.dumps(value, allow_nan=False, default=convert, indent=indent, separators=separators)
+        return json.dumps(
+            value, allow_nan=False, default=convert, indent=indent, separators=separators
+        )
     except (TypeError, ValueError, RecursionError) as error:
-        raise StoreError(f"the header or JSON for {path} cannot be written: {error}. Nothing was written.") from error
+        raise StoreError(
+            f"the header or JSON for {path} cannot be written: {error}. Nothing was written."
+        ) from error

@@ -8,7 +8,16 @@ from typing import Any
 
 from tsmlib.storage import files as files_storage
 from tsmlib.storage.artifacts import read_header
-from tsmlib.storage.files import MANIFEST, STATUS, Json, PathLike, StoreError, read_bytes, remedy, unpacked
+from tsmlib.storage.files import (
+    MANIFEST,
+    STATUS,
+    Json,
+    PathLike,
+    StoreError,
+    read_bytes,
+    remedy,
+    unpacked,
+)
 
 
 def write_json(path: PathLike, value: Json) -> None:
@@ -64,13 +73,20 @@ def _require_sha256(path: Path, data: bytes, wanted: str | None) -> None:
 def write_manifest(folder: PathLike) -> None:
     """Write ``MANIFEST.json``: size and SHA-256 of every file under ``folder`` (for folders that are shipped)."""
     folder = Path(folder)
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != MANIFEST and not p.name.startswith(".")]
+    files = [
+        p
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and p.name != MANIFEST and not p.name.startswith(".")
+    ]
     write_json(folder / MANIFEST, sealed({"files": listing(folder, files)}))
 
 
 def listing(folder: Path, files: Sequence[Path]) -> dict[str, dict[str, Json]]:
     """Size and SHA-256 of each file, by its name relative to ``folder``."""
-    return {p.relative_to(folder).as_posix(): {"bytes": p.stat().st_size, "sha256": sha256(p)} for p in files}
+    return {
+        p.relative_to(folder).as_posix(): {"bytes": p.stat().st_size, "sha256": sha256(p)}
+        for p in files
+    }
 
 
 def sealed(entry: Mapping[str, Json]) -> dict[str, Json]:
@@ -148,12 +164,19 @@ def statuses(folder: Path) -> dict[str, Any]:
 def _status_files(folder: Path) -> list[Path]:
     """Status files by when their notebooks ended, the older runs' first."""
     old = [folder / STATUS] if (folder / STATUS).is_file() else []
-    return old + sorted(folder.glob(f"[!.]*.{STATUS}"), key=lambda path: str(read_own_json(path).get("finished", "")))
+    return old + sorted(
+        folder.glob(f"[!.]*.{STATUS}"),
+        key=lambda path: str(read_own_json(path).get("finished", "")),
+    )
 
 
 def made_by(entries: Mapping[str, Any]) -> dict[str, str]:
     """File -> the notebook of ``statuses`` that made it; of several the last."""
-    complete = (name for name, entry in entries.items() if intact(entry) and entry.get("state") == "complete")
+    complete = (
+        name
+        for name, entry in entries.items()
+        if intact(entry) and entry.get("state") == "complete"
+    )
     return {file: name for name in complete for file in entries[name].get("files", {})}
 
 
@@ -172,13 +195,19 @@ def _manifest(path: Path) -> dict[str, str]:
                 raise TypeError("expected 'files' and 'sha256'")
         else:
             entries = list(value.values()) if path.name == STATUS else [value]
-            entries = [entry for entry in entries if "files" in entry and entry["state"] == "complete"]
-        digests = {name: str(file["sha256"]) for entry in entries for name, file in entry["files"].items()}
+            entries = [
+                entry for entry in entries if "files" in entry and entry["state"] == "complete"
+            ]
+        digests = {
+            name: str(file["sha256"]) for entry in entries for name, file in entry["files"].items()
+        }
         whole = all(map(intact, entries))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise StoreError(f"{path} is not a manifest ({error!r}). {remedy(path)}") from error
     if not whole:
-        raise StoreError(f"{path} is damaged: its entries do not have the SHA-256 that it states. {remedy(path)}")
+        raise StoreError(
+            f"{path} is damaged: its entries do not have the SHA-256 that it states. {remedy(path)}"
+        )
     if any(name.is_absolute() or ".." in name.parts for name in map(Path, digests)):
         raise StoreError(f"{path} lists files outside its own folder. {remedy(path)}")
     return digests

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tsmlib.storage.files import PathLike, StoreError, packed, read_bytes, remedy, unpacked, write_bytes
+from tsmlib.storage.files import (
+    PathLike,
+    StoreError,
+    packed,
+    read_bytes,
+    remedy,
+    unpacked,
+    write_bytes,
+)
 from tsmlib.storage.manifest import read_text
 
 COLUMNS = (
@@ -18,9 +26,31 @@ COLUMNS = (
     *("horizon", "steps_ahead", "iteration", "env_steps", "subset", "execution", "noise", "delay"),
     *("metric", "value", "unit", "n", "seed", "scale"),
 )  # of every results table; a field that does not apply is empty
-EXTRA = ("split", "lag", "samples", "dimension", "copy", "target", "start", "torque_weight", "configuration")
-_COUNTS = ("horizon", "steps_ahead", "iteration", "env_steps", "delay", "n", "seed", "lag", "samples", "dimension",
-           "copy", "target")  # fmt: skip
+EXTRA = (
+    "split",
+    "lag",
+    "samples",
+    "dimension",
+    "copy",
+    "target",
+    "start",
+    "torque_weight",
+    "configuration",
+)
+_COUNTS = (
+    "horizon",
+    "steps_ahead",
+    "iteration",
+    "env_steps",
+    "delay",
+    "n",
+    "seed",
+    "lag",
+    "samples",
+    "dimension",
+    "copy",
+    "target",
+)
 _NUMBERS = ("noise", "value", "start", "torque_weight")
 LARGE = 900_000  # bytes; a table of more ships compressed
 
@@ -33,12 +63,18 @@ def frame(rows: pd.DataFrame | Iterable[Mapping[str, object]]) -> pd.DataFrame:
     found = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
     columns = [*COLUMNS, *(name for name in found.columns if name not in COLUMNS)]
     return pd.DataFrame(
-        {name: _typed(name, found[name].tolist() if name in found else [None] * len(found)) for name in columns}
+        {
+            name: _typed(name, found[name].tolist() if name in found else [None] * len(found))
+            for name in columns
+        }
     )
 
 
 def save(
-    path: PathLike, rows: pd.DataFrame | Iterable[Mapping[str, object]], *, extra: Sequence[str] = ()
+    path: PathLike,
+    rows: pd.DataFrame | Iterable[Mapping[str, object]],
+    *,
+    extra: Sequence[str] = (),
 ) -> pd.DataFrame:
     """Write a results table in one step; floats as their shortest exact text. Returns it as ``load`` would.
 
@@ -51,7 +87,10 @@ def save(
 
 
 def ship(
-    path: PathLike, rows: pd.DataFrame | Iterable[Mapping[str, object]], *, extra: Sequence[str] = ()
+    path: PathLike,
+    rows: pd.DataFrame | Iterable[Mapping[str, object]],
+    *,
+    extra: Sequence[str] = (),
 ) -> pd.DataFrame:
     """``save`` a table ``*.csv`` where it ships, which is ``*.csv.gz`` where it is LARGE."""
     table, data = _written(Path(path), rows, extra)
@@ -66,7 +105,9 @@ def ship_bytes(path: PathLike, data: bytes) -> None:
         write_bytes(plain, data)
         gz.unlink(missing_ok=True)
         return
-    if not gz.exists() or unpacked(gz, read_bytes(gz)) != data:  # another zlib may pack the same into other bytes
+    if (
+        not gz.exists() or unpacked(gz, read_bytes(gz)) != data
+    ):  # another zlib may pack the same into other bytes
         write_bytes(gz, packed(data))
     plain.unlink(missing_ok=True)
 
@@ -78,7 +119,9 @@ def stored(path: PathLike) -> Path | None:
     """
     found = [form for form in _forms(Path(path)) if form.exists()]
     if len(found) > 1:
-        raise StoreError(f"{path} is there compressed as well, expected one of both: delete the one that is older.")
+        raise StoreError(
+            f"{path} is there compressed as well, expected one of both: delete the one that is older."
+        )
     return found[0] if found else None
 
 
@@ -97,7 +140,9 @@ def _written(
         raise StoreError(
             f"rows for {path} have unknown columns {unknown}, expected some of {known}. Name others as extra."
         )
-    numbers: Sequence[Mapping[Any, Any]] = given or table[["env", "model", "metric", "value"]].to_dict("records")
+    numbers: Sequence[Mapping[Any, Any]] = given or table[
+        ["env", "model", "metric", "value"]
+    ].to_dict("records")
     for i, row in enumerate(numbers):
         for name, value in row.items():
             if isinstance(value, float | np.floating) and not math.isfinite(value):
@@ -126,10 +171,14 @@ def load(path: PathLike) -> pd.DataFrame:
     except (csv.Error, ValueError) as error:
         raise StoreError(f"{path} is not a table ({error}). {remedy(path)}") from error
     if missing := [name for name in COLUMNS if name not in columns]:
-        raise StoreError(f"{path} is not a results table: it lacks the columns {missing}. {remedy(path)}")
+        raise StoreError(
+            f"{path} is not a results table: it lacks the columns {missing}. {remedy(path)}"
+        )
     for line, row in enumerate(rows, start=2):
         if len(row) != len(columns):
-            raise StoreError(f"{path}, line {line}: {len(row)} fields, expected {len(columns)}. {remedy(path)}")
+            raise StoreError(
+                f"{path}, line {line}: {len(row)} fields, expected {len(columns)}. {remedy(path)}"
+            )
     return frame(pd.DataFrame(rows, columns=columns, dtype=object))
 
 
@@ -140,14 +189,22 @@ def records(table: pd.DataFrame) -> list[dict[Hashable, object]]:
 
 def _typed(name: str, values: Sequence[Any]) -> pd.Series:
     """One column: counts, numbers or texts, as its name says; of an unknown name, as its values are."""
-    given = [None if value is None or value is pd.NA or value == "" or value != value else value for value in values]
+    given = [
+        None if value is None or value is pd.NA or value == "" or value != value else value
+        for value in values
+    ]
     if name in COLUMNS and name not in _COUNTS and name not in _NUMBERS:
         return pd.Series(["" if value is None else str(value) for value in given], dtype="str")
     counts = name not in _NUMBERS and (name in COLUMNS or any(value is not None for value in given))
-    for convert, dtype, wanted in ((_count, "Int64", counts), (float, "float64", name not in _COUNTS)):
+    for convert, dtype, wanted in (
+        (_count, "Int64", counts),
+        (float, "float64", name not in _COUNTS),
+    ):
         if wanted:
             try:
-                return pd.Series([None if value is None else convert(value) for value in given], dtype=dtype)
+                return pd.Series(
+                    [None if value is None else convert(value) for value in given], dtype=dtype
+                )
             except (ValueError, TypeError, OverflowError):
                 continue
     return pd.Series(["" if value is None else value for value in given], dtype=object)

@@ -85,7 +85,9 @@ class TensorBoardCallback:
         if self._writer is None or progress.step <= self._last:
             if self._writer is not None:
                 self._writer.close()
-            self._writer = self._open(str(self.folder), purge_step=progress.step)  # hides this step and later ones
+            self._writer = self._open(
+                str(self.folder), purge_step=progress.step
+            )  # hides this step and later ones
         for name, value in {**progress.values, "seconds": progress.seconds}.items():
             self._writer.add_scalar(name, value, progress.step)
         self._writer.flush()

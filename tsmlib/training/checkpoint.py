@@ -24,7 +24,10 @@ from tsmlib.storage.provenance import provenance
 from tsmlib.training.precision import native_bf16
 
 KEPT = 2  # generations
-LATER = ("configuration", "began with")  # fields of a run's identity that older checkpoints do not have
+LATER = (
+    "configuration",
+    "began with",
+)  # fields of a run's identity that older checkpoints do not have
 
 
 @runtime_checkable
@@ -66,9 +69,14 @@ class TrainingState(Generic[C]):
     """
 
     def __init__(
-        self, model: nn.Module, optimizers: Mapping[str, torch.optim.Optimizer], curve: C,
-        total: int, identity: Mapping[str, Json], folder: Path | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: nn.Module,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        curve: C,
+        total: int,
+        identity: Mapping[str, Json],
+        folder: Path | None = None,
+    ) -> None:
         self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
         configuration = model.config() if isinstance(model, Configured) else {}
         began = artifacts.digest(model.state_dict())[:16]
@@ -81,7 +89,9 @@ class TrainingState(Generic[C]):
 
     def keep(self, loss: float) -> None:
         """Hold the present weights as the best."""
-        self.best = {name: tensor.detach().clone() for name, tensor in self.model.state_dict().items()}
+        self.best = {
+            name: tensor.detach().clone() for name, tensor in self.model.state_dict().items()
+        }
         self.best_step, self.best_loss = self.step, loss
 
     def restore_best(self) -> None:
@@ -107,9 +117,14 @@ class TrainingState(Generic[C]):
             for i, moments in optimizer.state_dict()["state"].items():
                 tensors |= {f"{name}.{i}.{moment}": tensor for moment, tensor in moments.items()}
         header = dict[str, Json](
-            identity=self.identity, step=self.step, seconds=self.seconds, curve=asdict(self.curve),
-            made_by=self._made_by(), best_step=self.best_step, best_loss=self.best_loss,
-        )  # fmt: skip
+            identity=self.identity,
+            step=self.step,
+            seconds=self.seconds,
+            curve=asdict(self.curve),
+            made_by=self._made_by(),
+            best_step=self.best_step,
+            best_loss=self.best_loss,
+        )
         save_generation(self.folder, self.step, tensors, header=encode_nonfinite(header))
 
     def load(self) -> None:
@@ -122,18 +137,24 @@ class TrainingState(Generic[C]):
             return
         path, tensors, header = found[0], found[1], cast(dict[str, Any], found[2])
         anew = f"Delete {self.folder} to start anew, or go back to those settings"
-        groups: dict[str, dict[str, Tensor]] = {name: {} for name in ("model", "best", *self.optimizers)}
+        groups: dict[str, dict[str, Tensor]] = {
+            name: {} for name in ("model", "best", *self.optimizers)
+        }
         moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.optimizers}
         try:
             if differs := _differences(header["identity"], self.identity):
-                raise StoreError(f"{path} is the checkpoint of another run: {'; '.join(differs)}. {anew}")
+                raise StoreError(
+                    f"{path} is the checkpoint of another run: {'; '.join(differs)}. {anew}"
+                )
             for name, tensor in tensors.items():
                 group, _, rest = name.partition(".")
                 groups[group][rest] = tensor
             planned = artifacts.layout(self.model.state_dict())
             for group in ("model", "best"):
                 if differs := artifacts.differences(artifacts.layout(groups[group]), planned):
-                    raise StoreError(f"{path} holds the weights of another model: {'; '.join(differs[:3])}. {anew}")
+                    raise StoreError(
+                        f"{path} holds the weights of another model: {'; '.join(differs[:3])}. {anew}"
+                    )
             for group, held in moments.items():
                 for name, tensor in groups[group].items():
                     index, _, moment = name.partition(".")
@@ -142,12 +163,18 @@ class TrainingState(Generic[C]):
                 type(self.curve)(**decode_nonfinite(header["curve"])),
                 {"device": "cpu", **header["made_by"]},
             )
-            step, best_step, best_loss = int(header["step"]), int(header["best_step"]), float(header["best_loss"])
+            step, best_step, best_loss = (
+                int(header["step"]),
+                int(header["best_step"]),
+                float(header["best_loss"]),
+            )
             seconds = float(header["seconds"])
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, StoreError):
                 raise
-            raise StoreError(f"{path} is no checkpoint of this tsmlib: {error!r:.200}. {anew}") from error
+            raise StoreError(
+                f"{path} is no checkpoint of this tsmlib: {error!r:.200}. {anew}"
+            ) from error
         self.model.load_state_dict(groups["model"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": moments[name]})
@@ -157,7 +184,11 @@ class TrainingState(Generic[C]):
 
     def _note_changes(self, made_by: Mapping[str, object]) -> None:
         now = self._made_by().items()
-        changed = [f"{name} {made_by.get(name)} -> {value}" for name, value in now if made_by.get(name) != value]
+        changed = [
+            f"{name} {made_by.get(name)} -> {value}"
+            for name, value in now
+            if made_by.get(name) != value
+        ]
         if self.folder and changed:
             self.curve.resumed.append(f"at step {self.step}: {', '.join(changed)}")
             warnings.warn(
@@ -176,7 +207,9 @@ def _differences(stated: Mapping[str, Json], identity: Mapping[str, Json]) -> li
     """What tells the run of a file from this one; older files say nothing of model and first weights."""
     asked = {name: value for name, value in identity.items() if name in stated or name not in LATER}
     more = [
-        f"{name} is {value!r:.200} in the file, expected none" for name, value in stated.items() if name not in asked
+        f"{name} is {value!r:.200} in the file, expected none"
+        for name, value in stated.items()
+        if name not in asked
     ]
     return artifacts.differences(stated, asked) + more
 
@@ -189,11 +222,19 @@ def resumable(state: TrainingState[C], *, purpose: str, progress: str) -> Iterat
             stack.enter_context(writer_lock(state.folder, purpose))
             state.load()
         yield stack.enter_context(
-            tqdm(total=state.total, initial=state.step, desc=progress, disable=not progress, mininterval=1.0)
+            tqdm(
+                total=state.total,
+                initial=state.step,
+                desc=progress,
+                disable=not progress,
+                mininterval=1.0,
+            )
         )
 
 
-def save_generation(folder: Path, number: int, tensors: Mapping[str, Tensor], *, header: Mapping[str, Json]) -> None:
+def save_generation(
+    folder: Path, number: int, tensors: Mapping[str, Tensor], *, header: Mapping[str, Json]
+) -> None:
     """Write generation ``number`` of a checkpoint into its folder; the one before stays, older ones go."""
     path = folder / f"{number:09d}.safetensors"
     artifacts.save(path, tensors, kind="checkpoint", header={**header, "generation": number})
@@ -219,7 +260,9 @@ def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Js
             refused.append(str(error))
             continue
         if refused:
-            warnings.warn(f"{' '.join(refused)} Going on from the generation before: {path}", stacklevel=2)
+            warnings.warn(
+                f"{' '.join(refused)} Going on from the generation before: {path}", stacklevel=2
+            )
         return path, tensors, header
     if refused:
         raise StoreError(

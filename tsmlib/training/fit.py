@@ -66,12 +66,16 @@ class TrainingOptions:
         if not self.clip > 0:
             raise ValueError(f"clip {self.clip}: expected above zero; math.inf never clips")
         if not (0 < self.lr < math.inf and 0 <= self.lr_final < math.inf):
-            raise ValueError(f"lr {self.lr}, lr_final {self.lr_final}: expected lr above zero, lr_final zero or above")
+            raise ValueError(
+                f"lr {self.lr}, lr_final {self.lr_final}: expected lr above zero, lr_final zero or above"
+            )
         for name in ("muon", "weight_decay", "warmup", "patience"):
             if not 0 <= (value := getattr(self, name)) < math.inf:
                 raise ValueError(f"{name} {value}: expected zero or above")
         if not 0 <= self.span[0] < self.span[1] <= 1:
-            raise ValueError(f"span {self.span}: expected two numbers from 0 to 1, the first below the second")
+            raise ValueError(
+                f"span {self.span}: expected two numbers from 0 to 1, the first below the second"
+            )
 
 
 def require_past(model: nn.Module, options: TrainingOptions) -> None:
@@ -126,19 +130,27 @@ def fit(
     held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, *lengths)))
     draw = batches(
         train.padded(o.past_len).to(device),
-        past_len=o.past_len, future_len=o.future_len, batch_size=o.batch_size, generator=generator,
+        past_len=o.past_len,
+        future_len=o.future_len,
+        batch_size=o.batch_size,
+        generator=generator,
         lengths=train.lengths,
-    )  # fmt: skip
+    )
     identity = asdict(options) | dict(
-        seed=seed, loss=getattr(loss, "__name__", "loss"), env=train.env, episodes=len(train),
+        seed=seed,
+        loss=getattr(loss, "__name__", "loss"),
+        env=train.env,
+        episodes=len(train),
         data=[trajectories_digest(data) for data in (train, validation)],
-    )  # fmt: skip
+    )
     if frozen := [name for name, weight in model.named_parameters() if not weight.requires_grad]:
         identity["frozen"] = frozen
     bf16 = o.bf16 and native_bf16(device)
     keep_freed_memory()
     with _trained_on(device, model):
-        state = TrainingState(model, optimizers(model, o), TrainingHistory(), o.steps, identity, checkpoint)
+        state = TrainingState(
+            model, optimizers(model, o), TrainingHistory(), o.steps, identity, checkpoint
+        )
         with resumable(state, purpose=f"training, seed {seed}", progress=progress) as bar:
             began, losses = time.process_time() - state.seconds, []
             for step in range(state.step, o.steps):
@@ -153,7 +165,9 @@ def fit(
                     if callback is not None:
                         callback(_newest(state))
                     state.save()
-                    bar.set_postfix(train=state.curve.train[-1], validation=state.curve.validation[-1])
+                    bar.set_postfix(
+                        train=state.curve.train[-1], validation=state.curve.validation[-1]
+                    )
                     losses = []
     state.restore_best()
     return state.curve
@@ -173,9 +187,14 @@ def keep_freed_memory() -> None:
 
 
 def optimizers(
-    model: nn.Module, o: TrainingOptions, *, weights: Mapping[str, Tensor] | None = None,
-    lr: float | Tensor | None = None, muon: float | Tensor | None = None, capturable: bool = False,
-) -> dict[str, torch.optim.Optimizer]:  # fmt: skip
+    model: nn.Module,
+    o: TrainingOptions,
+    *,
+    weights: Mapping[str, Tensor] | None = None,
+    lr: float | Tensor | None = None,
+    muon: float | Tensor | None = None,
+    capturable: bool = False,
+) -> dict[str, torch.optim.Optimizer]:
     """Adam, and Muon where it has a learning rate and the model a matrix.
 
     weights: in place of the model's, by name, with a leading dimension of copies. lr, muon: rates in place of those of
@@ -191,7 +210,9 @@ def optimizers(
         held.append({"params": inside, "weight_decay": o.weight_decay})
     made: dict[str, torch.optim.Optimizer] = {}
     if held := [group for group in held if group["params"]]:
-        made["adam"] = torch.optim.AdamW(held, lr=o.lr if lr is None else lr, fused=True, capturable=capturable)
+        made["adam"] = torch.optim.AdamW(
+            held, lr=o.lr if lr is None else lr, fused=True, capturable=capturable
+        )
     if o.muon and inside:
         rate, copies = o.muon if muon is None else muon, weights is not None
         made["muon"] = Muon(inside, lr=rate, weight_decay=o.weight_decay, copies=copies)
@@ -199,9 +220,14 @@ def optimizers(
 
 
 def _update(
-    state: TrainingState[TrainingHistory], loss: Loss, draw: Iterator[Window], generator: torch.Generator,
-    step: int, o: TrainingOptions, bf16: bool,
-) -> float:  # fmt: skip
+    state: TrainingState[TrainingHistory],
+    loss: Loss,
+    draw: Iterator[Window],
+    generator: torch.Generator,
+    step: int,
+    o: TrainingOptions,
+    bf16: bool,
+) -> float:
     """One step of the optimisers; the loss before it."""
     lr = schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span)
     for name, optimizer in state.optimizers.items():
@@ -221,7 +247,9 @@ def _update(
     return value.item()
 
 
-def _record(state: TrainingState[TrainingHistory], train: float, validation: float, bf16: bool) -> None:
+def _record(
+    state: TrainingState[TrainingHistory], train: float, validation: float, bf16: bool
+) -> None:
     _require_finite(state, "validation loss", validation, state.step)
     state.curve.step.append(state.step)
     state.curve.seconds.append(state.seconds)
@@ -235,10 +263,14 @@ def _record(state: TrainingState[TrainingHistory], train: float, validation: flo
 def _newest(state: TrainingState[TrainingHistory]) -> Progress:
     """The last record of a training."""
     curve = state.curve
-    return Progress(state.step, state.seconds, {"train": curve.train[-1], "validation": curve.validation[-1]})
+    return Progress(
+        state.step, state.seconds, {"train": curve.train[-1], "validation": curve.validation[-1]}
+    )
 
 
-def _require_finite(state: TrainingState[TrainingHistory], what: str, value: float, step: int) -> None:
+def _require_finite(
+    state: TrainingState[TrainingHistory], what: str, value: float, step: int
+) -> None:
     if not math.isfinite(value):
         raise state.stopped(f"the {what} became {value}", step)
 
@@ -257,7 +289,12 @@ def _trained_on(device: str, model: nn.Module) -> Iterator[None]:
 
 
 def schedule(
-    step: int, steps: int, lr: float, lr_final: float, warmup: int, span: tuple[float, float] = (0.0, 1.0)
+    step: int,
+    steps: int,
+    lr: float,
+    lr_final: float,
+    warmup: int,
+    span: tuple[float, float] = (0.0, 1.0),
 ) -> float:
     """Linear warm-up, then half a cosine from ``lr`` to ``lr_final``; or the part of it that ``span`` covers."""
     first, last = span
@@ -265,10 +302,14 @@ def schedule(
     if step < warmup:
         return lr * (step + 1) / warmup
     done, of = step - warmup, max(1, steps - warmup)
-    return lr_final + (lr - lr_final) * 0.5 * (1 + math.cos(math.pi * (first * of + (last - first) * done) / of))
+    return lr_final + (lr - lr_final) * 0.5 * (
+        1 + math.cos(math.pi * (first * of + (last - first) * done) / of)
+    )
 
 
-def fixed_windows(data: Trajectories, past_len: int, future_len: int, n_windows: int = 2000) -> Window:
+def fixed_windows(
+    data: Trajectories, past_len: int, future_len: int, n_windows: int = 2000
+) -> Window:
     """The same windows at every validation: evenly spread over episodes and starts, and never across an end."""
     counts = torch.from_numpy(data.steps - future_len + 1).clamp_min(0)  # windows of each episode
     n_all = int(counts.sum())
@@ -278,7 +319,9 @@ def fixed_windows(data: Trajectories, past_len: int, future_len: int, n_windows:
             f"collect some of at least {future_len} steps"
         )
     chosen = np.linspace(0, n_all - 1, min(n_windows, n_all)).round().astype(np.int64)
-    return windows(data.padded(past_len), *window_at(torch.from_numpy(chosen), counts), past_len, future_len)
+    return windows(
+        data.padded(past_len), *window_at(torch.from_numpy(chosen), counts), past_len, future_len
+    )
 
 
 @torch.no_grad()

@@ -13,7 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-QUINTIC = (3.4445, -4.7750, 2.0315)  # s -> a s + b s^3 + c s^5, the steepest at zero that still ends near 1
+QUINTIC = (
+    3.4445,
+    -4.7750,
+    2.0315,
+)  # s -> a s + b s^3 + c s^5, the steepest at zero that still ends near 1
 
 
 def matrices(model: nn.Module) -> list[nn.Parameter]:
@@ -29,13 +33,17 @@ def matrices(model: nn.Module) -> list[nn.Parameter]:
                 f"adam_only of {type(model).__name__} names {name!r:.80}; expected a layer or parameter of it, such as "
                 f"{', '.join(list(named)[:3])}"
             )
-    kernels = {id(layer.weight) for layer in model.modules() if isinstance(layer, nn.modules.conv._ConvNd)}
+    kernels = {
+        id(layer.weight) for layer in model.modules() if isinstance(layer, nn.modules.conv._ConvNd)
+    }
     return [
         weight
         for path, weight in named.items()
-        if weight.ndim in (2, 3) and min(weight.shape[-2:]) > 1 and id(weight) not in kernels
+        if weight.ndim in (2, 3)
+        and min(weight.shape[-2:]) > 1
+        and id(weight) not in kernels
         and not any(f"{path}.".startswith(f"{name}.") for name in spared)
-    ]  # fmt: skip
+    ]
 
 
 def orthogonalised(matrix: Tensor, iterations: int = 5) -> Tensor:
@@ -62,9 +70,14 @@ class Muon(torch.optim.Optimizer):
     """
 
     def __init__(
-        self, params: Iterable[Tensor], lr: float | Tensor, *, momentum: float = 0.95, weight_decay: float = 0.0,
+        self,
+        params: Iterable[Tensor],
+        lr: float | Tensor,
+        *,
+        momentum: float = 0.95,
+        weight_decay: float = 0.0,
         copies: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(params, dict(lr=lr, momentum=momentum, weight_decay=weight_decay))
         self.copies = copies
 
@@ -73,15 +86,27 @@ class Muon(torch.optim.Optimizer):
         """One update of every weight that has a gradient."""
         for group in self.param_groups:
             given = ((weight, weight.grad) for weight in group["params"])
-            directions = [(w, self._direction(w, gradient, group)) for w, gradient in given if gradient is not None]
-            for same in _of_one_shape(directions) if self.copies else [[pair] for pair in directions]:
+            directions = [
+                (w, self._direction(w, gradient, group))
+                for w, gradient in given
+                if gradient is not None
+            ]
+            for same in (
+                _of_one_shape(directions) if self.copies else [[pair] for pair in directions]
+            ):
                 found = [direction for _, direction in same]
-                updates = orthogonalised(torch.stack(found)) if self.copies else [orthogonalised(found[0])]
+                updates = (
+                    orthogonalised(torch.stack(found))
+                    if self.copies
+                    else [orthogonalised(found[0])]
+                )
                 for (weight, _), update in zip(same, updates, strict=True):
                     self._move(weight, update, group)
 
     def _move(self, weight: Tensor, update: Tensor, group: dict[str, Any]) -> None:
-        outputs, inputs = weight.shape[-2:] if weight.ndim == 2 + self.copies else weight.mT.shape[-2:]
+        outputs, inputs = (
+            weight.shape[-2:] if weight.ndim == 2 + self.copies else weight.mT.shape[-2:]
+        )
         scale = max(1.0, outputs / inputs) ** 0.5
         if group["weight_decay"]:
             weight.mul_(1 - group["lr"] * group["weight_decay"])

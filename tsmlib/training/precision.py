@@ -26,7 +26,9 @@ def native_bf16(device: str | torch.device = "cpu") -> bool:
             return torch.cuda.is_bf16_supported(including_emulation=False)
     if device.type != "cpu" or not torch.backends.mkldnn.is_available():
         return False
-    if not torch.ops.mkldnn._is_mkldnn_bf16_supported():  # also true of processors with AVX-512, where it is emulated
+    if (
+        not torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    ):  # also true of processors with AVX-512, where it is emulated
         return False
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return True

@@ -1,0 +1,88 @@
+"""The explorer, a page in which a person plans and MuJoCo executes, served to this machine alone."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import urllib.request
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from reproduction.runs import ROOT, RunError
+
+if TYPE_CHECKING:
+    from IPython.display import IFrame, Markdown
+
+PAGE = ROOT / "explorer" / "dist"
+PORT = 8765
+TYPES = {".wasm": "application/wasm", ".js": "text/javascript", ".f32": "application/octet-stream"}
+HEADERS = {
+    "Cache-Control": "no-cache",  # a page that was built again is not mixed with the one before
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data:",  # MuJoCo's bindings are made at run time, hence unsafe-eval
+}
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Files of a folder with the types and headers that the page needs. Says nothing."""
+
+    extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, **TYPES}  # noqa: RUF012
+
+    def end_headers(self) -> None:
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+    def list_directory(self, path: object) -> None:
+        self.send_error(404)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+def server(folder: Path = PAGE, *, port: int = PORT) -> http.server.ThreadingHTTPServer:
+    """A server of the page on 127.0.0.1, not yet running; port 0 is any that is free.
+
+    RunError where the page is not built, or the port is taken or none.
+    """
+    if not (folder / "index.html").exists() or not (folder / "manifest.json").exists():
+        raise RunError(
+            f"there is no page in {folder}; build it, which needs node and npm: make explorer"
+        )
+    try:
+        return http.server.ThreadingHTTPServer(
+            ("127.0.0.1", port), functools.partial(Handler, directory=str(folder))
+        )
+    except (OSError, OverflowError) as error:
+        why = error.strerror if isinstance(error, OSError) else "ports are 0 to 65535"
+        raise RunError(
+            f"port {port} of 127.0.0.1 cannot be used ({why}); name another: --port 0"
+        ) from error
+
+
+def serve(*, port: int = PORT, browser: bool = False) -> None:
+    """Serve the page until interrupted, and say where."""
+    with server(port=port) as running:
+        address = f"http://127.0.0.1:{running.server_port}/"
+        print(f"{address}  (Ctrl-C ends it)", flush=True)
+        if browser:
+            webbrowser.open(address)
+        running.serve_forever()
+
+
+def frame(*, port: int = PORT) -> IFrame | Markdown:
+    """The page in a frame, for the last line of a notebook's cell; where nothing serves it, how to serve it."""
+    from IPython.display import IFrame, Markdown
+
+    address = f"http://127.0.0.1:{port}/"
+    try:
+        with urllib.request.urlopen(address, timeout=2):
+            return IFrame(address, width="100%", height=900)
+    except OSError:
+        return Markdown(
+            "The explorer is not served on this machine. In a checkout of the repository, build it once with "
+            "`make explorer` (which takes node and npm), leave `python -m tsmlib explore` running in a terminal, and "
+            f"run this cell again; or open {address} in a browser then."
+        )

@@ -1,0 +1,297 @@
+"""Minari data sets: read as ``Trajectories``, and written from them. Needs ``pip install 'tsmlib[minari]'``.
+
+An HDF5 file from a stranger can point at other files on this machine and declare terabytes in a kilobyte, and Minari
+imports the environment that a data set names where it states no spaces. So before Minari reads, the data set must
+state two flat Box spaces, and its file hold plain numbers only, stored in it. No environment that a file names is made.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from tsmlib.storage.files import Json, PathLike, StoreError, read_bytes
+from tsmlib.trajectory import Trajectories
+
+MAX_RATIO = 20  # bytes that a file declares, or of its episodes padded to one length, over its own
+_SUPPORTED = "supported are observations that are a Box of one dimension, and actions that are one too, with bounds"
+
+
+def load_minari(
+    path: PathLike,
+    *,
+    env: str | None = None,
+    dt: float | None = None,
+    names: tuple[str, ...] | None = None,
+    units: tuple[str, ...] | None = None,
+    angles: tuple[int, ...] | None = None,
+) -> Trajectories:
+    """The episodes of a local Minari data set: its folder, or its id where Minari keeps it.
+
+    Observations (T + 1, dx) are the states. Actions (T, du) are scaled from the bounds of the action space to [-1, 1].
+    Episodes may differ in length; those that the environment ended are ``terminated``. Rewards are not read.
+
+    env, dt (seconds), names, units, angles: what the data mean, by default what ``save_minari`` wrote into the file;
+    else the id of the environment or of the data set, one second with a warning, x0, x1, ..., no units and no angles.
+    Raises StoreError for anything else than flat Box spaces and plain numbers, before data are read.
+    """
+    minari = _minari(path)
+    given = Path(path) if Path(path).is_dir() else minari.storage.get_dataset_path(str(path))
+    folder = given / "data" if (given / "data").is_dir() else given
+    try:
+        metadata = json.loads(read_bytes(folder / "metadata.json"))
+        low, high = _require_plain(folder, metadata)
+        meaning = _meaning(metadata, len(json.loads(metadata["observation_space"])["low"]))
+        for name, value in (
+            ("env", env),
+            ("dt", dt),
+            ("names", names),
+            ("units", units),
+            ("angles", angles),
+        ):
+            if value is not None:
+                meaning[name] = value
+        states, actions, terminated = [], [], []
+        for x, u, ended in _episodes(minari.MinariDataset(folder), low, high):
+            states.append(x)
+            actions.append(u)
+            terminated.append(ended)
+        _require_paddable(folder, states, actions)
+        if meaning["dt"] is None:
+            warnings.warn(
+                f"{given} does not say how long a step is; one step counts as one second. Say dt=...",
+                stacklevel=2,
+            )
+            meaning["dt"] = 1.0
+        return Trajectories.ragged(states, actions, **meaning, terminated=terminated)
+    except (
+        Exception
+    ) as error:  # what the files say goes through other libraries, which may fail in any way
+        raise StoreError(
+            f"{given} holds no usable Minari data set: {str(error) or repr(error):.500}. Expected flat Box spaces and "
+            "plain numbers in main_data.hdf5: ask whoever made it for a copy written by Minari itself."
+        ) from error
+
+
+def save_minari(
+    dataset_id: str, trajectories: Trajectories, rewards: np.ndarray | None = None
+) -> Path:
+    """Write ``trajectories`` as the local Minari data set ``dataset_id`` ("tsm/reacher/random-v0"). Returns its folder.
+
+    Actions are written in the bounds of the environment's action space where Gymnasium knows its id, else in [-1, 1].
+    rewards: (N, T); zeros where there are none. Minari keeps its data sets in $MINARI_DATASETS_PATH, or ~/.minari.
+    """
+    from gymnasium.spaces import Box
+
+    from tsmlib.envs.stepping import within_bounds
+
+    minari, t = _minari(dataset_id), trajectories
+    buffer = minari.data_collector.EpisodeBuffer
+    given = np.zeros(t.actions.shape[:2]) if rewards is None else rewards
+    made_by, actions = _environment(t), Box(-1, 1, t.actions.shape[2:])
+    if made_by is not None:
+        actions = made_by.action_space
+    ended = t.terminated or (False,) * len(t)
+    episodes = []
+    for i, steps in enumerate(t.steps):
+        last = np.arange(steps) == steps - 1
+        u = within_bounds(t.actions[i, :steps], actions)
+        episodes.append(
+            buffer(
+                observations=t.states[i, : steps + 1],
+                actions=u,
+                rewards=given[i, :steps],
+                terminations=last & ended[i],
+                truncations=last & (not ended[i]),
+            )
+        )
+    fields = ", ".join(f"{name} ({unit})" for name, unit in zip(t.names, t.units, strict=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore"
+        )  # of author, licence and evaluation, which data need not have
+        made = minari.create_dataset_from_buffers(
+            dataset_id,
+            episodes,
+            env=None if made_by is None else made_by.spec,
+            observation_space=Box(-np.inf, np.inf, t.states.shape[2:]),
+            action_space=actions,
+            description=f"{t.env}, {t.dt} s per step. Observations: {fields}.",
+        )
+        about = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
+        made.storage.update_metadata({"tsmlib": about})
+    return Path(made.spec.data_path).parent
+
+
+def _minari(what: PathLike) -> ModuleType:
+    try:
+        import h5py  # noqa: F401
+        import minari
+    except ImportError:
+        raise StoreError(
+            f"{what}: Minari data sets need minari and h5py: pip install 'tsmlib[minari]'"
+        ) from None
+    return minari
+
+
+def _environment(t: Trajectories) -> Any:
+    """The Gymnasium environment of these data, where its id is known here and its spaces are those of the data."""
+    import gymnasium
+
+    if ":" in t.env or t.env not in gymnasium.registry:
+        return None
+    env = gymnasium.make(t.env, disable_env_checker=True)
+    spaces = (env.observation_space, env.action_space)
+    fits = [getattr(space, "shape", None) for space in spaces] == [
+        t.states.shape[2:],
+        t.actions.shape[2:],
+    ]
+    bounded = all(np.isfinite(getattr(spaces[1], side, np.inf)).all() for side in ("low", "high"))
+    return env if fits and bounded else None
+
+
+def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
+    """What the metadata say of environment and states. ValueError where they say something else than they should."""
+    about: Any = metadata.get("tsmlib")
+    if about is None:
+        stated: Any = metadata.get("env_spec")
+        env = json.loads(stated)["id"] if stated is not None else metadata["dataset_id"]
+        about = {
+            "env": env,
+            "dt": None,
+            "names": [f"x{d}" for d in range(dx)],
+            "units": [""] * dx,
+            "angles": [],
+        }
+    words = [about["env"], *about["names"], *about["units"]]
+    dt = about["dt"]
+    if not all(isinstance(word, str) and len(word) <= 500 for word in words):
+        raise ValueError(f"env, names and units are {words!r:.200}, expected texts")
+    if dt is not None and not (isinstance(dt, int | float) and 0 < dt < math.inf):
+        raise ValueError(f"dt is {dt!r:.80}, expected seconds above 0")
+    if not all(type(index) is int and 0 <= index < dx for index in about["angles"]):
+        raise ValueError(
+            f"angles are {about['angles']!r:.80}, expected some of the {dx} state dimensions"
+        )
+    lists = {name: tuple(about[name]) for name in ("names", "units", "angles")}
+    return {"env": about["env"], "dt": dt} | lists
+
+
+def _episodes(
+    dataset: Any, low: np.ndarray, high: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
+    """States (T + 1, dx), actions (T, du) in [-1, 1], and whether the environment ended it, of each episode."""
+    centre, half = (low + high) / 2, (high - low) / 2
+    for number, episode in enumerate(dataset.iterate_episodes()):
+        actions, over = (
+            np.asarray(episode.actions, np.float64),
+            np.asarray(episode.terminations).astype(bool),
+        )
+        if actions.ndim != 2 or actions.shape[1] != len(low) or not len(actions) == len(over) > 0:
+            raise ValueError(
+                f"episode {number} has actions {actions.shape} and terminations {over.shape}, expected (T, {len(low)}) "
+                "and (T,) with at least one step"
+            )
+        if over[:-1].any():
+            raise ValueError(
+                f"episode {number} goes on after its termination at step {int(over.argmax())}, expected its end there"
+            )
+        scaled = (actions - centre) / half
+        if (most := np.abs(scaled).max()) > 1 + 1e-5:
+            raise ValueError(
+                f"actions of episode {number} leave the action space, by a factor of {most:g}, expected them within "
+                f"{low.tolist()!s:.80} to {high.tolist()!s:.80}"
+            )
+        yield (
+            np.asarray(episode.observations, np.float32),
+            scaled.clip(-1, 1).astype(np.float32),
+            bool(over[-1]),
+        )
+
+
+def _require_paddable(folder: Path, states: list[np.ndarray], actions: list[np.ndarray]) -> None:
+    """ValueError where few long episodes among many short ones would need far more memory than the file has bytes."""
+    longest = max(len(u) for u in actions)
+    padded = (
+        len(actions) * ((longest + 1) * states[0].shape[-1] + longest * actions[0].shape[-1]) * 4
+    )
+    if padded > MAX_RATIO * (folder / "main_data.hdf5").stat().st_size:
+        raise ValueError(
+            f"its {len(actions)} episodes of up to {longest} steps, padded to one length, take {padded / 1e9:.2g} GB, "
+            f"more than {MAX_RATIO} times the file: read it with minari and cut the long ones into pieces"
+        )
+
+
+def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarray, np.ndarray]:
+    """Two flat Box spaces, as many episodes as stated, and numbers within the file itself, no more than it can hold.
+
+    The bounds (du,) of the actions.
+    """
+    import h5py
+
+    stated: Any = metadata
+    _box("observations", stated["observation_space"])
+    low, high = _box("actions", stated["action_space"])
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise ValueError(
+            f"actions have no bounds, {stated['action_space']:.100}: nothing says how to scale them to [-1, 1]; "
+            f"{_SUPPORTED}. Read it with minari, scale its actions, and make a Trajectories.ragged(...)"
+        )
+    if stated["data_format"] != "hdf5":
+        raise ValueError(
+            f"its data are in the format {stated['data_format']!r:.80}, expected 'hdf5'"
+        )
+    file = folder / "main_data.hdf5"
+    left = MAX_RATIO * len(read_bytes(file))
+
+    def look(name: str, link: object) -> None:
+        nonlocal left
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(
+                f"{name[:80]!a} is a link ({type(link).__name__}), possibly to another file"
+            )
+        found = root[name]
+        if isinstance(found, h5py.Dataset):
+            left -= found.nbytes
+            if found.external or found.is_virtual:
+                raise ValueError(f"{name[:80]!a} has its data in other files or arrays")
+            if found.dtype.kind not in "fiub":
+                raise ValueError(f"{name[:80]!a} holds {found.dtype}, not numbers")
+            if left < 0:
+                raise ValueError(
+                    f"{name[:80]!a} declares {found.nbytes} bytes, more than the file can hold"
+                )
+
+    with h5py.File(file, "r", locking=False) as root:
+        root.visititems_links(look)
+        if not len(root) == stated["total_episodes"] > 0:
+            raise ValueError(
+                f"it holds {len(root)} groups, but states {stated['total_episodes']!r:.80} episodes"
+            )
+    return low, high
+
+
+def _box(what: str, stated: str) -> tuple[np.ndarray, np.ndarray]:
+    """The bounds (n,) of a flat Box; ValueError naming another space and what is supported."""
+    space: Any = json.loads(stated)  # infinite bounds and all
+    kind = {"Dict": "a dictionary", "Discrete": "discrete", "MultiDiscrete": "discrete"}.get(
+        space["type"], f"a {space['type']!s:.40}"
+    )
+    if space["type"] == "Box":
+        kind = {1: "", 2: "images", 3: "images"}.get(len(space["shape"]), "not flat")
+    if kind:
+        raise ValueError(f"{what} are {kind}, {stated:.80}; {_SUPPORTED}")
+    if {(len(space["low"]),), (len(space["high"]),)} != {tuple(space["shape"])}:
+        raise ValueError(
+            f"the space of the {what} is {stated:.80}, expected as many bounds as dimensions"
+        )
+    if np.dtype(space["dtype"]).kind not in "fiu":
+        raise ValueError(f"{what} are of type {space['dtype']!r:.80}, expected numbers")
+    return np.array(space["low"], np.float64), np.array(space["high"], np.float64)

@@ -1,0 +1,95 @@
+"""Models and tasks that come with the package."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
+
+import gymnasium
+import numpy as np
+import torch
+
+import tsmlib.envs
+from tsmlib import zoo
+from tsmlib.envs.physics import Physics
+from tsmlib.envs.spec import EnvSpec
+from tsmlib.planning.tasks import Task
+from tsmlib.storage import artifacts
+
+if TYPE_CHECKING:
+    from tsmlib.models.base import DynamicsModel
+
+_PACKAGE = Path(__file__).resolve().parent
+INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
+ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
+PRETRAINED, TASKS = ROOT / "data" / "pretrained", ROOT / "data" / "tasks"
+TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
+
+
+def load_pretrained(model: str, *, env: str) -> DynamicsModel:
+    """A trained model that comes with the package.
+
+    Args:
+        model: its word in the zoo, such as "rtsm", "tsm", "onestep" or "prior".
+        env: id of the environment that it predicts.
+
+    Returns:
+        The model, on the CPU.
+
+    Raises:
+        ValueError: no such model ships for this environment; the message names those that do.
+    """
+    trained_on = zoo.trained_on(env, model)
+    folder = PRETRAINED / EnvSpec.parse(trained_on).name
+    if not (path := folder / f"{model}.safetensors").exists():
+        there = [path.stem for path in sorted(folder.glob("*.safetensors")) if path.stem in zoo.ZOO]
+        known = f"there are {', '.join(there)}" if there else "there are none"
+        raise ValueError(f"no pretrained {model} of {env} in {folder}: {known}.")
+    expect = tsmlib.envs.fingerprint(trained_on)
+    cls = zoo.find(model).load()
+    return cast("DynamicsModel", artifacts.load_model(path, cls, expect=expect))
+
+
+def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:
+    """A hundred starts and targets of an arm's task; the test ones are frozen.
+
+    A variant with noise, delay, another mass, damping or gain has the task of the standard arm.
+
+    Args:
+        env: id of the environment.
+        split: "test", which no choice was made on, or "validation".
+
+    Returns:
+        The task.
+    """
+    spec = EnvSpec.parse(env)
+    shape = Physics(
+        link_lengths=spec.physics.link_lengths, object_radius=spec.physics.object_radius
+    )
+    arm = replace(spec.arm, physics=shape).id
+    if arm != env:
+        return replace(load_task(arm, split), env=env)
+    path = TASKS / f"{spec.name}.safetensors"
+    if split == "test" and path.exists():
+        tensors, header = artifacts.load(path, kind="task")
+        artifacts.require_fit(path, header, {"env": env})
+        return Task.standard(env, tensors["start"].numpy(), tensors["target"])
+    return draw_task(env, seed=TASK_SEED[split])
+
+
+def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
+    """Starts and targets from the resets of an arm.
+
+    Args:
+        env: id of the environment.
+        seed: of the first reset.
+        n: number of starts.
+
+    Returns:
+        The task.
+    """
+    with closing(gymnasium.make_vec(env, num_envs=n)) as copies:
+        start, info = copies.reset(seed=seed)
+    return Task.standard(env, start.astype(np.float32), torch.from_numpy(info["target"]).float())
