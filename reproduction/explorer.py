@@ -1,18 +1,14 @@
-"""The explorer, a page in which a person plans and MuJoCo executes, served to this machine alone."""
+"""The explorer, a page in which a person plans and MuJoCo executes, served to this machine."""
 
 from __future__ import annotations
 
 import functools
 import http.server
-import urllib.request
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from reproduction.runs import ROOT, RunError
-
-if TYPE_CHECKING:
-    from IPython.display import IFrame, Markdown
+from reproduction.runner import RunError
+from tsmlib.pretrained import ROOT
 
 PAGE = ROOT / "explorer" / "dist"
 PORT = 8765
@@ -20,8 +16,8 @@ TYPES = {".wasm": "application/wasm", ".js": "text/javascript", ".f32": "applica
 HEADERS = {
     "Cache-Control": "no-cache",  # a page that was built again is not mixed with the one before
     "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data:",  # MuJoCo's bindings are made at run time, hence unsafe-eval
+    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data:",  # MuJoCo's bindings are made at run time, hence unsafe-eval
 }
 
 
@@ -70,19 +66,3 @@ def serve(*, port: int = PORT, browser: bool = False) -> None:
         if browser:
             webbrowser.open(address)
         running.serve_forever()
-
-
-def frame(*, port: int = PORT) -> IFrame | Markdown:
-    """The page in a frame, for the last line of a notebook's cell; where nothing serves it, how to serve it."""
-    from IPython.display import IFrame, Markdown
-
-    address = f"http://127.0.0.1:{port}/"
-    try:
-        with urllib.request.urlopen(address, timeout=2):
-            return IFrame(address, width="100%", height=900)
-    except OSError:
-        return Markdown(
-            "The explorer is not served on this machine. In a checkout of the repository, build it once with "
-            "`make explorer` (which takes node and npm), leave `python -m tsmlib explore` running in a terminal, and "
-            f"run this cell again; or open {address} in a browser then."
-        )

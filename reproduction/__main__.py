@@ -1,0 +1,83 @@
+"""Commands of the reproduction: ``python -m tsmlib`` hands these on.
+
+``run NOTEBOOK`` executes a notebook, ``run all`` all of them in order; ``explore`` serves the
+explorer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from reproduction import explorer, runner
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: the words after ``python -m tsmlib``; the command line's where it is None.
+
+    Returns:
+        0 done, 1 it failed, 2 bad arguments, 130 interrupted.
+    """
+    arguments = _parser().parse_args(argv)
+    try:
+        return arguments.do(arguments)
+    except (RuntimeError, ValueError, TypeError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, ValueError | TypeError) else 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tsmlib", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = commands.add_parser("run", help="execute a notebook into runs/<scale>/seed<seed>/")
+    run.add_argument(
+        "notebook", help=f"{', '.join(runner.notebooks())}, all, or the path of a copy"
+    )
+    run.add_argument("--scale", default="laptop", help=f"{', '.join(runner.SCALES)}")
+    run.add_argument("--seed", type=int, default=0)
+    run.add_argument(
+        "-p",
+        dest="given",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="another parameter of the notebook",
+    )
+    run.set_defaults(do=_run)
+    explore = commands.add_parser("explore", help="serve the explorer, a page, on 127.0.0.1")
+    explore.add_argument("--port", type=int, default=explorer.PORT, help="0 is any that is free")
+    explore.add_argument("--open", action="store_true", help="open it in a browser")
+    explore.set_defaults(do=_explore)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    texts = dict[str, str]()
+    for item in arguments.given:
+        name, equals, text = item.partition("=")
+        if not equals or name in ("scale", "seed"):
+            raise ValueError(f"-p {item!r:.80}: expected NAME=VALUE; --scale and --seed for these")
+        texts[name] = text
+    parameters = runner.Parameters(arguments.scale, arguments.seed)
+    runner.require_tools()
+    word = arguments.notebook
+    paths = list(runner.notebooks().values()) if word == "all" else [runner.find(word)]
+    for path, values in [(path, runner.typed(path, texts)) for path in paths]:
+        print(runner.execute(path, parameters, values))
+    return 0
+
+
+def _explore(arguments: argparse.Namespace) -> int:
+    explorer.serve(port=arguments.port, browser=arguments.open)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""The paper's claims, their verdicts and reports."""
