@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from tsmlib.plots.checks import finite
-from tsmlib.plots.style import BLUE, ORANGE, PALE, RED, entry, legend, panels, styled
+from tsmlib.plots.style import BLUE, ORANGE, PALE, RED, entry, grid, legend, numbers, styled
 
 LOOKS: dict[str, dict[str, Any]] = {  # a colour for each; black is the true simulator
     "train": dict(color=BLUE, marker="o"),
@@ -52,7 +51,8 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     lowest to the highest; each line's exponent stands in the panel, with its spread over rounds, unless that is more
     than UNCLEAR. Grey: linear growth, or for threads a cost that falls in proportion.
     """
-    figure, axes = panels(len(curves), 4, 1.65)
+    lines_of = {title: dict.fromkeys(lines, ()) for title, lines in curves.items()}
+    figure, axes = grid(lines_of, 4, 1.65)
     for ax, (title, lines) in zip(axes, curves.items(), strict=True):
         every = np.unique(np.concatenate([np.asarray(sizes, float) for sizes, _ in lines.values()]))
         slope = -1 if title == "threads" else 1
@@ -60,8 +60,8 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         ax.plot(lowest, (lowest / lowest[0]) ** slope, color=PALE, ls="--", lw=0.8, zorder=1)
         notes = []
         for word, (sizes, seconds) in lines.items():
-            sizes = finite(f"sizes of {title}, {word}", sizes, "K")
-            seconds = finite(f"seconds of {title}, {word}", seconds, f"R {len(sizes)}")
+            sizes = numbers(f"sizes of {title}, {word}", sizes, "K")
+            seconds = numbers(f"seconds of {title}, {word}", seconds, f"R {len(sizes)}")
             relative = seconds / seconds[:, :1]
             middle = np.median(relative, axis=0)
             bars = np.stack([middle - relative.min(0), relative.max(0) - middle])
@@ -99,7 +99,9 @@ def growth(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     for ax in axes[::4]:
         ax.set_ylabel("cost (of the smallest)")
     used = [word for word in LOOKS if any(word in lines for lines in curves.values())]
-    entries = [entry(WORDS[word], **LOOKS[word], ms=3) for word in used]
-    entries.append(entry("in proportion", color=PALE, ls="--", lw=0.8))
-    legend(figure, entries, 7)
+    entries = [
+        entry(WORDS[word], LOOKS[word]["color"], marker=LOOKS[word]["marker"]) for word in used
+    ]
+    entries.append(entry("in proportion", PALE, "--"))
+    legend(figure, entries)
     return figure

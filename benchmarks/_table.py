@@ -15,7 +15,7 @@ from typing import Any
 import growth
 from _rounds import EXTRA, Row, figure, folder, load, text
 
-from tsmlib.plots import style
+from tsmlib import plots
 from tsmlib.storage import files
 from reproduction import runs
 
@@ -288,7 +288,7 @@ def publish(found: Found) -> None:
     if missing := [name for name in ORDER if name not in found]:
         lines += ["", f"Not measured: {', '.join(missing)}."]
     if (folder() / "growth_rows.csv").exists():
-        style.save(growth.draw(folder()), PICTURE)
+        plots.save(growth.draw(folder()), PICTURE.with_suffix(".png"))
         lines += ["", f"![How cost grows with the size of things](../figures/{PICTURE.name}.png)"]
     before, _, rest = DOCS.read_text().partition(MARKS[0])
     after = rest.partition(MARKS[1])[2]

@@ -213,10 +213,10 @@ _TSM, _RECURRENT, _ONE_STEP, _LSTM, _ENSEMBLE, _PRIOR = (
     )
 )
 _MODELS = (
-    ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, PAPER, _wide, planned=True),
+    ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, PAPER, _wide, planned=True),
     ModelSpec(
         "rtsm",
-        Look("recurrent TSM", "#003C8F", "*"),
+        Look("recurrent TSM", "#0B2F8A", "*"),
         _RECURRENT,
         RECURRENT,
         planned=True,

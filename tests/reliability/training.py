@@ -423,13 +423,13 @@ def full_disk(trials: int = 0) -> Outcome:
 
     with folder() as place:
         data, table, picture, film = (
-            place / f"x.{kind}" for kind in ("safetensors", "csv", "pdf", "mp4")
+            place / f"x.{kind}" for kind in ("safetensors", "csv", "png", "mp4")
         )
         rows = [{"metric": "success", "value": 0.5, "n": i} for i in range(200)]
         writers: dict[Path, Callable[[], Any]] = {
             data: lambda: artifacts.save_trajectories(data, TRAIN),
             table: lambda: tables.save(table, rows),
-            picture: lambda: figures.save(Figure(), place / "x"),
+            picture: lambda: figures.save(Figure(), place / "x.png"),
         }
         for path, write in writers.items():
             write()

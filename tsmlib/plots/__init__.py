@@ -1,10 +1,11 @@
-"""Figures: arrays in, a matplotlib figure out; one file per subject.
+"""Figures: panels in, a matplotlib figure out.
 
-Every function draws in the style of ``tsmlib.mplstyle`` and returns its ``Figure`` with nothing left open in pyplot: as
-the last line of a notebook cell it shows once, and ``save`` writes it. ``__init__.pyi`` lists what is here; a file is
-imported when a name of it is first used.
+Every figure function takes a mapping from the title of a panel to what the panel shows: a mapping
+from a word to an array. The word is the key of a model in ``tsmlib.zoo``, which gives its name and
+its hue in every figure, or any label. A figure is returned and never left open in pyplot: as the
+last line of a notebook cell it shows once, and ``save`` writes it.
 
-Letters in shapes: n episodes, T steps, S samples, dx state size, H and W pixels.
+Letters in shapes: n lines, S samples, T steps, dx state size, H and W pixels.
 """
 
 import lazy_loader

@@ -23,9 +23,9 @@ class Look:
 
 @dataclass(frozen=True)
 class Method:
-    """A model and the way it was used: the key of every mapping that a figure or a table of methods takes.
+    """A model and the way it was used: the key of every mapping of methods.
 
-    search_space: latent or direct, the planner's or the policy's; variant: what else distinguishes two uses of a model.
+    search_space: latent or direct; variant: what else distinguishes two uses of a model.
     Methods are compared without their look.
     """
 

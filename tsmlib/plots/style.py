@@ -1,13 +1,12 @@
-"""Style of all figures: the style file, colours, legends, and files whose bytes do not change."""
+"""Style of all figures: the style file, one name and one hue per model, legends, and files."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import ParamSpec
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,27 +14,27 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike
 
+from tsmlib import zoo
+from tsmlib.plots.method import Look
 from tsmlib.storage.files import write_bytes
 
 P = ParamSpec("P")
-Props = dict[str, Any]  # keyword arguments of a matplotlib line
+Dashes = str | tuple[int, tuple[float, ...]]  # matplotlib's
+Panels = Mapping[str, Mapping[str, ArrayLike]]  # title -> word -> array
 
 STYLE = str(Path(__file__).with_name("tsmlib.mplstyle"))
-WIDTH = 7.0  # inches: the text width of a two-column journal page
-BLUE, ORANGE, RED = "#0072B2", "#E69F00", "#D55E00"  # Okabe and Ito's, where no method is drawn
-DARK, NOTE, PALE, GRID = (
-    "#4A4A4A",
-    "#555555",
-    "#B0B0B0",
-    "#EEEEEE",
-)  # data and simulator, small words, lines behind
-DASHED = (0, (3, 1.5))
-JOINTS = ("shoulder", "elbow")
+WIDTH = 7.0  # inches, the text width of a two-column page
+DARK, NOTE, PALE, GRID = "#222222", "#555555", "#B0B0B0", "#E6E6E6"
+BLUE, ORANGE, RED = "#0072B2", "#E69F00", "#D55E00"  # Okabe and Ito's, where no model is drawn
+TRUTH = ("simulator", "executed")  # words that are drawn in black, above everything else
+LABELS = ("#4A4A4A", "#9467BD", "#17807E", "#A05A2C", "#8C8C8C", "#C05C8E")  # of other words
+DASHES: tuple[Dashes, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Run ``draw`` in the package's style and leave no figure open in pyplot, whether it returns or raises."""
+    """Run ``draw`` in the package's style and leave no figure open in pyplot."""
 
     @wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -50,152 +49,138 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-def save(figure: Figure, stem: str | Path) -> tuple[Path, Path]:
-    """Write ``<stem>.pdf`` and ``<stem>.png``, each in one step; the same figure gives the same bytes, on any day."""
-    pdf, png = Path(f"{stem}.pdf"), Path(f"{stem}.png")
-    none: dict[Path, dict[str, None]] = {
-        pdf: {"CreationDate": None, "Creator": None, "Producer": None},
-        png: {"Software": None},
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure in one step; the same figure gives the same bytes on any day.
+
+    Args:
+        figure: what a function of ``tsmlib.plots`` returned.
+        path: the file, which ends in .png, .svg or .pdf.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: another ending.
+    """
+    path = Path(path)
+    undated: dict[str, dict[str, None]] = {
+        ".png": {"Software": None},
+        ".svg": {"Date": None, "Creator": None},
+        ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
     }
-    for path, metadata in none.items():
-        _write(figure, path, metadata)
-    return pdf, png
-
-
-def save_svg(figure: Figure, path: Path) -> Path:
-    """Write an SVG file in one step, its words as words; the same figure gives the same bytes, on any day."""
-    _write(figure, path, {"Date": None, "Creator": None})
+    if path.suffix not in undated:
+        raise ValueError(f"{path} ends in {path.suffix!r}; expected .png, .svg or .pdf")
+    drawn = BytesIO()  # the disk may be full
+    with plt.style.context(STYLE):
+        figure.savefig(drawn, format=path.suffix[1:], metadata=undated[path.suffix])
+    write_bytes(path, drawn.getvalue())
     return path
 
 
-def _write(figure: Figure, path: Path, metadata: dict[str, None]) -> None:
-    drawn = BytesIO()  # the disk may be full
-    with plt.style.context(STYLE):
-        figure.savefig(drawn, format=path.suffix[1:], metadata=metadata)
-    write_bytes(path, drawn.getvalue())
+def looks(panels: Panels) -> dict[str, tuple[Look, Dashes]]:
+    """Name, hue and dashes of each word of some panels, in the order in which they are met.
+
+    A word of ``tsmlib.zoo`` has the look of its model everywhere. What follows a comma tells uses
+    of one model apart, by dashes: ``"rtsm, without prior"``.
+    """
+    found: dict[str, tuple[Look, Dashes]] = {}
+    labels = 0
+    for word in dict.fromkeys(word for series in panels.values() for word in series):
+        model, comma, use = word.partition(", ")
+        if model in TRUTH:
+            known = Look(model, DARK)
+        elif model in zoo.ZOO or model in zoo.LOOKS:
+            known = zoo.look(model)
+        else:
+            known = Look(model, LABELS[labels % len(LABELS)])
+            labels += 1
+        same = sum(other.colour == known.colour for other, _ in found.values())
+        name = f"{known.name}, {use}" if comma else known.name
+        found[word] = Look(name, known.colour, known.marker), DASHES[same % len(DASHES)]
+    return found
+
+
+def numbers(name: str, value: ArrayLike, *shapes: str) -> np.ndarray:
+    """``value`` as an array of floats, of one of some shapes such as ``"T"`` and ``"S T 2"``.
+
+    Raises:
+        ValueError: another shape, nothing in it, or an infinite value; NaN is a gap.
+    """
+    array = np.asarray(value, float)
+    fits = any(
+        array.ndim == len(sizes)
+        and all(s.isalpha() or int(s) == n for s, n in zip(sizes, array.shape, strict=False))
+        for sizes in (shape.split() for shape in shapes)
+    )
+    if not fits or not array.size:
+        expected = " or ".join(f"({', '.join(shape.split())})" for shape in shapes)
+        raise ValueError(f"{name} has shape {array.shape}; expected {expected}")
+    if np.isinf(array).any():
+        raise ValueError(f"{name} holds infinite values; leave them out or replace them by NaN")
+    return array
+
+
+def grid(
+    panels: Panels, columns: int, height: float, *, share: str = "", width: float = WIDTH
+) -> tuple[Figure, list[Axes]]:
+    """A figure with one titled panel for each of ``panels``, ``height`` inches each.
+
+    share: axes that all panels have in common, "x", "y" or "xy".
+    """
+    if not panels or not all(len(series) for series in panels.values()):
+        raise ValueError("there is nothing to draw: panels, or one of them, is empty")
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(width, rows * height + 0.3),
+        sharex="x" in share,
+        sharey="y" in share,
+        squeeze=False,
+    )
+    for ax in axes.flat[len(panels) :]:
+        ax.remove()
+    for ax, title in zip(axes.flat, panels, strict=False):
+        ax.set_title(title)
+    return figure, list(axes.flat[: len(panels)])
+
+
+def entry(label: str, colour: str, dashes: Dashes = "-", marker: str = "") -> Line2D:
+    """A line of a legend."""
+    return Line2D([], [], label=label, color=colour, ls=dashes, marker=marker, ms=6)
+
+
+def legend(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """A legend above all panels, in as many rows as the figure's width asks for."""
+    for rows in range(1, len(handles) + 1):
+        drawn = figure.legend(
+            handles=handles, loc="outside upper left", ncols=-(-len(handles) // rows)
+        )
+        if drawn.get_window_extent().width <= figure.bbox.width or rows == len(handles):
+            figure.set_figheight(figure.get_figheight() + 0.14 * rows)
+            return
+        drawn.remove()
 
 
 def tint(colour: str, share: float = 0.5) -> tuple[float, float, float]:
-    """``colour`` mixed with white; the elbow is drawn in the shoulder's colour, lighter."""
+    """``colour`` mixed with ``share`` of white."""
     red, green, blue = (1 - share * (1 - part) for part in to_rgb(colour))
     return red, green, blue
 
 
-def panels(
-    count: int,
-    columns: int,
-    height: float,
-    *,
-    width: float = WIDTH,
-    head: float = 0.35,
-    **options: Any,
-) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` axes in rows of ``columns``, each ``height`` inches; unused places stay empty."""
-    columns = min(columns, count)
-    rows = -(-count // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(width, rows * height + head), squeeze=False, **options
-    )
-    for ax in axes.flat[count:]:
-        ax.remove()
-    return figure, list(axes.flat[:count])
-
-
-def entry(label: str, **look: Any) -> Line2D:
-    """A line of a legend."""
-    return Line2D([], [], **look, label=label)
-
-
-def legend(figure: Figure, handles: Sequence[Line2D], columns: int = 8) -> int:
-    """A legend above all panels, where it covers nothing, of no more columns than its rows need and fewer where these
-    are wider than the figure; the number of rows."""
-    rows = max(1, -(-len(handles) // columns))
-    while True:
-        columns = -(-len(handles) // rows) or 1
-        drawn = figure.legend(handles=handles, loc="outside upper left", ncols=columns)
-        if columns == 1 or drawn.get_window_extent().width <= figure.bbox.width:
-            return rows
-        drawn.remove()
-        rows += 1
-
-
-def stamp(figure: Figure, text: str) -> Figure:
-    """The figure with a line below everything that says where its numbers are from."""
-    lines = textwrap.wrap(text, int(figure.get_figwidth() / 0.056))
-    with plt.style.context(STYLE):
-        if lines:
-            figure.set_figheight(figure.get_figheight() + 0.12 * len(lines) + 0.06)
-            told = entry("\n".join(lines), ls="")
-            figure.legend(
-                handles=[told],
-                loc="outside lower left",
-                handlelength=0,
-                handletextpad=0,
-                labelcolor=NOTE,
-            )
-    return figure
-
-
-def joint_legend(figure: Figure, main: str = DARK) -> None:
-    """Which line is the shoulder's and which the elbow's."""
-    legend(figure, [entry(JOINTS[0], color=main), entry(JOINTS[1], color=tint(main))])
-
-
-def note(ax: Axes, text: str, x: float, y: float) -> None:
-    """Small words inside a panel, at shares of its width and height, set towards its middle."""
-    ax.annotate(
-        text,
-        (x, y),
-        xycoords="axes fraction",
-        ha="left" if x < 0.5 else "right",
-        va="bottom" if y < 0.5 else "top",
-        fontsize=6.5,
-        color=NOTE,
-    )
-
-
-def above(ax: Axes, text: str, x: float) -> None:
-    """Small words on the upper edge of a panel, to the right of its left end (x = 0) or to the left of its right."""
-    ax.annotate(
-        text,
-        (x, 1),
-        (0, 1),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=6.5,
-        color=NOTE,
-        ha="right" if x else "left",
-        va="bottom",
-    )
-
-
 def scene(ax: Axes) -> None:
-    """A picture of the plane, framed and without numbers."""
+    """Make ``ax`` a picture of the plane: equal scales, a thin frame, no numbers."""
     ax.set(aspect="equal", xticks=(), yticks=())
     ax.set_axis_on()
     ax.spines[:].set(visible=True, color="#CCCCCC")
 
 
-def rows_only(ax: Axes) -> None:
-    """No line and no ticks on the left: the rows have names."""
-    ax.spines["left"].set_visible(False)
-    ax.tick_params(axis="y", length=0)
-
-
-def torques(ax: Axes, actions: np.ndarray, dt: float, main: str, limit: float = 1.0) -> None:
-    """Both torques of one episode, actions (T, 2), as the arm gets them: constant over each step."""
-    seconds = np.arange(len(actions) + 1) * dt
-    for joint, shade, order in ((1, tint(main), 2), (0, main, 3)):
-        held = np.append(actions[:, joint], actions[-1, joint])
-        ax.step(seconds, held, where="post", color=shade, zorder=order)
-    ax.set(xlim=(0, seconds[-1]), ylim=(-1.08 * limit, 1.08 * limit))
-    ax.locator_params(nbins=4)
-    ax.axhline(0, color="#DDDDDD", lw=0.5, zorder=0)
-
-
-def torque_labels(figure: Figure) -> None:
-    """The axes that all panels of torques share; time below each of the lowest, not where the stamp stands."""
-    for ax in figure.axes:
-        if (place := ax.get_subplotspec()) and place.is_last_row():
-            ax.set_xlabel("time (s)")
-    figure.supylabel("torque (share of full)", fontsize=7)
+def outer(figure: Figure, axes: Iterable[Axes], x_label: str, y_label: str) -> None:
+    """Name the axes once: x below the lowest panels, y beside the whole figure."""
+    for ax in axes:
+        place = ax.get_subplotspec()
+        if place is not None and place.is_last_row():
+            ax.set_xlabel(x_label)
+    if y_label:
+        figure.supylabel(y_label, fontsize=7)

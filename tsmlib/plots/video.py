@@ -1,7 +1,7 @@
-"""Films of an arm: side by side and one above another, as files, and as pictures that move inside a notebook.
+"""Films: side by side, one above another, as files, and as pictures that move inside a notebook.
 
-A notebook's film is an animated PNG. JupyterLab removes the source of a ``<video>`` from a notebook that it does not
-trust, as from any that was executed elsewhere, and GitHub shows none; both show a picture.
+A notebook's film is an animated PNG. JupyterLab removes the source of a ``<video>`` from a notebook
+that it does not trust, as from any that was executed elsewhere; it shows a picture.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -21,26 +21,25 @@ from tsmlib.storage.files import write_bytes
 if TYPE_CHECKING:
     from IPython.display import Image
 
-
-ANIMATED = {".png": "PNG", ".gif": "GIF", ".webp": "WEBP"}
-
-
-def _frames(field: str, frames: np.ndarray) -> np.ndarray:
-    frames = np.asarray(frames)
-    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
-        raise ValueError(
-            f"{field} is {frames.dtype} {frames.shape}, expected uint8 (T, H, W, 3) with at least one frame"
-        )
-    return frames
+Form = Literal["PNG", "GIF", "WEBP"]
+ANIMATED: dict[str, Form] = {".png": "PNG", ".gif": "GIF", ".webp": "WEBP"}
 
 
 def side_by_side(films: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Films as one, (T, H + strip, W1 + W2 + ..., 3), its label above each; a shorter one waits on its last frame."""
+    """Films as one, each below its label; a shorter one waits on its last frame.
+
+    Args:
+        films: label -> frames (T, H, W, 3) uint8, all of one height.
+
+    Returns:
+        Frames (T, H + strip, W1 + W2 + ..., 3).
+
+    Raises:
+        ValueError: no film, or films of different heights.
+    """
     films = {label: _frames(label, film) for label, film in films.items()}
-    if (
-        len(heights := {label: film.shape[1] for label, film in films.items()}) == 0
-        or len({*heights.values()}) > 1
-    ):
+    heights = {label: film.shape[1] for label, film in films.items()}
+    if len(set(heights.values())) != 1:
         found = ", ".join(f"{label} {pixels}" for label, pixels in heights.items()) or "no film"
         raise ValueError(
             f"films of one height are expected, found pixels: {found}; render all at one height"
@@ -48,7 +47,6 @@ def side_by_side(films: Mapping[str, np.ndarray]) -> np.ndarray:
     length, height = max(map(len, films.values())), max(20, max(heights.values()) // 14)
     parts = []
     for label, film in films.items():
-        held = _waiting(film, length)
         banner = Figure(figsize=(film.shape[2] / 100, height / 100), dpi=100, facecolor="white")
         banner.text(
             0.5, 0.45, label, ha="center", va="center", fontsize=0.5 * height, family="DejaVu Sans"
@@ -56,30 +54,48 @@ def side_by_side(films: Mapping[str, np.ndarray]) -> np.ndarray:
         canvas = FigureCanvasAgg(banner)
         canvas.draw()
         strip = np.asarray(canvas.buffer_rgba())[..., :3]
-        parts.append(np.concatenate([np.broadcast_to(strip, (length, *strip.shape)), held], axis=1))
+        above = np.broadcast_to(strip, (length, *strip.shape))
+        parts.append(np.concatenate([above, _waiting(film, length)], axis=1))
     return np.concatenate(parts, axis=2)
 
 
 def stacked(above: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Two films as one, (T, H1 + H2, W, 3); the shorter one waits on its last frame."""
+    """Two films as one; the shorter one waits on its last frame.
+
+    Args:
+        above: frames (T1, H1, W, 3) uint8.
+        below: frames (T2, H2, W, 3) uint8.
+
+    Returns:
+        Frames (T, H1 + H2, W, 3).
+
+    Raises:
+        ValueError: films of different widths.
+    """
     above, below = _frames("above", above), _frames("below", below)
     if above.shape[2] != below.shape[2]:
         raise ValueError(
-            f"above is {above.shape[2]} pixels wide and below {below.shape[2]}; render both at one width"
+            f"above is {above.shape[2]} pixels wide and below {below.shape[2]}; render both at one "
+            "width"
         )
     length = max(len(above), len(below))
     return np.concatenate([_waiting(above, length), _waiting(below, length)], axis=1)
 
 
-def _waiting(film: np.ndarray, length: int) -> np.ndarray:
-    """``film`` with its last frame repeated until it has ``length`` frames."""
-    return film[np.minimum(np.arange(length), len(film) - 1)]
-
-
 def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
-    """Write ``frames`` (T, H, W, 3) uint8 to ``path``: .mp4, or a picture that moves, .png, .gif or .webp.
+    """Write a film: .mp4, or a picture that moves, .png, .gif or .webp.
 
-    An mp4's odd sizes get one repeated row or column, since browsers play only even ones.
+    Args:
+        frames: (T, H, W, 3) uint8; an mp4 of odd sizes repeats a row or column.
+        path: the file.
+        fps: frames per second.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: another ending, or something else than frames.
+        OSError: ffmpeg could not write the file.
     """
     frames, path = _frames("frames", frames), Path(path)
     if path.suffix in ANIMATED:
@@ -87,20 +103,17 @@ def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
         return path
     if path.suffix != ".mp4":
         raise ValueError(f"video file {path} must end in .mp4, {', '.join(ANIMATED)}")
-    import imageio.v2 as imageio  # an mp4 is no figure: only who writes one needs it
-    from imageio_ffmpeg import count_frames_and_secs
-
-    even = np.pad(
-        frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge"
-    )
-    options = [
-        "-threads",
-        "1",
-        "-fflags",
-        "+bitexact",
-        "-movflags",
-        "+faststart",
-    ]  # one thread: the same bytes again
+    try:
+        import imageio.v2 as imageio  # only an mp4 needs it
+        from imageio_ffmpeg import count_frames_and_secs
+    except ImportError as error:
+        raise OSError(
+            f"an mp4 needs ffmpeg: pip install imageio-ffmpeg, or name {path.stem}.webp instead"
+        ) from error
+    rows, columns = frames.shape[1] % 2, frames.shape[2] % 2  # browsers play only even sizes
+    even = np.pad(frames, ((0, 0), (0, rows), (0, columns), (0, 0)), mode="edge")
+    # One thread, so that the bytes are the same again.
+    options = ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart"]
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "film.mp4"
         try:
@@ -114,9 +127,7 @@ def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
                 pixelformat="yuv420p",
                 output_params=options,
             )
-            if count_frames_and_secs(str(made))[0] != len(
-                even
-            ):  # ffmpeg says nothing of a full disk
+            if count_frames_and_secs(str(made))[0] != len(even):  # ffmpeg hides a full disk
                 raise OSError("frames are missing")
         except (OSError, RuntimeError) as error:
             reason = str(error).partition("\n")[0]
@@ -131,15 +142,26 @@ def animation(
     frames: np.ndarray,
     fps: int = 25,
     *,
-    form: str = "PNG",
+    form: Form = "PNG",
     width: int = 960,
     colours: int = 96,
     hold: float = 0.0,
 ) -> bytes:
-    """``frames`` (T, H, W, 3) uint8 as a picture that moves, again and again.
+    """A film as a picture that moves, again and again.
 
-    form: PNG, GIF or WEBP. width: wider frames are made smaller, in pixels. colours: of a PNG or GIF, all frames alike,
-    which makes them as small as a film is; a WEBP has any. hold: seconds that the last frame stays longer.
+    Args:
+        frames: (T, H, W, 3) uint8.
+        fps: frames per second.
+        form: PNG, GIF or WEBP.
+        width: wider frames are made smaller, in pixels.
+        colours: of a PNG or GIF, all frames alike, which keeps the file small.
+        hold: seconds that the last frame stays longer.
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        ValueError: something else than frames.
     """
     from PIL import Image
 
@@ -149,10 +171,8 @@ def animation(
         pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
     options: dict[str, int] = {"quality": 70, "method": 4} if form == "WEBP" else {}
     if form != "WEBP":
-        some = np.concatenate(
-            [np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 8)]]
-        )
-        palette = Image.fromarray(some).quantize(colours, dither=Image.Dither.NONE)
+        some = [np.asarray(picture) for picture in pictures[:: -(-len(pictures) // 8)]]
+        palette = Image.fromarray(np.concatenate(some)).quantize(colours, dither=Image.Dither.NONE)
         pictures = [
             picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
         ]
@@ -164,22 +184,31 @@ def animation(
     return written.getvalue()
 
 
-def embed(film: str | Path | np.ndarray, fps: int = 25) -> Image:
-    """A film for the end of a notebook cell, as a picture that moves: frames (T, H, W, 3), or an mp4 file."""
+def embed(frames: np.ndarray, fps: int = 25) -> Image:
+    """A film for the end of a notebook cell.
+
+    Args:
+        frames: (T, H, W, 3) uint8.
+        fps: frames per second.
+
+    Returns:
+        A picture that moves.
+    """
     from IPython.display import Image
 
-    return Image(
-        data=animation(film if isinstance(film, np.ndarray) else _read(Path(film)), fps),
-        format="png",
-    )
+    return Image(data=animation(frames, fps), format="png")
 
 
-def _read(path: Path) -> np.ndarray:
-    """The frames of an mp4 file."""
-    import imageio.v2 as imageio
-
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no film at {path}; write it with figures.save_video(frames, path) first"
+def _frames(name: str, frames: np.ndarray) -> np.ndarray:
+    frames = np.asarray(frames)
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
+        raise ValueError(
+            f"{name} is {frames.dtype} {frames.shape}; expected uint8 (T, H, W, 3) with at least "
+            "one frame"
         )
-    return np.stack(imageio.mimread(path, memtest=False))
+    return frames
+
+
+def _waiting(film: np.ndarray, length: int) -> np.ndarray:
+    """``film`` with its last frame repeated until it has ``length`` frames."""
+    return film[np.minimum(np.arange(length), len(film) - 1)]
