@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
-import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from tsmlib.envs.mujoco_bulk import is_mujoco
 from tsmlib.envs.stepping import make
 
 WIDTH, HEIGHT, SMOOTH = 480, 300, 2  # pixels; of a picture that is drawn so many times as large
@@ -149,7 +147,7 @@ def _robot(env_id: str) -> Any:
 def _hidden_positions(env_id: str) -> int | None:
     """How many of the first positions an observation leaves out, 0 or 1; None: it is something else."""
     robot = _robot(env_id)
-    if not is_mujoco(cast(gymnasium.Env, robot)):
+    if type(getattr(robot, "data", None)).__name__ != "MjData":
         return None
     seen, _ = robot.reset(seed=0)
     for hidden in (0, 1):

@@ -38,11 +38,10 @@ from tsmlib.envs.geometry import (
     capsule_length,
     fingertip,
 )
-from tsmlib.envs.mujoco_bulk import without_log
 from tsmlib.envs.physics import Changes, Physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.unstable import SimulationUnstable
+from tsmlib.envs.unstable import SimulationUnstable, without_log
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move

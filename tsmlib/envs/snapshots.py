@@ -1,239 +1,227 @@
-"""The variables of an environment, saved and brought back; and what it can do, found by trying.
+"""What would follow in a foreign environment: snapshots of its state, where these are the whole of it.
 
-An environment's state is taken to be the plain values among its attributes and its wrappers' (numbers, arrays, lists,
-random generators), and of one of MuJoCo's the state of the physics with all that the integrator starts from. Whether
-that is all is not known but tried, once for every id (`abilities`).
+They are where every attribute is a plain value (numbers, texts, arrays, random generators, and lists of these) or
+MuJoCo's own data, or where the environment offers two methods of its own:
+
+    save_state() -> object           everything that the future depends on
+    restore_state(object) -> None    the environment as it was then
+
+Elsewhere the refusal names the attribute. What is played from a snapshot is held against a copy that was stepped from
+its seed, and refused where it differs.
 """
 
 from __future__ import annotations
 
 import copy
+import enum
+import hashlib
+import random
 from collections import deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import PurePath
+from types import BuiltinFunctionType, FunctionType
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
-from tsmlib.envs.mujoco_bulk import Bulk, Mismatch, arrays, is_mujoco
+from tsmlib.envs.spaces import UnsupportedEnvironment, layers
+from tsmlib.envs.stepping import Stepping, canonical, copies
 
-_FIXED = (bool, int, float, complex, str, bytes, type(None), np.generic)  # need no copy
-_PLAIN = (*_FIXED, np.ndarray, np.random.Generator, tuple, list, dict, set, deque)
-_STEPS = 25  # of a trial of the bulk path: to the ground, for most robots
-
-
-class Snapshot(NamedTuple):
-    """Plain attributes, layer by layer of wrappers; MuJoCo's state, where there is one, and what it had made of it."""
-
-    layers: tuple[dict[str, Any], ...]
-    physics: np.ndarray | None
-    derived: dict[str, np.ndarray]
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic, enum.Enum, PurePath)
+_COPIED = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
+_CONSTANT = ("env", "_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs")
+_FIXED = ("MjModel", "MujocoRenderer")  # MuJoCo's; the model is looked at, see ``Oracle``
+_MODEL_KEPT = "its steps change its MuJoCo model, which is no part of its state"
 
 
-class _Drawn(NamedTuple):
-    """A random generator as it was, which is a tenth of the work of a copy."""
-
-    kind: type[np.random.BitGenerator]
-    state: Mapping[str, Any]
-
-    def again(self) -> np.random.Generator:
-        generator = np.random.Generator(self.kind())
-        generator.bit_generator.state = self.state
-        return generator
-
-
-class Step(NamedTuple):
-    """What one step gave."""
-
-    observation: np.ndarray
-    reward: float
-    terminated: bool
-    truncated: bool
-
-
-def save(env: gymnasium.Env, *, derived: bool = True) -> Snapshot:
-    """Everything plain that ``env`` and its wrappers hold. derived: also what MuJoCo has made of its state."""
-    layers = tuple(
-        {name: _copied(value) for name, value in vars(layer).items() if isinstance(value, _PLAIN)}
-        for layer in _layers(env)
-    )
-    if not is_mujoco(env):
-        return Snapshot(layers, None, {})
-    simulated: Any = env.unwrapped
-    kept = {name: array.copy() for name, array in arrays(simulated.data).items()} if derived else {}
-    return Snapshot(layers, _integration_state(simulated), kept)
+def refusal(env: gymnasium.Env) -> str:
+    """Why the state of an environment cannot be saved, naming the attribute; '' where it can be."""
+    arrays: list[tuple[str, np.ndarray]] = []
+    for layer in layers(env):
+        name = type(layer).__name__
+        if _offers(layer):
+            continue
+        if any(vars(kind).get("__slots__") for kind in type(layer).__mro__):
+            return f"{name} keeps its state in __slots__"
+        for attribute, value in vars(layer).items():
+            if attribute not in _CONSTANT and not _fixed(value):
+                if what := _odd(value, arrays, attribute):
+                    return f"its state is not all plain: {name}.{attribute} {what}"
+    for i, (one, array) in enumerate(arrays):
+        for other, another in arrays[:i]:
+            if array is not another and np.may_share_memory(array, another):
+                return f"its attributes {other} and {one} are views of the same numbers"
+    return ""
 
 
-def restore(env: gymnasium.Env, snapshot: Snapshot) -> None:
-    """``env`` as it was when ``snapshot`` was taken; bit for bit where its `abilities` say so."""
-    for layer, values in zip(_layers(env), snapshot.layers, strict=True):
-        for name, value in values.items():
-            own = vars(layer).get(name)
-            if not isinstance(value, _Drawn):
-                vars(layer)[name] = _copied(value)
-            elif isinstance(own, np.random.Generator) and type(own.bit_generator) is value.kind:
-                own.bit_generator.state = value.state
-            else:
-                vars(layer)[name] = value.again()
-    if snapshot.physics is not None:
-        import mujoco
-
-        simulated: Any = env.unwrapped
-        mujoco.mj_setState(
-            simulated.model, simulated.data, snapshot.physics, mujoco.mjtState.mjSTATE_INTEGRATION
-        )
-        for name, value in snapshot.derived.items():
-            present = getattr(simulated.data, name)
-            if present.shape == value.shape:  # others are as long as there are contacts
-                present[...] = value
-
-
-@dataclass(frozen=True)
-class Abilities:
-    """What an environment can do, as far as a trial of a few steps says.
-
-    repeats: the same seed and actions give the same episode, bit for bit. restores: it goes on from a snapshot as it
-    went on before; derived: from one that holds what MuJoCo has made of its state. bulk: how MuJoCo's bulk simulation
-    takes the place of its own; None: it does not, and ``why``.
-    """
-
-    repeats: bool
-    restores: bool
-    derived: bool
-    bulk: Bulk | None
-    why: str = ""
-
-
-_known: dict[str, Abilities] = {}
-
-
-def abilities(env: gymnasium.Env) -> Abilities:
-    """What environments of this id and these arguments can do, tried on ``env`` the first time, which is reset."""
-    spec = env.spec
-    if spec is None:  # nothing says which arguments it was made with
-        return _tried(env)
-    key = repr(
-        (spec.id, spec.kwargs, spec.additional_wrappers, [type(layer) for layer in _layers(env)])
-    )
-    if key not in _known:
-        _known[key] = _tried(env)
-    return _known[key]
-
-
-def _tried(env: gymnasium.Env) -> Abilities:
-    rng = np.random.default_rng(0)
-    space: Any = env.action_space
-    actions = rng.uniform(space.low, space.high, (_STEPS, *space.shape)).astype(space.dtype)
-    repeats = same(_played(env, 3, actions[:8]), _played(env, 3, actions[:8]))
-    ways = [derived for derived in (False, True) if repeats and _restores(env, actions, derived)]
-    bulk, why = _bulk(env, actions) if ways else (None, "its state cannot be set")
-    return Abilities(repeats, bool(ways), not ways or ways[0], bulk, why)
-
-
-def play(env: gymnasium.Env, actions: np.ndarray) -> list[Step]:
-    """The steps of ``actions`` (T, du), up to and with the one that ends the episode."""
-    steps = []
-    for action in actions:
-        observation, reward, terminated, truncated, _ = env.step(action)
-        steps.append(Step(observation, float(reward), bool(terminated), bool(truncated)))
-        if terminated or truncated:
-            break
-    return steps
-
-
-def same(one: list[Step], other: list[Step], tolerance: float = 0.0) -> bool:
-    """Whether two episodes agree in everything, up to ``tolerance`` (absolute and relative)."""
-    return len(one) == len(other) and all(
-        a[2:] == b[2:]
-        and np.allclose(a.observation, b.observation, rtol=tolerance, atol=tolerance)
-        and np.isclose(a.reward, b.reward, rtol=tolerance, atol=tolerance)
-        for a, b in zip(one, other, strict=True)
+def _offers(layer: Any) -> bool:
+    return callable(getattr(layer, "save_state", None)) and callable(
+        getattr(layer, "restore_state", None)
     )
 
 
-def _played(env: gymnasium.Env, seed: int, actions: np.ndarray) -> list[Step]:
-    env.reset(seed=seed)
-    return play(env, actions)
+def _fixed(value: Any) -> bool:
+    """Whether a value never changes, or is MuJoCo's data, which are copied by MuJoCo."""
+    if isinstance(value, FunctionType):
+        return value.__closure__ is None and not vars(value)
+    known = isinstance(value, BuiltinFunctionType | gymnasium.Space | GymnasiumSpec | type)
+    return known or type(value).__name__ in (*_FIXED, "MjData")
 
 
-def _restores(env: gymnasium.Env, actions: np.ndarray, derived: bool) -> bool:
-    """Whether a snapshot brings back what other steps and another reset have changed."""
-    try:
-        _played(env, 3, actions[:2])
-        taken = save(env, derived=derived)
-        before = play(env, actions[2:8])
-        _played(env, 4, actions[8:12])
-        restore(env, taken)
-        return same(before, play(env, actions[2:8]))
-    except Exception:  # an environment that is not made to be copied may fail in any way
-        return False
-
-
-def _bulk(env: gymnasium.Env, actions: np.ndarray) -> tuple[Bulk | None, str]:
-    """The first way of bulk simulation that gives what stepping gives, or why there is none."""
-    if not is_mujoco(env):
-        return None, "it is not one of MuJoCo's"
-    if why := Bulk.refused(env):
-        return None, why
-    stepped = [_played(env, seed, actions) for seed in (3, 4)]
-    for last_substep in (False, True):
-        bulk = Bulk(env.unwrapped, last_substep=last_substep)
-        # A way that leaves out what follows from the state is right where that can be anything.
-        for fill in (None,) if last_substep else (1e9, -1e9):
-            try:
-                found = [_in_bulk(env, bulk, seed, actions, fill) for seed in (3, 4)]
-            except Mismatch as mismatch:
-                return None, str(mismatch)
-            if not all(same(*pair, tolerance=1e-9) for pair in zip(stepped, found, strict=True)):
-                break
-        else:
-            env.reset(seed=3)
-            seen = bulk.observed(env, bulk.physics(bulk.start(env)[None], actions[None])[0])
-            bulk.only_observes &= np.array_equal(
-                seen[: len(stepped[0])], [step.observation for step in stepped[0]]
-            )
-            return bulk, ""
-    return None, "its observations, rewards or ends differ from those of stepping"
-
-
-def _in_bulk(
-    env: gymnasium.Env, bulk: Bulk, seed: int, actions: np.ndarray, fill: float | None = None
-) -> list[Step]:
-    env.reset(seed=seed)
-    physics = bulk.physics(bulk.start(env)[None], actions[None])
-    with bulk.playing(env, physics[0], actions, fill=fill):
-        return play(env, actions)
-
-
-def _layers(env: gymnasium.Env) -> Iterator[Any]:
-    while isinstance(env, gymnasium.Wrapper):
-        yield env
-        env = env.env
-    yield env
-
-
-def _copied(value: object) -> object:
-    """A deep copy; of what most environments hold, faster than ``copy.deepcopy``."""
-    if isinstance(value, _FIXED):
-        return value
+def _odd(value: Any, arrays: list[tuple[str, np.ndarray]], attribute: str) -> str:
+    """What keeps a value from being plain, or ''; the arrays in it are added to ``arrays``."""
     if isinstance(value, np.ndarray) and value.dtype != object:
-        return value.copy()
-    if isinstance(value, np.random.Generator):
-        return _Drawn(type(value.bit_generator), value.bit_generator.state)
-    if type(value) is dict and all(
-        isinstance(part, (*_FIXED, np.ndarray)) for part in value.values()
-    ):
-        return {name: _copied(part) for name, part in value.items()}
-    if type(value) in (list, tuple) and all(isinstance(part, _FIXED) for part in value):  # type: ignore[attr-defined]
-        return value[:]  # type: ignore[index]
-    return copy.deepcopy(value)
+        owner = value
+        while isinstance(owner, np.ndarray):
+            owner = owner.base  # type: ignore[assignment]
+        arrays.append((attribute, value))
+        return "" if owner is None else f"is a view of a {type(owner).__name__}"
+    if isinstance(value, (*_PLAIN, *_COPIED)):
+        return ""
+    if type(value) is dict:
+        value = [*value, *value.values()]
+    if isinstance(value, list | tuple | set | frozenset | deque):
+        return next((odd for part in value if (odd := _odd(part, arrays, attribute))), "")
+    return f"is or holds a {type(value).__name__}"
 
 
-def _integration_state(env: Any) -> np.ndarray:
-    import mujoco
+class _Data(NamedTuple):
+    """MuJoCo's data, and all that they held."""
 
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    state = np.empty(mujoco.mj_stateSize(env.model, kind))
-    mujoco.mj_getState(env.model, env.data, state, kind)
-    return state
+    live: Any
+    copy: Any
+
+
+def save(env: gymnasium.Env) -> list[Any]:
+    """The state of an environment of which ``refusal`` says nothing, layer by layer."""
+    state: list[Any] = []
+    for layer in layers(env):
+        if _offers(layer):
+            state.append(layer.save_state())
+        else:
+            own = vars(layer)
+            state.append({name: own[name] for name in own if name not in _CONSTANT})
+    return _copied(state)
+
+
+def restore(env: gymnasium.Env, state: list[Any]) -> None:
+    """Bring back what ``save`` gave, which can be brought back again."""
+    for layer, values in zip(layers(env), _copied(state), strict=True):
+        if _offers(layer):
+            layer.restore_state(values)
+            continue
+        own = vars(layer)
+        for name in [name for name in own if name not in _CONSTANT and name not in values]:
+            del own[name]
+        for name, value in values.items():
+            own[name] = value
+            if isinstance(value, _Data):
+                import mujoco
+
+                own[name] = value.live
+                mujoco.mj_copyData(value.live, value.live.model, value.copy)
+
+
+def _copied(state: list[Any]) -> list[Any]:
+    """A copy in which the same object stays the same; what never changes, and copies of data, are kept."""
+    memo: dict[int, Any] = {}
+    for values in state:
+        for value in values.values() if isinstance(values, dict) else ():
+            if type(value).__name__ == "MjData":
+                import mujoco
+
+                data = mujoco.MjData(value.model)
+                mujoco.mj_copyData(data, value.model, value)
+                memo[id(value)] = _Data(value, data)
+            elif _fixed(value) or isinstance(value, _Data):
+                memo[id(value)] = value
+    return copy.deepcopy(state, memo)
+
+
+class Oracle:
+    """Episodes that began by resets and went on by actions, and what would follow in them."""
+
+    def __init__(self, env_id: str, seeds: Sequence[int], actions: np.ndarray) -> None:
+        """Begin, each episode in a copy of its own.
+
+        Args:
+            env_id: of a foreign environment.
+            seeds: (B,), of the resets.
+            actions: (B, t, du) in [-1, 1], taken since.
+
+        Raises:
+            UnsupportedEnvironment: the environment's state cannot be saved; names the attribute.
+        """
+        self.id, self.seeds, self.actions, self.checked = canonical(env_id), seeds, actions, False
+        self.run = self._begun()
+        self.last, self.ended = self.run.last.copy(), self.run.ended.copy()
+        for env in self.run.envs:
+            if why := refusal(env):
+                self.run.close()
+                raise _no_oracle(self.id, why)
+        self.saved = [save(env) for env in self.run.envs]
+        self.models = [_models(env) for env in self.run.envs]
+
+    def outcomes(self, candidates: np.ndarray) -> np.ndarray:
+        """What would follow under each candidate; the episodes stay.
+
+        Args:
+            candidates: (C, B, T, du) in [-1, 1].
+
+        Returns:
+            States (C, B, T, dx); of an episode that ended, the last one repeats.
+
+        Raises:
+            UnsupportedEnvironment: the same seed and actions do not repeat an episode.
+        """
+        states = np.stack([self._played(actions) for actions in candidates])
+        if [_models(env) for env in self.run.envs] != self.models:
+            raise _no_oracle(self.id, _MODEL_KEPT)
+        if not self.checked:
+            with closing(self._begun()) as other:
+                for again in (other.rollout(candidates[-1]), self._played(candidates[-1])):
+                    if (apart := again != states[-1]).any():
+                        i, t, d = np.argwhere(apart)[0]
+                        raise _no_oracle(
+                            self.id,
+                            f"the same seed and actions do not repeat it: {self.run.names[d]} of episode {i} after "
+                            f"{t + 1} steps is {states[-1, i, t, d]:g} from its snapshot, and {again[i, t, d]:g}",
+                        )
+            self.checked = True
+        return states
+
+    def _begun(self) -> Stepping:
+        run = Stepping(copies(self.id, len(self.seeds)), env_id=self.id)
+        run.reset(seed=self.seeds)
+        run.rollout(self.actions)
+        return run
+
+    def _played(self, actions: np.ndarray) -> np.ndarray:
+        for env, state in zip(self.run.envs, self.saved, strict=True):
+            restore(env, state)
+        self.run.last, self.run.ended = self.last.copy(), self.ended.copy()
+        return self.run.rollout(actions)
+
+
+def _models(env: gymnasium.Env) -> list[bytes]:
+    """Digests of the MuJoCo models among an environment's attributes."""
+    found = []
+    for layer in layers(env):
+        for value in vars(layer).values():
+            if type(value).__name__ == "MjModel":
+                import mujoco
+
+                held = np.empty(mujoco.mj_sizeModel(value), np.uint8)
+                mujoco.mj_saveModel(value, None, held)
+                found.append(hashlib.sha256(held.tobytes()).digest())
+    return found
+
+
+def _no_oracle(env_id: str, why: str) -> UnsupportedEnvironment:
+    return UnsupportedEnvironment(
+        f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, tsmlib.model_predictor; or give "
+        "the environment the methods save_state() and restore_state(state), which hold all that its future depends on"
+    )

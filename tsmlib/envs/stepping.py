@@ -1,48 +1,57 @@
-"""Any Gymnasium environment with flat Box spaces, simulated by stepping; of MuJoCo's, in bulk where that is the same.
+"""Episodes of any environment: our arms in bulk, any other one stepped, N copies for N episodes.
 
-An observation is not a state. An episode is begun by the seed of a reset; one that has begun goes on from a snapshot of
-the environment's variables, where it has been tried that this brings it back (`snapshots.abilities`). Actions here lie
-in [-1, 1], the bounds of the environment's action space. An episode that ended is not stepped any further: its last
-state repeats.
+No copy is shared between episodes. An observation is not a state, so an episode begins by the seed of a reset. One that
+ended is not stepped any further: its last state repeats. What reset and step return is copied (``spaces``).
 
-Letters in shapes: N episodes, T steps, dx size of an observation, du of an action.
+Letters in shapes: N episodes, T steps, dx size of a state, du of an action.
 """
 
 from __future__ import annotations
 
 import secrets
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Space
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.vector.utils import batch_space, iterate
 
-from tsmlib.envs.mujoco_bulk import CHUNK, Mismatch, without_log
-from tsmlib.envs.snapshots import Snapshot, Step, abilities, play, restore, save
-from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.unstable import SimulationUnstable
+from tsmlib.checks import require_count
+from tsmlib.envs import spaces
+from tsmlib.envs.spaces import (
+    Description,
+    UnsupportedEnvironment,
+    canonical,
+    describe,
+    environment_id,
+    find_spec,
+    flat,
+    idle_action,
+    layers,
+    within_bounds,
+)
+from tsmlib.envs.unstable import SimulationUnstable, without_log
 
 Seeds = int | Sequence[int] | None  # of the first episode, those after it following; or of each
-
-SUPPORTED = "supported are observations that are a Box of one dimension, and actions that are one too, with finite bounds"
-
-
-class UnsupportedEnvironment(ValueError):
-    """An environment that cannot do what was asked of it; the message names it, and what is supported."""
 
 
 class Simulation(Protocol):
     """N episodes of one environment.
 
-    id: of Gymnasium. dt: seconds per step. names, units: of the state, one word per dimension; angles: its dimensions
-    in radians. steps (N,): taken by each until now; ended (N,) and terminated (N,): whether it is over, and whether the
-    environment ended it, as opposed to a limit of time. returns (N,): by the environment's own reward; NaN: none kept.
-    path: how it simulates, in words.
+    Attributes:
+        id: of the environment, with its arguments: ``"Pendulum-v1(g=1.0)"``.
+        dt: seconds per step.
+        names, units: of the state, one word per dimension.
+        angles: dimensions of the state in radians.
+        action_dim: du.
+        idle: the action (du,) in [-1, 1] that does nothing.
+        steps: (N,), taken by each episode until now.
+        ended, terminated: (N,), whether it is over, and whether the environment ended it, as
+            opposed to a limit of time.
+        returns: (N,), by the environment's own reward; NaN where none is kept.
     """
 
     id: str
@@ -51,11 +60,11 @@ class Simulation(Protocol):
     units: tuple[str, ...]
     angles: tuple[int, ...]
     action_dim: int
+    idle: np.ndarray
     steps: np.ndarray
     ended: np.ndarray
     terminated: np.ndarray
     returns: np.ndarray
-    path: str
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
         """Begin N episodes, from ``seed`` or in ``states`` (N, dx); the first states (N, dx)."""
@@ -74,92 +83,77 @@ class Simulation(Protocol):
 
 
 def simulation(env: VectorEnv) -> Simulation:
-    """The episodes of a vector environment. UnsupportedEnvironment where its spaces are not supported."""
-    if hasattr(env, "rollout"):
-        return Arms(env)
-    return Stepping(env.envs) if type(env) is SyncVectorEnv else Vectorised(env)
+    """The episodes of a vector environment.
 
-
-def make_simulation(env_id: str, n: int, *, returns: bool = False) -> Simulation:
-    """N episodes of the environment of an id: in one copy of it where its state can be set, else in N.
-
-    returns: keep those of the environment's own reward.
+    Raises:
+        UnsupportedEnvironment: its spaces are not supported, or its copies are one object.
     """
-    if env_id.startswith("tsm/"):
-        EnvSpec.parse(env_id)  # a variant of an arm is registered by this
-    if gymnasium.spec(env_id).vector_entry_point is not None:
-        return simulation(gymnasium.make_vec(env_id, num_envs=n))
-    first = make_supported(env_id)
-    if abilities(first).restores:
-        return Stepping([first], n, returns=returns)
-    more = (make(env_id) for _ in range(n - 1))
-    return Stepping([first, *more], returns=returns)
+    made = env.unwrapped.spec
+    if hasattr(env, "rollout") and made is not None and made.namespace == "tsm":
+        return Arms(env)
+    return Stepping(env.envs, env.env_fns[0]) if type(env) is SyncVectorEnv else Vectorised(env)
 
 
-def make_supported(env_id: str) -> gymnasium.Env:
-    """The environment of an id; UnsupportedEnvironment, with it closed, where its spaces are not supported."""
-    env = make(env_id)
+def make_simulation(env_id: str, n: int) -> Simulation:
+    """N episodes of the environment of an id, foreign ones in N copies.
+
+    Args:
+        env_id: ``"tsm/ReacherPush-v1"``, ``"Pendulum-v1(g=1.0)"``, ...
+        n: episodes.
+
+    Raises:
+        UnsupportedEnvironment: its spaces are not supported, or the id does not say how to make it.
+    """
+    spec = find_spec(env_id)
+    if spec.namespace == "tsm" or spec.entry_point is None:
+        return simulation(gymnasium.make_vec(spec, num_envs=n))
+    envs = copies(env_id, n)
     try:
-        require_supported(env_id, env.observation_space, env.action_space)
-    except UnsupportedEnvironment:
-        env.close()
+        return Stepping(envs, lambda: make(env_id), canonical(env_id))
+    except BaseException:
+        for env in envs:
+            env.close()
         raise
-    return env
+
+
+def copies(env_id: str, n: int) -> list[gymnasium.Env]:
+    """N copies of an environment, closed again where they cannot be used."""
+    made: list[gymnasium.Env] = []
+    try:
+        for _ in range(require_count("episodes", n)):
+            made.append(make(env_id))
+            spaces.state_names(env_id, made[0].observation_space)
+            spaces.require_actions(env_id, made[0].action_space)
+    except BaseException:
+        for env in made:
+            env.close()
+        raise
+    return made
 
 
 def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
-    """The environment of an id. What MuJoCo has to say of Gymnasium's own robots, whose files are old, is left out."""
-    quiet = str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco")
+    """The environment of an id, which may carry arguments; ``render_mode`` only where it is asked for.
+
+    What MuJoCo has to say of Gymnasium's own robots, whose files are old, is left out.
+    """
+    spec = find_spec(env_id)
+    quiet = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+    shown = {} if render_mode is None else {"render_mode": render_mode}
     with without_log() if quiet else nullcontext():
-        return gymnasium.make(env_id, render_mode=render_mode, disable_env_checker=True)
-
-
-def require_supported(env_id: str, observations: Space, actions: Space) -> tuple[Box, Box]:
-    """Both spaces, flat and bounded as they have to be; UnsupportedEnvironment, naming what is supported."""
-    if not isinstance(observations, Box) or len(observations.shape) != 1:
-        kind = (
-            "images"
-            if isinstance(observations, Box) and len(observations.shape) in (2, 3)
-            else "not flat"
-        )
-        raise UnsupportedEnvironment(
-            f"observations of {env_id} are {kind}, {observations!s:.100}; {SUPPORTED}. Wrap it, for example in "
-            "gymnasium.wrappers.FlattenObservation, or in one that gives its features"
-        )
-    if not isinstance(actions, Box) or len(actions.shape) != 1:
-        kind = "discrete" if not isinstance(actions, Box) else "not flat"
-        raise UnsupportedEnvironment(
-            f"actions of {env_id} are {kind}, {actions!s:.100}; {SUPPORTED}"
-        )
-    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-        raise UnsupportedEnvironment(
-            f"actions of {env_id} have no bounds, {actions!s:.100}; {SUPPORTED}. Give it some by "
-            "gymnasium.wrappers.RescaleAction, or in its own action space"
-        )
-    return observations, actions
-
-
-def within_bounds(actions: np.ndarray, space: Box) -> np.ndarray:
-    """Actions (..., du) in [-1, 1] to the bounds of ``space``, in its type."""
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    scaled = (low + high) / 2 + (high - low) / 2 * np.clip(np.asarray(actions, np.float64), -1, 1)
-    return np.clip(scaled.astype(space.dtype), space.low, space.high)
+        return gymnasium.make(spec, disable_env_checker=True, **shown)
 
 
 class Arms:
-    """The arms, and what else simulates whole sequences by a ``rollout`` of its own; they never end."""
+    """The arms, and what else of ours simulates whole sequences by a ``rollout``; they never end."""
 
     def __init__(self, env: VectorEnv) -> None:
         arms: Any = env.unwrapped
         self.env: Any = env
         self.id, self.dt = arms.spec.id, arms.dt
-        self.names, self.units, self.angles = (
-            tuple(arms.names),
-            tuple(arms.units),
-            tuple(arms.angles),
-        )
+        self.names, self.units = tuple(arms.names), tuple(arms.units)
+        self.angles = tuple(arms.angles)
         self.action_dim = arms.single_action_space.shape[0]
-        self.path = "bulk simulation"
+        self.idle = idle_action(arms.single_action_space)
         self.steps = np.zeros(env.num_envs, np.int64)
         self.ended = self.terminated = np.zeros(env.num_envs, bool)
         self.returns = np.full(env.num_envs, np.nan)
@@ -177,26 +171,23 @@ class Arms:
         self.env.close()
 
 
-class _Described:
+class _Episodes:
     """What is the same however an environment is stepped: its description, and the episodes so far."""
 
-    def __init__(
-        self, env_id: str, described: Any, observations: Space, actions: Space, n: int
-    ) -> None:
-        self.id, self.num_envs = env_id, n
-        self.space, self.actions = require_supported(env_id, observations, actions)
-        dx = self.space.shape[0]
-        self.dt = _dt(env_id, described)
-        self.names = tuple(getattr(described, "names", ())) or tuple(f"x{d}" for d in range(dx))
-        self.units = tuple(getattr(described, "units", ())) or ("",) * dx
-        self.angles = tuple(getattr(described, "angles", ()))
-        self.action_dim = self.actions.shape[0]
-        self._begin(np.zeros((n, dx)))
+    def __init__(self, robot: Description, n: int, another: Callable[[], Any] | None) -> None:
+        self.robot, self.num_envs, self.another = robot, n, another
+        self.id, self.dt, self.idle = robot.id, robot.dt, robot.idle
+        self.names, self.units, self.angles = robot.names, robot.units, robot.angles
+        self.action_dim = len(robot.idle)
+        self._begin([np.zeros(len(robot.names))] * n)
 
-    def _begin(self, states: np.ndarray) -> None:
-        self.last = states
+    def _begin(self, states: list[np.ndarray]) -> np.ndarray:
+        self.last = np.stack(states)
         self.steps, self.returns = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
         self.ended, self.terminated = (np.zeros(self.num_envs, bool) for _ in range(2))
+        for i, state in enumerate(self.last):
+            self._require_finite(state[None], i)
+        return self.last.copy()
 
     def _seeds(self, seed: Seeds, states: np.ndarray | None) -> list[int]:
         if states is not None:
@@ -206,11 +197,9 @@ class _Described:
             )
         if seed is None:
             seed = secrets.randbits(31)
-        seeds = (
-            [seed + i for i in range(self.num_envs)]
-            if isinstance(seed, int)
-            else [int(s) for s in seed]
-        )
+        if isinstance(seed, int | np.integer):
+            seed = [int(seed) + i for i in range(self.num_envs)]
+        seeds = [require_count("a seed", s, least=0) for s in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(
                 f"{len(seeds)} seeds for {self.num_envs} episodes of {self.id}; expected one each"
@@ -219,186 +208,135 @@ class _Described:
 
     def _commands(self, actions: np.ndarray) -> np.ndarray:
         """Actions (N, T, du) as the environment takes them; ValueError where they are something else."""
-        if actions.ndim != 3 or (actions.shape[0], actions.shape[2]) != (
-            self.num_envs,
-            self.action_dim,
-        ):
+        if actions.ndim != 3 or actions.shape[::2] != (self.num_envs, self.action_dim):
             raise ValueError(
                 f"actions are {actions.shape}; {self.id} expected ({self.num_envs}, T, {self.action_dim})"
             )
         if not np.isfinite(actions).all():
             raise ValueError(f"an action for {self.id} is not finite; nothing was simulated")
-        return within_bounds(actions, self.actions)
+        return within_bounds(actions, self.robot.actions)
+
+    def _state(self, observation: Any) -> np.ndarray:
+        return flat(self.id, self.robot.observations, observation)
 
     def _require_finite(self, states: np.ndarray, i: int) -> None:
         """SimulationUnstable unless all that episode i came to (T, dx) is finite."""
         wrong = ~np.isfinite(states)
         if wrong.any():
             t, d = np.argwhere(wrong)[0].tolist()
-            raise SimulationUnstable(
-                self.id, i, int(self.steps[i]) + t, f"{self.names[d]} is {states[t, d]}"
-            )
+            reason = f"{self.names[d]} is {states[t, d]}"
+            raise SimulationUnstable(self.id, i, int(self.steps[i]) + t, reason)
 
-    def _checked(self, observation: object) -> np.ndarray:
-        found = np.asarray(observation)
-        if found.shape != self.space.shape:
-            raise UnsupportedEnvironment(
-                f"{self.id} gave an observation of shape {found.shape}, but says that they are {self.space.shape}: it "
-                f"changes its space; {SUPPORTED}, the same throughout"
-            )
-        return found
+    def _note(self, i: int, state: np.ndarray, reward: Any, over: Any, late: Any) -> None:
+        """One step of episode i."""
+        self._require_finite(state[None], i)
+        self.returns[i] += _number(self.id, "reward", reward)
+        self.steps[i] += 1
+        self.terminated[i] = bool(_number(self.id, "terminated", over))
+        self.ended[i] = self.terminated[i] or bool(_number(self.id, "truncated", late))
+        self.last[i] = state
+
+    def _examine(self, seed: int, envs: Sequence[Any] = ()) -> None:
+        """Before the first episode: reset a copy that is none of ``envs`` twice, and step it once.
+
+        It is said aloud where the two begin apart, and dt is the time that passed, where its clocks know.
+        """
+        another, self.another = self.another, None
+        made = another() if another else None
+        if made is None or any(made.unwrapped is env.unwrapped for env in envs):
+            return
+        with closing(made) as env:
+            one, two = (self._state(_reset(self.id, env, seed)) for _ in range(2))
+            if not np.array_equal(one, two):
+                d = int(np.argmax(np.abs(one - two)))
+                warnings.warn(
+                    f"{self.id} does not begin again where it began: two resets with seed {seed} gave "
+                    f"{self.names[d]} = {one[d]:g} and {two[d]:g}. Its episodes cannot be repeated, so plans are "
+                    "executed from elsewhere than they were made for. Let its reset draw from self.np_random "
+                    "after super().reset(seed=seed), and leave out wrappers that remember",
+                    stacklevel=6,
+                )
+            before = _clocks(env)
+            env.step(within_bounds(self.idle, self.robot.actions))
+            self.dt *= _repeats(env, before, self.dt)
 
 
-class Stepping(_Described):
-    """Episodes that are each stepped in a copy of their own; or ``n`` of them in one copy, from snapshots."""
+class Stepping(_Episodes):
+    """Episodes that are each stepped in a copy of their own."""
 
     def __init__(
-        self, envs: Sequence[gymnasium.Env], n: int | None = None, *, returns: bool = False
+        self,
+        envs: Sequence[gymnasium.Env],
+        another: Callable[[], gymnasium.Env] | None = None,
+        env_id: str = "",
     ) -> None:
+        """envs: the copies. another: makes one more, to try things on. env_id: by default what the first says."""
+        ids = {env_id} if env_id else {environment_id(env) for env in envs}
+        env_id = ids.pop() if len(ids) == 1 else _mixed(ids)
+        if len({id(env.unwrapped) for env in envs}) < len(envs):
+            raise UnsupportedEnvironment(
+                f"the {len(envs)} copies of {env_id} are one and the same object; make a new one for each episode: "
+                "SyncVectorEnv([lambda: Robot()] * N)"
+            )
+        _require_steady(env_id, envs[0])
         first = envs[0]
-        env_id = first.spec.id if first.spec else type(first.unwrapped).__name__
         super().__init__(
-            env_id, first.unwrapped, first.observation_space, first.action_space, n or len(envs)
+            describe(env_id, first, first.observation_space, first.action_space),
+            len(envs),
+            another,
         )
-        self.envs, self.shared = envs, n is not None
-        known = abilities(first)
-        alike = len(envs) == 1 or (
-            first.spec is not None and all(env.spec == first.spec for env in envs)
-        )
-        self.bulk = known.bulk if alike else None
-        why = known.why or "it cannot be told that its copies are alike"
-        self.path = "bulk simulation (mujoco.rollout)" if self.bulk else f"stepping: {why}"
-        self.keeps_returns, self.derived = returns, known.derived
-        self.snapshots: list[Snapshot | None] = [None] * self.num_envs
+        self.envs = envs
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
-        first = []
-        for i, own in enumerate(self._seeds(seed, states)):
-            first.append(self._checked(self._env(i).reset(seed=own)[0]))
-            self._leave(i)
-        self._begin(np.stack(first).astype(np.float64))
-        if not self.keeps_returns:
-            self.returns[:] = np.nan
-        return self.last
+        seeds = self._seeds(seed, states)
+        self._examine(seeds[0], self.envs)
+        begun = zip(self.envs, seeds, strict=True)
+        return self._begin([self._state(_reset(self.id, env, own)) for env, own in begun])
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
         commands = self._commands(actions)
         states = np.repeat(self.last[:, None], actions.shape[1], axis=1)
-        running = np.flatnonzero(~self.ended) if actions.shape[1] else np.arange(0)
-        for i, steps in zip(
-            running.tolist(),
-            self._simulated(running, commands[running], self.keeps_returns),
-            strict=True,
-        ):
-            self._fill(states[i], steps)
-            self._require_finite(states[i, : len(steps)], i)
-            self._count(i, steps)
-            self._leave(i)
-        self.last = states[:, -1].copy() if actions.shape[1] else self.last
+        for i, env in enumerate(self.envs):
+            t = 0
+            while t < actions.shape[1] and not self.ended[i]:
+                observation, *outcome, _ = _step(self.id, env, commands[i, t])
+                states[i, t] = self._state(observation)
+                self._note(i, states[i, t], *outcome)
+                t += 1
+            states[i, t:] = self.last[i]
         return states
 
     def close(self) -> None:
         for env in self.envs:
             env.close()
 
-    def outcomes(self, actions: np.ndarray) -> np.ndarray:
-        """What would follow under each of C candidates (C, N, T, du): states (C, N, T, dx). The episodes stay."""
-        n, _, horizon, _ = actions.shape
-        states = np.repeat(np.tile(self.last, (n, 1))[:, None], horizon, axis=1)
-        commands = within_bounds(actions, self.actions).reshape(n * self.num_envs, horizon, -1)
-        episodes = np.tile(np.arange(self.num_envs), n)
-        rows = np.flatnonzero(~self.ended[episodes])
-        for row, steps in zip(
-            rows, self._simulated(episodes[rows], commands[rows], False), strict=True
-        ):
-            self._fill(states[row], steps)
-        return states.reshape(n, self.num_envs, horizon, -1)
 
-    def _simulated(
-        self, episodes: np.ndarray, commands: np.ndarray, rewards: bool
-    ) -> Iterator[list[Step]]:
-        """What each of ``episodes`` (n,) does under commands (n, T, du); its environment is left where it came to.
+class Vectorised(_Episodes):
+    """N episodes of any other vector environment, by its own ``step``.
 
-        rewards: whether they are asked for; else they may be NaN.
-        """
-        for at in range(0, len(episodes), CHUNK):
-            part = slice(at, at + CHUNK)
-            physics: list[np.ndarray | None] = [None] * len(episodes[part])
-            if self.bulk is not None:
-                starts = np.stack([self.bulk.start(self._enter(i)) for i in episodes[part]])
-                physics = [*self.bulk.physics(starts, commands[part])]
-            for i, each, simulated in zip(episodes[part], commands[part], physics, strict=True):
-                yield self._played(i, each, simulated, rewards)
-
-    def _played(
-        self, i: int, commands: np.ndarray, physics: np.ndarray | None, rewards: bool
-    ) -> list[Step]:
-        """The steps of one episode, from bulk physics where they turn out to be its own."""
-        env = self._enter(i)
-        if physics is None or self.bulk is None:
-            return play(env, commands)
-        if self.bulk.only_observes and not rewards and (left := steps_left(env)) is not None:
-            seen = self.bulk.observed(
-                env, physics[: min(left, len(commands)) * self.bulk.frame_skip + 1]
-            )
-            spend(env, len(seen))
-            return [Step(x, np.nan, False, k + 1 == left) for k, x in enumerate(seen)]
-        before = save(env, derived=self.derived) if self.snapshots[i] is None else self.snapshots[i]
-        assert before is not None
-        try:
-            with self.bulk.playing(env, physics, commands):
-                return play(env, commands)
-        except Mismatch:
-            restore(env, before)
-            return play(env, commands)
-
-    def _fill(self, states: np.ndarray, steps: list[Step]) -> None:
-        """Write what was observed into ``states`` (T, dx), the last of it to the end."""
-        seen = np.stack([self._checked(step.observation) for step in steps])
-        states[: len(seen)], states[len(seen) :] = seen, seen[-1]
-
-    def _count(self, i: int, steps: list[Step]) -> None:
-        self.steps[i] += len(steps)
-        self.returns[i] += sum(step.reward for step in steps)
-        self.terminated[i] = steps[-1].terminated
-        self.ended[i] = steps[-1].terminated or steps[-1].truncated
-
-    def _env(self, i: int) -> gymnasium.Env:
-        return self.envs[0 if self.shared else i]
-
-    def _enter(self, i: int) -> gymnasium.Env:
-        env, snapshot = self._env(i), self.snapshots[i]
-        if self.shared and snapshot is not None:
-            restore(env, snapshot)
-        return env
-
-    def _leave(self, i: int) -> None:
-        if self.shared:
-            self.snapshots[i] = save(self._env(i), derived=self.derived)
-
-
-class Vectorised(_Described):
-    """N episodes of any other vector environment, by its own ``step``; what it makes of ended ones is left out."""
+    What it makes of ended episodes, be it a reset in the same step, stays out of the data.
+    """
 
     def __init__(self, env: VectorEnv) -> None:
-        spec = env.spec or env.unwrapped.spec
-        env_id = spec.id if spec else type(env.unwrapped).__name__
-        copies = getattr(env.unwrapped, "envs", None)
-        described = (
-            copies[0].unwrapped if copies else gymnasium.make(spec.id).unwrapped if spec else env
-        )
-        super().__init__(
-            env_id, described, env.single_observation_space, env.single_action_space, env.num_envs
-        )
-        self.env, self.path = env, "stepping: its copies are stepped together"
-        self.mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        self.env, self.metadata = env, env.metadata or {}
+        makers = getattr(env.unwrapped, "env_fns", None)
+        *wrappers, _ = layers(env)
+        with closing(makers[0]()) if makers else nullcontext(env) as one:
+            env_id = environment_id(one)
+            if makers:
+                words = [type(layer).__name__ for layer in wrappers]
+                env_id += "".join(f"+{word}" for word in words if word not in spaces.HARMLESS)
+            for layer in (env, one):
+                _require_steady(env_id, layer)
+            robot = describe(env_id, one, env.single_observation_space, env.single_action_space)
+        super().__init__(robot, env.num_envs, makers[0] if makers and not wrappers else None)
+        self.batch = batch_space(env.single_observation_space, env.num_envs)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
         seeds = self._seeds(seed, states)
+        self._examine(seeds[0])
         given: Any = seeds  # as copies take them, whatever the signature of VectorEnv.reset says
-        if not isinstance(self.env.unwrapped, SyncVectorEnv | AsyncVectorEnv) and (
-            seed is None or isinstance(seed, int)
-        ):
+        if not hasattr(self.env.unwrapped, "env_fns") and (seed is None or np.ndim(seed) == 0):
             given = seeds[0]
         try:
             first, _ = self.env.reset(seed=given)
@@ -408,8 +346,7 @@ class Vectorised(_Described):
             raise UnsupportedEnvironment(
                 f"{self.id} takes no seed for each of its episodes ({error!s:.100}); give one for all of them, seed=0"
             ) from error
-        self._begin(np.stack([self._checked(x) for x in first]).astype(np.float64))
-        return self.last
+        return self._begin([self._state(x) for x in self._rows(first)])
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
         commands = self._commands(actions)
@@ -417,81 +354,122 @@ class Vectorised(_Described):
         for t in range(actions.shape[1]):
             if self.ended.all():
                 break
-            observed, rewards, terminated, truncated, info = self.env.step(commands[:, t])
-            over = terminated | truncated
+            observed, *outcome, info = self.env.step(commands[:, t])
+            rows = self._rows(observed)
+            rewards, over, late = (self._numbers(part) for part in outcome)
             for i in np.flatnonzero(~self.ended):
-                seen = observed[i]
-                if over[i] and self.mode == AutoresetMode.SAME_STEP:
-                    seen = info["final_obs"][
-                        i
-                    ]  # what was observed is the next episode's first state
-                states[i, t:] = self._checked(seen)
-                self._require_finite(states[i, t : t + 1], int(i))
-                self.returns[i] += rewards[i]
-                self.steps[i] += 1
-                self.terminated[i], self.ended[i] = terminated[i], over[i]
-            if over.any() and not self.ended.all() and self.mode == AutoresetMode.DISABLED:
-                self.env.reset(options={"reset_mask": over})
-        self.last = states[:, -1].copy() if actions.shape[1] else self.last
+                if over[i] or late[i]:
+                    rows[i] = self._final(rows[i], info, i)
+                states[i, t:] = self._state(rows[i])
+                self._note(int(i), states[i, t], rewards[i], over[i], late[i])
+            self._restart(over | late)
         return states
 
     def close(self) -> None:
         self.env.close()
 
+    def _rows(self, observed: Any) -> list[Any]:
+        """The observation of each copy."""
+        rows = list(iterate(self.batch, observed))
+        if len(rows) != self.num_envs:
+            raise UnsupportedEnvironment(
+                f"{self.id} gave {len(rows)} observations for {self.num_envs} copies"
+            )
+        return rows
 
-def steps_left(env: gymnasium.Env) -> int | None:
-    """Steps until the limit of time of an environment that is wrapped as ``gymnasium.make`` does; None of any other."""
-    limit: int | None = None
-    layer: Any = env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, TimeLimit):
-            limit = layer._max_episode_steps - (layer._elapsed_steps or 0)
-        elif not isinstance(layer, OrderEnforcing | PassiveEnvChecker):
-            return None
-        layer = layer.env
-    return limit
+    def _numbers(self, values: Any) -> np.ndarray:
+        array = np.asarray(values)
+        if array.size != self.num_envs:
+            raise UnsupportedEnvironment(
+                f"{self.id} gave rewards or ends of shape {array.shape} for {self.num_envs} copies; expected one each"
+            )
+        return array.reshape(-1)
 
-
-def spend(env: gymnasium.Env, steps: int) -> None:
-    """Count ``steps`` towards the limit of time, as if they had been taken one by one."""
-    layer: Any = env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, TimeLimit):
-            vars(layer)["_elapsed_steps"] = (layer._elapsed_steps or 0) + steps
-        layer = layer.env
-
-
-def _dt(env_id: str, env: Any) -> float:
-    """Seconds per step, as the environment says."""
-    found, fps = getattr(env, "dt", None), (getattr(env, "metadata", None) or {}).get("render_fps")
-    if isinstance(found, int | float | np.floating) and 0 < found < np.inf:
-        return float(found)
-    if fps:
-        return 1.0 / float(fps)
-    warnings.warn(
-        f"{env_id} does not say how long a step is; one step counts as one second", stacklevel=4
-    )
-    return 1.0
-
-
-def continued(env_id: str, seeds: Sequence[int], actions: np.ndarray) -> Stepping:
-    """Episodes that began with the resets of ``seeds`` (B,) and went on by ``actions`` (B, t, du), to go on from.
-
-    UnsupportedEnvironment where its state cannot be set, so that it cannot be tried what would follow.
-    """
-    one = make_supported(env_id)
-    known = abilities(one)
-    if not known.restores:
-        one.close()
-        why = (
-            "its state cannot be saved and set"
-            if known.repeats
-            else "the same seed and actions do not repeat it"
-        )
+    def _final(self, seen: Any, info: Any, i: int) -> Any:
+        """What episode i came to with its last step, which may have been reset within it."""
+        mode = self.metadata.get("autoreset_mode")
+        finals = info.get("final_obs", info.get("final_observation"))
+        if finals is not None and finals[i] is not None:
+            return finals[i]
+        if mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+            return seen
         raise UnsupportedEnvironment(
-            f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, tsmlib.model_predictor"
+            f"{self.id} does not say what an episode that ended came to: put it into info['final_obs'], or say in "
+            "metadata['autoreset_mode'] that it is not reset within the step, gymnasium.vector.AutoresetMode.NEXT_STEP"
         )
-    begun = Stepping([one], len(seeds))
-    begun.reset(seed=seeds)
-    begun.rollout(actions)
-    return begun
+
+    def _restart(self, over: np.ndarray) -> None:
+        """Let the others go on where copies have to be reset from outside."""
+        waits = self.metadata.get("autoreset_mode") == AutoresetMode.DISABLED
+        if not waits or not over.any() or self.ended.all():
+            return
+        observed, _ = self.env.reset(options={"reset_mask": over})
+        rows = self._rows(observed)
+        for i in np.flatnonzero(~self.ended):
+            if not np.array_equal(self._state(rows[i]), self.last[i]):
+                raise UnsupportedEnvironment(
+                    f"{self.id} was to be reset in the copies that ended, options['reset_mask'], and reset copy {i} "
+                    "too, in the middle of its episode; heed the mask, or end all copies together"
+                )
+
+
+def _mixed(ids: set[str]) -> str:
+    return f"{min(ids).partition('(')[0]}(copies differ)"
+
+
+def _reset(env_id: str, env: gymnasium.Env, seed: int) -> Any:
+    result = env.reset(seed=seed)
+    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+        raise UnsupportedEnvironment(
+            f"reset of {env_id} returned {result!s:.80}; Gymnasium expects (observation, info)"
+        )
+    return result[0]
+
+
+def _step(env_id: str, env: gymnasium.Env, command: np.ndarray) -> tuple[Any, ...]:
+    result = env.step(command)
+    if not isinstance(result, tuple) or len(result) != 5:
+        raise UnsupportedEnvironment(
+            f"step of {env_id} returned {result!s:.80}; Gymnasium expects (observation, reward, terminated, truncated, "
+            "info)"
+        )
+    return result
+
+
+def _number(env_id: str, what: str, value: Any) -> float:
+    """One number, also of shape (1,)."""
+    array = np.asarray(value)
+    if array.size != 1 or array.dtype.kind not in "fiub":
+        raise UnsupportedEnvironment(f"{what} of {env_id} is {value!r:.80}; expected one number")
+    return float(array.reshape(-1)[0])
+
+
+def _require_steady(env_id: str, env: Any) -> None:
+    """UnsupportedEnvironment where an observation depends on all that was seen before."""
+    if any(type(layer).__name__ == "NormalizeObservation" for layer in layers(env)):
+        raise UnsupportedEnvironment(
+            f"{env_id} is wrapped in NormalizeObservation, whose units drift with all that it has seen: the same seed "
+            "and actions do not repeat an episode. Leave it out; models here scale their data themselves"
+        )
+
+
+def _clocks(env: gymnasium.Env) -> tuple[int | None, float | None]:
+    """Steps that the limit of time has counted, and MuJoCo's seconds."""
+    counts = [getattr(layer, "_elapsed_steps", None) for layer in layers(env)]
+    data = getattr(env.unwrapped, "data", None)
+    time = float(data.time) if type(data).__name__ == "MjData" else None  # type: ignore[union-attr]
+    return next((count for count in counts if count is not None), None), time
+
+
+def _repeats(env: gymnasium.Env, before: tuple[int | None, float | None], dt: float) -> float:
+    """How many times as long as ``dt`` the step since ``before`` took, by the clocks that there are."""
+    steps, seconds = _clocks(env)
+    if seconds is not None and before[1] is not None and seconds > before[1]:
+        ratio = (seconds - before[1]) / dt
+        return 1.0 if abs(ratio - 1) < 0.01 else ratio
+    for layer in layers(env):
+        if hasattr(layer, "dt"):
+            return 1.0  # said by a wrapper outside of the limit of time
+        if getattr(layer, "_elapsed_steps", None) is not None:
+            break
+    return float(steps - before[0]) if steps and before[0] is not None and steps > before[0] else 1.0

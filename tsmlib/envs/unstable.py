@@ -1,12 +1,39 @@
-"""The error of a simulation that left what is possible, of any environment."""
+"""What goes wrong in a simulator: the error that says so, and MuJoCo's own warnings."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class SimulationUnstable(RuntimeError):
-    """The simulator left the physical range: ``env`` (id), ``episode``, ``step`` since reset (from 0), ``reason``."""
+    """The simulator left the physical range.
+
+    Attributes:
+        env: id.
+        episode: which of those that ran together.
+        step: since its reset, from 0.
+        reason: what left the range.
+    """
 
     def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
         super().__init__(
             f"the simulation of {env} became unstable in episode {episode} at step {step}: {reason}. "
-            "Check the state this episode started from; the other episodes of this call were not returned."
+            "Check the state this episode started from; the other episodes of this call were not "
+            "returned."
         )
         self.env, self.episode, self.step, self.reason = env, episode, step, reason
+
+
+@contextmanager
+def without_log() -> Iterator[None]:
+    """MuJoCo's warnings go nowhere, so that it writes no MUJOCO_LOG.TXT.
+
+    Whoever asks for this reports what went wrong.
+    """
+    import mujoco
+
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)

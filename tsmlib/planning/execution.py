@@ -130,7 +130,7 @@ def _run(
 ) -> tuple[Trajectories, Simulation]:
     """An episode from each of the task's starts, and the simulation that it ran in."""
     seed, states = (task.seeds, None) if task.begins_by_seed else (SENSORS, task.start)
-    with closing(make_simulation(task.env, len(task), returns=True)) as run:
+    with closing(make_simulation(task.env, len(task))) as run:
         return collect(
             run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states
         ), run

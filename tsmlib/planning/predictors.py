@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from tsmlib.collection import collect, open_loop
+from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.stepping import UnsupportedEnvironment, continued, make_simulation
+from tsmlib.envs.stepping import UnsupportedEnvironment, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.models.mixture import Mixture
 from tsmlib.planning.base import Predictor
@@ -152,7 +153,7 @@ def simulator_predictor(
     """
     if isinstance(env, Task) and env.seeds:
         sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
-        begun = continued(env.env, env.seeds, sofar)
+        begun = Oracle(env.env, env.seeds, sofar)
 
         def outcomes(actions: Tensor) -> Tensor:
             return torch.from_numpy(begun.outcomes(actions.numpy())).float()[None]

@@ -132,7 +132,7 @@ class Task:
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
-        spec = gymnasium.registry.get(self.env) if self.seeds else None  # an arm goes on
+        spec = gymnasium.registry.get(self.env.partition("(")[0]) if self.seeds else None  # an arm goes on
         if spec and (limit := spec.max_episode_steps) and self.horizon > limit:
             raise ValueError(
                 f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; give horizon={limit} or "
