@@ -100,7 +100,9 @@ def environment_id(env: gymnasium.Env) -> str:
         if word in known:
             known.remove(word)
         elif word not in HARMLESS:
-            name += f"+{word}{_arguments(name, getattr(layer, '_saved_kwargs', {}), {}, strict=False)}"
+            name += (
+                f"+{word}{_arguments(name, getattr(layer, '_saved_kwargs', {}), {}, strict=False)}"
+            )
     return name
 
 
@@ -112,8 +114,15 @@ def canonical(env_id: str) -> str:
 
 _OF_MAKE = ("OrderEnforcing", "PassiveEnvChecker", "TimeLimit")
 HARMLESS = {  # wrappers that change neither observations nor what an action does
-    *_OF_MAKE, "RecordEpisodeStatistics", "RecordVideo", "HumanRendering", "RenderCollection",
-    "ClipReward", "NormalizeReward", "TransformReward", "DictInfoToList",
+    *_OF_MAKE,
+    "RecordEpisodeStatistics",
+    "RecordVideo",
+    "HumanRendering",
+    "RenderCollection",
+    "ClipReward",
+    "NormalizeReward",
+    "TransformReward",
+    "DictInfoToList",
 }
 
 
@@ -250,9 +259,7 @@ def require_actions(env_id: str, space: Space) -> Box:
     if not isinstance(space, Box) or space.dtype is None or space.dtype.kind != "f":
         kind = f"of type {space.dtype}" if isinstance(space, Box) else f"a {type(space).__name__}"
         kind = "discrete" if "Discrete" in kind or "Binary" in kind else kind
-        raise UnsupportedEnvironment(
-            f"actions of {env_id} are {kind}, {space!s:.100}; {SUPPORTED}"
-        )
+        raise UnsupportedEnvironment(f"actions of {env_id} are {kind}, {space!s:.100}; {SUPPORTED}")
     bounds = np.abs([space.low, space.high]).astype(np.float64)
     if not bounds.size or not (bounds <= FARTHEST).all():
         raise UnsupportedEnvironment(

@@ -472,4 +472,6 @@ def _repeats(env: gymnasium.Env, before: tuple[int | None, float | None], dt: fl
             return 1.0  # said by a wrapper outside of the limit of time
         if getattr(layer, "_elapsed_steps", None) is not None:
             break
-    return float(steps - before[0]) if steps and before[0] is not None and steps > before[0] else 1.0
+    return (
+        float(steps - before[0]) if steps and before[0] is not None and steps > before[0] else 1.0
+    )
