@@ -11,6 +11,8 @@ from dataclasses import replace
 from importlib import import_module
 from typing import Unpack
 
+from gymnasium.envs.registration import register
+
 from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
 from tsmlib.envs.physics import STANDARD, Changes
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
@@ -82,3 +84,11 @@ for _id in ENV_IDS:
     EnvSpec.parse(_id)
     imperfect(_id, noise=NOISE)
     imperfect(_id, delay=DELAY)
+
+# Not through ``pusht.pusht_variant``, which would import the simulator.
+register(
+    "tsm/PushT-v0",
+    entry_point="tsmlib.envs.pusht:PushTEnv",
+    vector_entry_point="tsmlib.envs.pusht:PushT",
+    max_episode_steps=300,
+)
