@@ -85,8 +85,7 @@ for _id in ENV_IDS:
     imperfect(_id, noise=NOISE)
     imperfect(_id, delay=DELAY)
 
-# Not through ``pusht.pusht_variant``, which would import the simulator.
-register(
+register(  # `pusht_field.pusht_variant` registers others; importing it here would load torch
     "tsm/PushT-v0",
     entry_point="tsmlib.envs.pusht:PushTEnv",
     vector_entry_point="tsmlib.envs.pusht:PushT",

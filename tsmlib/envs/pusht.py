@@ -1,168 +1,67 @@
-"""PushT in pymunk: a round pusher moves a T in a walled field, seen from above. Places are in pixels, y points down.
+"""PushT in pymunk: a round pusher moves a T in a walled field. Places are in px, y points down.
 
-The constants are those of stable-worldmodel, so are ``gym-pusht``'s. In state x_t the pusher is drawn to the place
+The constants are those of stable-worldmodel, so are ``gym-pusht``'s. In state x_t the pusher is
+drawn to the place
 
     g = p_t + 100 u_t        dv = (100 (g - p) - 20 v) dt        ten times in a step of 0.1 s
 
-and what it meets moves as it is pushed: nothing slides on, since velocities are lost from one physics step to the next.
-The pusher is not stopped by anything, neither by walls; a T that it squeezes against a wall may leave the field.
+and what it meets moves as it is pushed: nothing slides on, since velocities are lost from one
+physics step to the next. The pusher is not stopped by anything, neither by walls; a T that it
+squeezes against a wall may leave the field.
 """
 
 from __future__ import annotations
 
-import re
 import secrets
-from dataclasses import dataclass, fields
+from collections.abc import Callable
 
 import gymnasium
 import numpy as np
 import pymunk
 import torch
-from gymnasium.envs.registration import register, registry
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from tsmlib.checks import require_choice, require_count, require_number
+from tsmlib.checks import require_choice, require_count
+from tsmlib.envs.pusht_field import (
+    ENV_ID,
+    GOAL,
+    HIGH,
+    LOW,
+    NAMES,
+    UNITS,
+    WALL,
+    PushTPhysics,
+    clearance,
+    in_field,
+    placed,
+    pusht_image,
+    pusht_physics,
+    require_in_field,
+    require_states,
+)
 from tsmlib.envs.unstable import SimulationUnstable
 from tsmlib.trajectory import Segment
 
-ENV_ID = "tsm/PushT-v0"
 DT, SUBSTEPS = 0.1, 10  # s; physics steps in each
 STIFFNESS, DAMPING = 100.0, 20.0  # of the pusher's controller, 1/s^2 and 1/s
 REACH = 100.0  # px from the pusher to its target at full action
-SIZE, LOW, HIGH, WALL = (
-    512.0,
-    5.0,
-    506.0,
-    2.0,
-)  # px: the picture, the walls' centre lines, their radius
 FAR = 1e4  # px; beyond it a simulation has failed
-NAMES = ("pusher_x", "pusher_y", "tee_x", "tee_y", "tee_angle", "pusher_vx", "pusher_vy")
-UNITS = ("px", "px", "px", "px", "rad", "px/s", "px/s")
-GOAL = (256.0, 400.0, 256.0, 256.0, np.pi / 4, 0.0, 0.0)  # of a task without pairs (protocol A)
-SHAPES = {  # boxes (left, top, right, bottom) in units of the scale, the first one's moment counts for all
-    "T": ((-2.0, 0.0, 2.0, 1.0), (-0.5, 1.0, 0.5, 4.0)),
-    "small_T": ((-1.5, 0.0, 1.5, 1.0), (-0.5, 1.0, 0.5, 2.0)),
-    "L": ((0.0, 0.0, 1.0, 2.0), (0.0, -1.0, 2.0, 0.0)),
-    "Z": ((0.0, 0.0, 2.0, 1.0), (-1.0, -1.0, 1.0, 0.0)),
-    "square": ((-1.0, -1.0, 1.0, 1.0),),
-    "I": ((-0.5, -2.0, 0.5, 2.0),),
-    "plus": ((-1.5, -0.5, 1.5, 0.5), (-0.5, -1.5, 0.5, 1.5)),
-}
-GREY, GREEN, BLUE = "#778899", "#90EE90", "#4169E1"  # the colours that the field knows
 Info = dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class PushTPhysics:
-    """What can differ between two fields.
-
-    Args:
-        radius: of the pusher, px.
-        scale: width of the T's boxes, px.
-        friction: of pusher, T and walls; 0 in the original, which sets it where pymunk does not read it.
-        shape: of what is pushed, a key of ``SHAPES``.
-
-    Raises:
-        ValueError: a value out of its range.
-    """
-
-    radius: float = 15.0
-    scale: float = 30.0
-    friction: float = 0.0
-    shape: str = "T"
-
-    def __post_init__(self) -> None:
-        require_number("radius", self.radius, 5.0, 40.0)
-        require_number("scale", self.scale, 15.0, 45.0)
-        require_number("friction", self.friction, 0.0, 2.0)
-        require_choice("shape", self.shape, SHAPES)
-
-    @property
-    def id(self) -> str:
-        """Gymnasium's id: ``"tsm/PushT-scale40-shapeL-v0"``; ``"tsm/PushT-v0"`` of the standard field."""
-        changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
-        values = ((f.name, getattr(self, f.name)) for f in changed)
-        words = [f"-{name}{value if name == 'shape' else f'{value:g}'}" for name, value in values]
-        return f"tsm/PushT{''.join(words)}-v0"
-
-    @property
-    def boxes(self) -> np.ndarray:
-        """Corners (boxes, 4, 2) of what is pushed, in its own frame, px."""
-        x = np.array(SHAPES[self.shape]) * self.scale
-        return np.stack([x[:, [0, 1]], x[:, [2, 1]], x[:, [2, 3]], x[:, [0, 3]]], axis=1)
-
-
-def pusht_physics(env_id: str) -> PushTPhysics:
-    """The physics that an id says, which Gymnasium knows from then on; ValueError for another id."""
-    names = "".join(rf"(?:-{f.name}([0-9A-Za-z_.]+))?" for f in fields(PushTPhysics))
-    parts = re.fullmatch(rf"tsm/PushT{names}-v0", env_id)
-    if parts is None:
-        raise ValueError(
-            f"{env_id!r:.80} is no PushT; expected {ENV_ID!r} or what pusht_variant() calls one"
-        )
-    values = zip(fields(PushTPhysics), parts.groups(), strict=True)
-    given = {f.name: text if f.name == "shape" else float(text) for f, text in values if text}
-    return (
-        pusht_physics(pusht_variant(**given)) if env_id not in registry else PushTPhysics(**given)
-    )
-
-
-def pusht_variant(**changes: float | str) -> str:
-    """The id of PushT with other physics (`PushTPhysics`), registered where it is not yet."""
-    physics = PushTPhysics(**changes)  # type: ignore[arg-type]
-    if physics.id not in registry:
-        register(
-            physics.id,
-            entry_point="tsmlib.envs.pusht:PushTEnv",
-            vector_entry_point="tsmlib.envs.pusht:PushT",
-            kwargs={"env_id": physics.id},
-            max_episode_steps=300,
-        )
-    return physics.id
-
-
-def placed(points: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Points (..., P, 2) of the T's own frame where it is in states (..., 7): (..., P, 2), px."""
-    cosine, sine = np.cos(states[..., 4, None]), np.sin(states[..., 4, None])
-    x, y = points[..., 0], points[..., 1]
-    turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
-    return turned + states[..., None, 2:4]
-
-
-def in_field(states: np.ndarray, physics: PushTPhysics | None = None) -> np.ndarray:
-    """Whether pusher and T lie within the walls, give or take a pixel, in states (..., 7): (...) bool."""
-    physics = physics or PushTPhysics()
-    corners = placed(physics.boxes.reshape(-1, 2), states)
-    low, high, pusher = LOW + WALL - 1.0, HIGH - WALL + 1.0, states[..., :2]
-    inside = (corners >= low) & (corners <= high)
-    clear = (pusher >= low + physics.radius) & (pusher <= high - physics.radius)
-    return inside.all((-2, -1)) & clear.all(-1)
-
-
-def clearance(states: np.ndarray, physics: PushTPhysics | None = None) -> np.ndarray:
-    """Pixels between pusher and T in states (..., 7), negative where they overlap: (...)."""
-    physics = physics or PushTPhysics()
-    offset = states[..., :2] - states[..., 2:4]
-    cosine, sine = np.cos(states[..., 4]), np.sin(states[..., 4])
-    x, y = offset[..., 0], offset[..., 1]
-    own = np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)[..., None, :]
-    low, high = physics.boxes[:, 0], physics.boxes[:, 2]
-    beyond = np.maximum(low - own, own - high)  # (..., boxes, 2)
-    outside = np.linalg.norm(beyond.clip(min=0.0), axis=-1)
-    return (outside + beyond.max(-1).clip(max=0.0)).min(-1) - physics.radius
 
 
 class PushT(VectorEnv):
     """N fields. Episodes are not reset on their own: ``truncated`` turns true after the last step.
 
-    ``reset(seed, options)``: ``options["states"]`` (N, 7) starts the episodes there, ``options["goal"]`` (7,) or (N, 7)
-    sets the goal. Without a start, episode i is drawn from (seed, i) alone: pusher and T within the walls and apart.
+    ``reset(seed, options)``: ``options["states"]`` (N, 7) starts the episodes there,
+    ``options["goal"]`` (7,) or (N, 7) sets the goal. Without a start, episode i is drawn from
+    (seed, i) alone: pusher and T within the walls and apart.
 
-    An episode is a function of its start and actions. Chipmunk keeps impulses that cannot be read, so a snapshot is the
-    start with all actions since, and is brought back by replaying them, bit for bit.
+    An episode is a function of its start and actions. Chipmunk keeps impulses that cannot be read,
+    so a snapshot is the start with all actions since, and is brought back by replaying them, bit
+    for bit.
     """
 
     metadata = {  # noqa: RUF012 - as Gymnasium declares it
@@ -221,7 +120,7 @@ class PushT(VectorEnv):
         return states.copy(), {"goal": self.goal.copy()}
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
-        """Advance by ``actions`` (N, T, 2), clipped to [-1, 1], and give the states (N, T, 7) after each.
+        """Advance by ``actions`` (N, T, 2), clipped to [-1, 1]: the states (N, T, 7) after each.
 
         Raises:
             ValueError: actions of another shape, or not finite; nothing was simulated.
@@ -238,7 +137,8 @@ class PushT(VectorEnv):
             )
         if len(bad := np.argwhere(~np.isfinite(actions))):
             raise ValueError(
-                f"actions are {actions[tuple(bad[0])]} in episode {bad[0][0]}, step {bad[0][1]}; expected finite numbers"
+                f"actions are {actions[tuple(bad[0])]} in episode {bad[0][0]}, step {bad[0][1]}; "
+                "expected finite numbers"
             )
         actions = actions.clip(-1.0, 1.0)
         states = np.empty((*actions.shape[:2], 7))
@@ -255,9 +155,10 @@ class PushT(VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """One step by actions (N, 2): states (N, 7), rewards (N,), terminated, truncated (N,) and the goals.
+        """One step by actions (N, 2): states (N, 7), rewards, terminated, truncated (N,), goals.
 
-        The reward is minus the mean distance of the T's corners from the goal's, in hundreds of pixels.
+        The reward is minus the mean distance of the T's corners from the goal's, in hundreds of
+        pixels.
         """
         states = self.rollout(np.asarray(actions)[:, None])[:, 0]
         corners = self.physics.boxes.reshape(-1, 2)
@@ -277,14 +178,14 @@ class PushT(VectorEnv):
         self.rollout(actions)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """One uint8 image (height, width, 3) per episode, or None without ``render_mode="rgb_array"``."""
+        """A uint8 image (height, width, 3) of each; None without ``render_mode="rgb_array"``."""
         if self.render_mode is None:
             return None
         pairs = zip(self._states, self.goal, strict=True)
         return tuple(pusht_image(state, goal, self.physics) for state, goal in pairs)
 
     def _draw(self, rng: np.random.Generator) -> np.ndarray:
-        """A first state (7,): places and angle uniform, drawn again until pusher and T are apart and in the field."""
+        """A first state (7,): uniform, until pusher and T are apart and in the field."""
         while True:
             places = rng.uniform([50, 50, 100, 100, -np.pi], [450, 450, 400, 400, np.pi])
             state = np.concatenate([places, np.zeros(2)])
@@ -369,38 +270,11 @@ class PushTEnv(gymnasium.Env):
         return None if images is None else images[0]
 
 
-def require_states(name: str, value: object, n: int) -> np.ndarray:
-    """``value`` as finite float64 states (n, 7); ValueError that names it otherwise."""
-    states = np.array(value, np.float64)
-    if states.shape == (n, 5):
-        raise ValueError(
-            f"{name} is {states.shape}: gym-pusht's states of five numbers lack the pusher's velocity; expected "
-            f"({n}, 7), append two zeros: np.pad({name}, ((0, 0), (0, 2)))"
-        )
-    if states.shape != (n, 7):
-        raise ValueError(f"{name} is {states.shape}; expected ({n}, 7): {', '.join(NAMES)}")
-    if len(bad := np.argwhere(~np.isfinite(states))):
-        raise ValueError(f"{name} is not finite in episode {bad[0][0]}: {states[bad[0][0]]}")
-    return states
+def weak_policy(generator: torch.Generator, *, near: float = 100.0) -> Callable[[Segment], Tensor]:
+    """The controller of random play: a target around the pusher, drawn towards the T.
 
-
-def require_in_field(name: str, states: np.ndarray, physics: PushTPhysics | None = None) -> None:
-    """ValueError naming the first of states (N, 7) whose pusher or T is not within the walls."""
-    within = in_field(states, physics)
-    if not within.all():
-        i = int(np.argmin(within))
-        raise ValueError(
-            f"{name} {i} is outside the field or inside a wall: pusher at {states[i, :2].round(1)}, T at "
-            f"{states[i, 2:4].round(1)} turned by {states[i, 4]:.2f} rad; expected both between {LOW + WALL:g} and "
-            f"{HIGH - WALL:g} px with all their corners"
-        )
-
-
-def weak_policy(generator: torch.Generator, *, near: float = 100.0):
-    """The controller of random play: a target uniform within ``near`` px of the pusher, drawn towards the T.
-
-    stable-worldmodel's WeakPolicy: the pusher's place plus noise, clipped to a square of half-width ``near`` around
-    the T's place. Without it the pusher rarely meets the T.
+    stable-worldmodel's WeakPolicy: the pusher's place plus noise, clipped to a square of half-width
+    ``near`` around the T's place. Without it the pusher rarely meets the T.
     """
 
     def controller(past: Segment) -> Tensor:
@@ -410,60 +284,3 @@ def weak_policy(generator: torch.Generator, *, near: float = 100.0):
         return ((target - pusher) / REACH).clamp(-1, 1)[:, None]
 
     return controller
-
-
-def symmetric_copies(states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes (N, T + 1, 7) and actions (N, T, 2) in all eight copies, quarter turns and mirror images: 8 N of each."""
-    centre, found = (LOW + HIGH) / 2, []
-    for mirror in (1.0, -1.0):
-        for quarters in range(4):
-            cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters]
-            turn = np.array([[cosine, sine], [-sine, cosine]], states.dtype)
-            turn[0] *= mirror  # x -> mirror x, then the turn, of rows
-            x = states.copy()
-            for part in (slice(0, 2), slice(2, 4)):
-                x[..., part] = (states[..., part] - centre) @ turn + centre
-            x[..., 4] = mirror * states[..., 4] + quarters * np.pi / 2
-            x[..., 5:] = states[..., 5:] @ turn
-            found.append((x, actions @ turn))
-    every_state, every_action = zip(*found, strict=True)
-    return np.concatenate(every_state), np.concatenate(every_action)
-
-
-def pusht_image(
-    state: np.ndarray,
-    goal: np.ndarray | None = None,
-    physics: PushTPhysics | None = None,
-    *,
-    pixels: int = 256,
-) -> np.ndarray:
-    """A state (7,) drawn over its goal: grey T, green goal, blue pusher; uint8 (pixels, pixels, 3)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(1, 1), dpi=pixels)
-    canvas, ax = FigureCanvasAgg(figure), figure.add_axes((0, 0, 1, 1))
-    draw_pusht(ax, state, goal, physics)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def draw_pusht(
-    ax,
-    state: np.ndarray,
-    goal: np.ndarray | None = None,
-    physics: PushTPhysics | None = None,
-    *,
-    alpha: float = 1.0,
-) -> None:
-    """Draw a state (7,) over its goal into ``ax``, px."""
-    from matplotlib.patches import Circle, Polygon, Rectangle
-
-    physics = physics or PushTPhysics()
-    ax.add_patch(Rectangle((LOW, LOW), HIGH - LOW, HIGH - LOW, fc="white", ec="#D3D3D3", lw=2))
-    for pose, colour in ((goal, GREEN), (state, GREY)):
-        for box in physics.boxes if pose is not None else ():
-            ax.add_patch(Polygon(placed(box, pose), fc=colour, ec=colour, lw=0.3, alpha=alpha))
-    ax.add_patch(Circle(tuple(state[:2]), physics.radius, fc=BLUE, ec="none", alpha=alpha))
-    ax.set(xlim=(0, SIZE), ylim=(SIZE, 0), aspect="equal")
-    ax.axis("off")

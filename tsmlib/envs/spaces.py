@@ -20,6 +20,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.spaces import Box, Dict, Space, Tuple
 
+from tsmlib.envs.pusht_field import pusht_physics
 from tsmlib.envs.spec import EnvSpec
 
 SUPPORTED = (
@@ -58,8 +59,10 @@ def find_spec(env_id: str) -> GymnasiumSpec:
     if colon:
         importlib.import_module(module)
         name = plain
-    if name.startswith("tsm/") and not bracket:
-        EnvSpec.parse(name)  # registers a variant of an arm
+    if name.startswith("tsm/PushT-") and not bracket:
+        pusht_physics(name)  # registers a variant
+    elif name.startswith("tsm/") and not bracket:
+        EnvSpec.parse(name)
     spec = gymnasium.spec(name)
     if not bracket:
         return spec

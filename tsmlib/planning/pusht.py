@@ -1,7 +1,7 @@
-"""PushT as a task: the three measures of success that the field uses, costs, and tasks of pairs (start, goal).
+"""PushT as a task: the measures of success that the field uses, costs, and pairs (start, goal).
 
-Protocols are never mixed; ``docs/explanation/pusht.md`` says where each comes from. States are (..., 7) in pixels and
-radians, goals (..., 7) broadcast against them.
+Protocols are never mixed; ``docs/explanation/pusht.md`` says where each comes from. States are
+(..., 7) in pixels and radians, goals (..., 7) broadcast against them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from tsmlib.envs.pusht import SHAPES
+from tsmlib.envs.pusht_field import SHAPES
 
 COVERED = 0.95  # A: share of the goal's area
 NEAR, TURNED = 20.0, math.pi / 9  # B: px of (pusher, T) as one vector of four, rad
@@ -24,8 +24,8 @@ def turned_by(states: Tensor, goal: Tensor) -> Tensor:
     return torch.atan2(difference.sin(), difference.cos()).abs()
 
 
-def coverage(states: Tensor, goal: Tensor, *, scale: float = 30.0, points: int = 15) -> Tensor:
-    """Share of the goal's area that the T covers, by a grid of ``points`` to each scale: (...), 0 to 1."""
+def coverage(states: Tensor, goal: Tensor, *, scale: float = 30.0, points: int = 16) -> Tensor:
+    """Share of the goal's area that the T covers, by a grid of ``points`` to a scale: (...)."""
     cell = (torch.arange(4 * points) + 0.5) / points - 2.0
     x, y = torch.meshgrid(cell, cell + 2.0, indexing="ij")
     grid = torch.stack([x.flatten(), y.flatten()], dim=-1)
@@ -38,12 +38,12 @@ def coverage(states: Tensor, goal: Tensor, *, scale: float = 30.0, points: int =
 
 
 def success_a(states: Tensor, goal: Tensor) -> Tensor:
-    """Protocol A, Diffusion Policy: the T covers 95 % of the goal's area once. (..., T, 7) -> (...) bool."""
+    """Protocol A, Diffusion Policy: 95 % of the goal covered once. (..., T, 7) -> (...) bool."""
     return (coverage(states, goal[..., None, :]) >= COVERED).any(-1)
 
 
 def solved_b(states: Tensor, goal: Tensor) -> Tensor:
-    """Protocol B in each state: pusher and T within 20 px, the T within pi / 9. (..., 7) -> (...) bool."""
+    """Protocol B in each state: pusher and T within 20 px and pi / 9. (..., 7) -> (...) bool."""
     away = (states[..., :4] - goal[..., :4]).norm(dim=-1)
     return (away < NEAR) & (turned_by(states, goal) < TURNED)
 

@@ -1,0 +1,189 @@
+"""PushT: its physics, its starts and goals, and the three measures of success."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import tsmlib  # noqa: F401 - registers the environments
+from tsmlib.collection import collect
+from tsmlib.envs.pusht import PushT, weak_policy
+from tsmlib.envs.pusht_field import (
+    GOAL,
+    clearance,
+    in_field,
+    placed,
+    pusht_image,
+    pusht_physics,
+    pusht_variant,
+    symmetric_copies,
+)
+from tsmlib.envs.stepping import make_simulation
+from tsmlib.planning.pusht import coverage, solved_b, solved_c, success_a, success_b, success_c
+
+
+def play(n=12, horizon=30, env_id="tsm/PushT-v0", seed=0):
+    policy = weak_policy(torch.Generator().manual_seed(seed))
+    return collect(gymnasium.make_vec(env_id, num_envs=n), policy, horizon=horizon, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return play()
+
+
+def begun(states):
+    env = PushT(len(states))
+    env.reset(options={"states": states})
+    return env
+
+
+def test_an_untouched_t_does_not_move():
+    state = np.array([[60.0, 60, 300, 300, 0.3, 0, 0]])
+    moved = begun(state).rollout(np.full((1, 5, 2), -0.2))
+    assert (moved[0, :, 2:5] == state[0, 2:5]).all()
+
+
+def test_the_pusher_reaches_a_place_at_rest_and_a_push_carries_the_t_along():
+    state = np.array([[250.0, 200, 250, 300, 0, 0, 0]])
+    after = begun(state).rollout(np.array([[[0.0, 0.8]] * 4 + [[0.0, 0.0]] * 6]))
+    assert after[0, -1, 3] > 300
+    assert abs(after[0, -1, 2] - 250) < 1
+    assert clearance(after[0, -1]) > -1.5
+
+
+def test_what_is_pushed_stops_when_the_pusher_leaves(data):
+    still = np.abs(np.diff(data.states[..., 2:5], axis=1)).max(-1) == 0
+    apart = clearance(data.states) > 80
+    assert still[apart[:, :-1] & apart[:, 1:]].mean() > 0.9
+
+
+def test_an_episode_is_a_function_of_its_start_and_actions(data):
+    env = begun(data.states[:, 0].astype(float))
+    whole = env.rollout(data.actions)
+    env.reset(seed=0)
+    parts = [env.rollout(data.actions[:, k : k + 10]) for k in (0, 10, 20)]
+    # A start drawn from a seed has more digits than one in float32, and contact multiplies them.
+    assert (np.concatenate(parts, 1).astype(np.float32) == data.states[:, 1:]).all()
+    assert np.median(np.abs(whole - data.states[:, 1:])) < 1e-2
+
+
+def test_a_snapshot_continues_bit_for_bit(data):
+    env = begun(data.states[:, 0])
+    env.rollout(data.actions[:, :20])
+    snapshot = env.get_state()
+    first = env.rollout(data.actions[:, 20:])
+    env.set_state(snapshot)
+    assert (env.rollout(data.actions[:, 20:]) == first).all()
+
+
+def test_one_field_is_many_with_n_of_one(data):
+    one = gymnasium.make("tsm/PushT-v0")
+    one.reset(options={"states": data.states[3, 0]})
+    stepped = np.stack([one.step(u)[0] for u in data.actions[3, :20]])
+    assert (stepped == begun(data.states[3:4, 0]).rollout(data.actions[3:4, :20])[0]).all()
+
+
+def test_starts_lie_within_the_walls_and_apart():
+    env = PushT(100)
+    states, info = env.reset(seed=3)
+    assert in_field(states).all()
+    assert (clearance(states) > 0).all()
+    assert (info["goal"] == GOAL).all()
+    assert (PushT(2).reset(seed=3)[0] == states[:2]).all()  # episode i does not depend on N
+
+
+def test_the_physics_commute_with_quarter_turns_and_mirrors(data):
+    states, actions = symmetric_copies(data.states.astype(float), data.actions.astype(float))
+    apart = np.abs(begun(states[:, 0]).rollout(actions) - states[:, 1:]).max((1, 2))
+    first = np.abs(begun(data.states[:, 0]).rollout(data.actions) - data.states[:, 1:]).max((1, 2))
+    assert np.median(apart) < 0.01
+    assert (apart[: len(first)] == first).all()
+
+
+def test_a_larger_t_is_another_environment_that_its_id_remembers():
+    name = pusht_variant(scale=40, radius=20, shape="L", friction=0.5)
+    assert name == "tsm/PushT-radius20-scale40-friction0.5-shapeL-v0"
+    assert pusht_physics(name).scale == 40
+    assert make_simulation(name, 2).id == name
+    assert play(2, 3, name).env == name
+
+
+def test_all_shapes_can_be_pushed():
+    for shape in ("T", "small_T", "L", "Z", "square", "I", "plus"):
+        seen = play(8, 40, pusht_variant(shape=shape))
+        assert np.abs(seen.states[:, -1, 2:4] - seen.states[:, 0, 2:4]).max() > 10
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"states": np.zeros((1, 5))}, "five numbers lack the pusher's velocity"),
+        ({"goal": [20, 20, 256, 256, 0, 0, 0]}, None),
+        ({"goal": [10, 20, 256, 256, 0, 0, 0]}, "goal 0 is outside the field or inside a wall"),
+        ({"goal": [256, 400, 30, 256, 0, 0, 0]}, "goal 0 is outside the field"),
+        ({"goal": [np.nan, 400, 30, 256, 0, 0, 0]}, "goal is not finite"),
+        ({"target": [0, 0]}, "unknown reset options"),
+    ],
+)
+def test_bad_starts_and_goals_are_named(options, words):
+    if words is None:
+        options = {"goal": [23, 23, 256, 256, 0, 0, 0]}
+        PushT(1).reset(options=options)
+    else:
+        with pytest.raises(ValueError, match=words):
+            PushT(1).reset(options=options)
+
+
+def test_bad_actions_are_named():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        PushT(1).rollout(np.zeros((1, 1, 2)))
+    env = begun(np.array([GOAL]))
+    with pytest.raises(ValueError, match="expected \\(N=1, T, 2\\)"):
+        env.rollout(np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="nan in episode 0, step 1"):
+        env.rollout(np.array([[[0, 0], [np.nan, 0]]]))
+    with pytest.raises(ValueError, match="is no PushT"):
+        pusht_physics("tsm/PushT-wheels4-v0")
+
+
+def test_measures_of_success():
+    goal = torch.tensor(GOAL, dtype=torch.float32)
+    near = goal + torch.tensor([12.0, 0, 12, 0, 0.3, 0, 0])
+    away = goal + torch.tensor([30.0, 0, 0, 0, 0.0, 0, 0])
+    turned = goal + torch.tensor([0.0, 0, 0, 0, 2 * np.pi + 0.1, 0, 0])
+    assert solved_b(near, goal)
+    assert not solved_b(away, goal)
+    assert solved_b(turned, goal)
+    assert not solved_c(near, goal)
+    assert solved_c(away, goal)
+    assert solved_c(turned, goal)
+    episode = torch.stack([near, away, away, near])
+    assert success_b(episode, goal)
+    assert not success_c(episode, goal)
+    assert success_c(torch.stack([near, away, away, away]), goal)
+    assert success_a(torch.stack([near, away]), goal)
+    assert not success_a(near[None], goal)
+
+
+def test_coverage_is_the_share_of_the_goals_area():
+    goal = torch.tensor(GOAL, dtype=torch.float32)
+    assert coverage(goal, goal) == 1.0
+    shifted = torch.tensor([0.0, 0, 256, 256, 0, 0, 0])
+    level = shifted.clone()
+    level[2] += 30.0  # bar: 3 of 4 boxes stay covered, stem: none of 3
+    assert coverage(level, shifted) == pytest.approx(3 / 7, abs=0.01)
+
+
+def test_the_t_lies_where_its_state_says():
+    corner = placed(np.array([[60.0, 30.0]]), np.array(GOAL))
+    assert corner[0] == pytest.approx([256 + 30 / 2**0.5, 256 + 90 / 2**0.5])
+
+
+def test_a_picture_shows_pusher_t_and_goal():
+    picture = pusht_image(np.array([400.0, 400, 150, 150, 0, 0, 0]), np.array(GOAL), pixels=128)
+    assert picture.shape == (128, 128, 3)
+    assert picture.dtype == np.uint8
+    for x, y, colour in ((400, 400, "#4169E1"), (150, 165, "#778899"), (256, 290, "#90EE90")):
+        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.abs(picture[y // 4, x // 4].astype(int) - rgb).max() < 12
