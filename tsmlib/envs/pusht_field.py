@@ -87,9 +87,8 @@ def pusht_physics(env_id: str) -> PushTPhysics:
         )
     values = zip(fields(PushTPhysics), parts.groups(), strict=True)
     given = {f.name: text if f.name == "shape" else float(text) for f, text in values if text}
-    return (
-        pusht_physics(pusht_variant(**given)) if env_id not in registry else PushTPhysics(**given)
-    )
+    pusht_variant(**given)
+    return PushTPhysics(**given)  # type: ignore[arg-type]
 
 
 def pusht_variant(**changes: float | str) -> str:
