@@ -123,8 +123,8 @@ def main() -> None:
     ways: dict[str, Callable[[], object]] = {
         "latent, Adam": lambda: few_adam(fast, space=latent(prior)),
         "latent, Adam plain": lambda: few_adam(plain, space=latent(plain_prior)),
-        "direct, Adam": lambda: few_adam(fast, space=DirectActions(horizon)),
-        "direct, Adam plain": lambda: few_adam(plain, space=DirectActions(horizon)),
+        "direct, Adam": lambda: few_adam(fast, space=DirectActions(horizon, rms=0.1)),
+        "direct, Adam plain": lambda: few_adam(plain, space=DirectActions(horizon, rms=0.1)),
         "latent, CEM": lambda: few_cem(fast, space=latent(prior)),
         "latent, CEM plain": lambda: few_cem(plain, space=latent(plain_prior)),
         "simulate": lambda: simulate(start, torques, simulated),

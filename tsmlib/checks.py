@@ -1,4 +1,4 @@
-"""Small checks of arguments, whose errors say what was found, what was expected and what to type."""
+"""Small checks of arguments, whose errors say what was found, what was expected, what to type."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def require_count(name: str, value: object, *, least: int = 1) -> int:
-    """``value`` as an int of at least ``least``; TypeError or ValueError that names it otherwise."""
+    """``value`` as an int of at least ``least``; else a TypeError or ValueError that names it."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is {value!r:.80}; expected a whole number of at least {least}")
     if value < least:
@@ -26,13 +26,14 @@ def require_count(name: str, value: object, *, least: int = 1) -> int:
 def require_number(
     name: str, value: object, low: float = -math.inf, high: float = math.inf, *, above: bool = False
 ) -> float:
-    """``value`` as a finite float within [low, high], or (low, high] with ``above``; else an error that names it."""
+    """``value`` as a finite float within [low, high], with ``above`` (low, high]; else an error."""
     between = f"a number {'above' if above else 'of at least'} {low:g} and at most {high:g}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} is {value!r:.80}; expected {between}")
-    if not math.isfinite(value) or not low <= value <= high or (above and value == low):
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high or (above and number == low):
         raise ValueError(f"{name} is {value}; expected {between}")
-    return float(value)
+    return number
 
 
 def require_choice(name: str, value: T, choices: Iterable[T]) -> T:
@@ -77,3 +78,27 @@ def as_tensor(name: str, value: object, shape: tuple[int | str, ...]) -> Tensor:
 
 def _words(shape: tuple[int | str, ...]) -> str:
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+
+
+def require_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """TypeError unless ``value`` is of a kind; ``expected`` says in words what to give."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {described(value)}; expected {expected}")
+
+
+def require_callable(name: str, value: object, expected: str) -> None:
+    """TypeError unless ``value`` can be called; ``expected`` says in words what to give."""
+    if not callable(value) or isinstance(value, type):
+        raise TypeError(f"{name} is {described(value)}; expected {expected}")
+
+
+def described(value: object) -> str:
+    """A value as errors name it: its type, and where it has one its shape."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    shape = getattr(value, "shape", None)
+    kind = "tensor" if isinstance(value, Tensor) else type(value).__name__
+    if isinstance(shape, tuple):
+        return f"a {kind} {tuple(shape)}"
+    shown = f" {value!r:.60}" if isinstance(value, str | int | float | list | tuple) else ""
+    return f"a {kind}{shown}"

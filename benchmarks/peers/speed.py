@@ -35,7 +35,7 @@ from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import adam, cem, expected_return
 from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.planning.tasks import Task, zero_torques
+from tsmlib.planning.tasks import Task
 from tsmlib.statistics import interval
 from tsmlib.storage import artifacts, tables
 from tsmlib import zoo
@@ -288,7 +288,7 @@ class Models:
         return (
             LatentActions(self.prior, horizon)
             if way.search_space == "latent"
-            else DirectActions(horizon)
+            else DirectActions(horizon, rms=0.1)
         )
 
 
@@ -466,7 +466,7 @@ def training(
 def planning(found: Sequence[Outcome], task: Task) -> list[dict[str, Any]]:
     """Print and return seconds and returns of every way, compared with those of mbrl-lib with its own settings."""
     first, n, rows = found[0], len(task), []
-    idle = execute(task, zero_torques(task)).executed_return.numpy()
+    idle = execute(task, task.idle_actions()).executed_return.numpy()
     print(
         f"\nplanning, {n} targets, {task.horizon} steps: candidates x iterations x samples; idle (no torques) returns "
         f"{idle.mean():.2f}"

@@ -82,7 +82,7 @@ def of_return(
 
     weights = {"model": _playing(net), "prior": _playing(prior)}
     return errors(LatentActions(prior, task.horizon), weights) | errors(
-        DirectActions(task.horizon), {}
+        DirectActions(task.horizon, task.action_dim, rms=0.1), {}
     )
 
 

@@ -1,4 +1,7 @@
-"""Plans, and the protocols of predictors, search spaces and planners."""
+"""Plans, and the protocols of predictors, search spaces and planners.
+
+Letters in shapes: B targets planned for at once, C candidates for each, S model samples, T horizon.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,24 @@ from tsmlib.rewards import Reward
 from tsmlib.trajectory import Segment
 
 Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
+Risk = Callable[[Tensor], Tensor]  # returns of the samples (S, C, B) -> of candidates (C, B)
+
+
+def mean(returns: Tensor) -> Tensor:
+    """Judge by the expectation over samples, as the paper does (Eqs. 2 and 3)."""
+    return returns.mean(0)
+
+
+def worst(returns: Tensor) -> Tensor:
+    """Judge by the worst sample."""
+    return returns.amin(0)
 
 
 class Judge(Protocol):
-    """What candidates are judged by: ``model_predictor``, the mode; ``expected_predictor``, mode and samples; ..."""
+    """Makes what candidates are judged by: ``model_predictor``, ``expected_predictor``, ..."""
 
     def __call__(self, model: Model, past: Segment, /, *, seed: int) -> Predictor:
-        """The predictor through ``model`` from ``past`` (B, L, .); what is drawn is a function of ``seed``."""
+        """The predictor through ``model`` from ``past`` (B, L, .); ``seed`` fixes what it draws."""
         ...
 
 
@@ -39,7 +53,7 @@ class SearchSpace(Protocol):
         ...
 
     def after(self, parameters: Tensor, steps: int) -> tuple[SearchSpace, Tensor]:
-        """What is left when ``steps`` actions of a plan (B, *shape) are done: the space, and the plan in it."""
+        """The space of the rest after ``steps`` actions of a plan (B, *shape), and the rest."""
         ...
 
 
@@ -47,10 +61,18 @@ class SearchSpace(Protocol):
 class Plan:
     """The best actions found for each of B targets.
 
-    actions (B, T, du); parameters (B, *shape) they decode from; states (S, B, T, dx) predicted for them;
-    predicted_return (B,): expected and undiscounted; curve (iterations + 1, B): predicted return of the best so far,
-    from the start on, -inf where none was finite yet; seconds; trace (iterations + 1, B, *shape): the parameters of the
-    best so far, see ``plan_at``.
+    Attributes:
+        actions: (B, T, du) in [-1, 1].
+        parameters: (B, *shape) in the search space, which decode to the actions.
+        states: (S, B, T, dx) predicted for the actions, physical units.
+        predicted_return: (B,), undiscounted, mean over the samples.
+        curve: (iterations + 1, B), what the best so far was judged by, from the start on; -inf
+            where no return was finite yet.
+        seconds: of the planning, on the wall.
+        trace: (iterations + 1, B, *shape), parameters of the best so far (``plan_at``); None where
+            they were not kept.
+        start: (B, dx), the states that the plan begins in; None where the predictor did not say.
+            ``execute`` refuses the plan for other starts.
     """
 
     actions: Tensor
@@ -60,10 +82,12 @@ class Plan:
     curve: Tensor
     seconds: float
     trace: Tensor | None = None
+    start: Tensor | None = None
 
     def __repr__(self) -> str:
         n, steps = self.actions.shape[:2]
-        return f"Plan({n} targets, {steps} steps, mean predicted return {float(self.predicted_return.mean()):.4g})"
+        value = float(self.predicted_return.mean())
+        return f"Plan({n} targets, {steps} steps, mean predicted return {value:.4g})"
 
 
 class Planner(Protocol):
@@ -72,5 +96,8 @@ class Planner(Protocol):
     def __call__(
         self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /
     ) -> Plan:
-        """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero. Never worse than it."""
+        """Plan from parameters ``start`` (C, B, *shape), or for ``start`` targets from zero.
+
+        The plan is never worse than its start.
+        """
         ...

@@ -1,20 +1,26 @@
-"""Execution of plans in the true simulator: predicted and executed return (section 5.3.2, figure 6).
+"""Execution of plans in the true simulator: predicted and executed return (section 5.3.2).
 
-Open loop as in the paper (``execute``), or planning again every few steps from what the arm really did (``mpc``).
+Open loop as in the paper (``execute``), or planning again every few steps from what the arm really
+did (``mpc``).
+
+Letters in shapes: B targets, T horizon, L past length, dx, du size of state and action.
 """
+
+from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm.auto import tqdm
 
+from tsmlib.checks import as_tensor, described, require_callable, require_count, require_type
 from tsmlib.collection import Controller, collect, open_loop
 from tsmlib.envs.stepping import Arms, Simulation, make_simulation
 from tsmlib.envs.unstable import SimulationUnstable
@@ -35,17 +41,20 @@ SENSORS = 5  # seed of the sensor noise of every trial, so that trials can be re
 class Trial:
     """Actions executed in the true simulator.
 
-    actions (B, T, du), of a controller zero after the end of an episode; states (B, T + 1, dx) from the start on;
-    executed_return (B,): undiscounted; final_distance (B,): metres, or as the task's measure of success has it, NaN
-    where it has none; plan: where the actions came from, with the predicted return, if from a plan; observed
-    (B, T + 1, dx): what the sensors said, where they are noisy.
+    Behind delayed actions ``actions`` are those that were given. The executed return charges those
+    that arrived, a predicted return those given, so that the gap holds the penalty of the last tau.
 
-    Behind delayed actions ``actions`` are those that were given. The executed return charges those that arrived, a
-    predicted return those given, so that the gap holds the penalty of the last tau torques.
-
-    success (B,): by the task's measure; None without one. lengths: steps of each episode, where some ended early;
-    returns are of those steps. own_return (B,): by the environment's own reward, NaN where it keeps none. seen: the
-    episodes as they were collected, with what the sensors said and how each of them ended.
+    Attributes:
+        actions: (B, T, du); of a controller zero after the end of an episode.
+        states: (B, T + 1, dx), from the start on.
+        executed_return: (B,), undiscounted, of the steps of each episode.
+        final_distance: (B,), metres, or as the task's measure of success has it; NaN without one.
+        plan: where the actions came from, with the predicted return, if from a plan.
+        observed: (B, T + 1, dx), what the sensors said, where they are noisy.
+        success: (B,) bool, by the task's measure; None without one.
+        lengths: steps of each episode, where some ended early.
+        own_return: (B,), by the environment's own reward, NaN where it keeps none.
+        seen: the episodes as they were collected.
     """
 
     actions: Tensor
@@ -60,8 +69,9 @@ class Trial:
     seen: Trajectories | None = None
 
     def __repr__(self) -> str:
-        found = f"{len(self.actions)} episodes, {max(self.steps)} steps"
-        return f"Trial({found}, mean executed return {float(self.executed_return.mean()):.4g})"
+        size = f"{len(self.actions)} episodes, {max(self.steps)} steps"
+        solved = "" if self.success is None else f", {int(self.success.sum())} successes"
+        return f"Trial({size}, mean executed return {self.executed_return.mean():.4g}{solved})"
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -77,29 +87,71 @@ class Trial:
 
 
 def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10) -> Trial:
-    """Run a plan, or plain actions (B, T, du), open loop from the task's starts; or a controller, a policy say.
+    """Run a plan, or plain actions, open loop from the task's starts; or a controller.
 
-    Actions beyond [-1, 1] are clipped, and the trial holds and charges them as they were executed.
-    past_len: steps of past that a controller sees; those before the episode are x_0 repeated and no action.
-    A controller sees what the sensors say, noise included (drawn from one fixed seed); the trial holds true states.
+    Args:
+        task: whose starts and reward are meant.
+        plan: a plan from these starts; actions (B, T, du) in [-1, 1]; or a controller, a function
+            of the past (B, L, .) that gives the next actions (B, K, du). A controller sees what the
+            sensors say, noise included (drawn from one fixed seed); the trial holds true states.
+        past_len: L, steps of past that a controller sees; before the episode they are x_0 repeated
+            and no action.
+
+    Returns:
+        The trial.
+
+    Raises:
+        TypeError: ``plan`` is something else, such as a policy or a model.
+        ValueError: actions of another shape, beyond [-1, 1], or planned from other starts; or an
+            environment that begins elsewhere than its task.
+        SimulationUnstable: a state that is not finite.
     """
-    actions = plan.actions if isinstance(plan, Plan) else plan
-    if isinstance(actions, Tensor):
-        actions = actions.clamp(-1, 1)
-        seen, run = _run(task, open_loop(actions), actions.shape[1])
+    _require_task(task)
+    past_len = require_count("past_len", past_len)
+    if isinstance(plan, Plan) or not callable(plan):
+        actions = _open_loop_actions(task, plan)
+        seen, run = _run(task, open_loop(actions), task.horizon)
+    elif isinstance(plan, nn.Module) or hasattr(plan, "begin"):
+        raise TypeError(
+            f"plan is {described(plan)}; expected a Plan, actions or a controller. A policy acts "
+            "by tsmlib.policies.networks.controller(policy, task.target), a model by a plan"
+        )
     else:
-        seen, run = _run(task, actions, task.horizon, past_len)
+        seen, run = _run(task, plan, task.horizon, past_len)
         actions = _whole_actions(seen, task.horizon)
     return _measured(task, run, seen, actions, plan if isinstance(plan, Plan) else None)
+
+
+def _require_task(task: object) -> None:
+    hint = "a Task, such as tsmlib.load_task(env) or tsmlib.Task.from_env(env, ...)"
+    require_type("task", task, Task, hint)
+
+
+def _open_loop_actions(task: Task, plan: object) -> Tensor:
+    """The actions (B, T, du) of a plan, or given as they are, checked against the task."""
+    if isinstance(plan, Plan) and plan.start is not None:
+        task.require_start(plan.start, "the plan")
+    name, given = ("plan.actions", plan.actions) if isinstance(plan, Plan) else ("actions", plan)
+    sizes = (len(task), task.horizon, task.action_dim)
+    actions = as_tensor(name, given, sizes)
+    if (most := float(actions.abs().max())) > 1 + 1e-6:
+        raise ValueError(
+            f"{name} go up to {most:g}; expected them within [-1, 1], the bounds of the action "
+            "space: divide by its bounds, or clip, actions.clamp(-1, 1)"
+        )
+    return actions
 
 
 @dataclass(frozen=True)
 class Stable(Generic[T]):
     """The result of a run on those instances of a task whose simulation stayed stable.
 
-    task: these instances; kept: their indices among all. found: what ``run`` gave; None where no instance is left, and
-    ``task`` is then the last that was lost. lost: how many others there were. discarded_steps: executed before an
-    instance was lost, after which the others begin anew.
+    Attributes:
+        task: these instances; where none is left, the last that was lost.
+        kept: their indices among all.
+        found: what the run gave; None where no instance is left.
+        lost: how many others there were.
+        discarded_steps: executed before an instance was lost, whereupon the others begin anew.
     """
 
     task: Task
@@ -110,7 +162,15 @@ class Stable(Generic[T]):
 
 
 def without_unstable(task: Task, run: Callable[[Task, list[int]], T]) -> Stable[T]:
-    """``run(task, indices)``, run again without each instance whose simulation becomes unstable, until none does."""
+    """Run instances of a task, again without each whose simulation becomes unstable.
+
+    Args:
+        task: of all instances.
+        run: of a task and the indices of its instances among all.
+
+    Returns:
+        What the last run gave, and of which instances.
+    """
     kept, discarded = list(range(len(task))), 0
     left = task
     while True:
@@ -131,9 +191,12 @@ def _run(
     """An episode from each of the task's starts, and the simulation that it ran in."""
     seed, states = (task.seeds, None) if task.begins_by_seed else (SENSORS, task.start)
     with closing(make_simulation(task.env, len(task))) as run:
-        return collect(
+        seen = collect(
             run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states
-        ), run
+        )
+    if task.begins_by_seed:
+        task.require_start(torch.from_numpy(seen.states[:, 0]), "the executed episode")
+    return seen, run
 
 
 def mpc(
@@ -142,34 +205,49 @@ def mpc(
     space: SearchSpace,
     planner: Planner,
     *,
-    every: int = 10,  # steps executed before the next plan
+    every: int = 10,
     plan: Plan | None = None,
     judge: Judge = model_predictor,
     seed: int = 0,
     progress: str = "",
 ) -> Trial:
-    """Closed loop (model predictive control): plan to the end of the episode, execute ``every`` steps, observe, repeat.
+    """Closed loop: plan to the end of the episode, execute some steps, observe, repeat.
 
-    The horizon shrinks: T, T - every, T - 2 every, ... steps. Each plan starts from what is left of the one before it
-    (``SearchSpace.after``), and is never worse than that by its own prediction.
+    The horizon shrinks: T, T - every, T - 2 every, ... steps. Each plan starts from what is left of
+    the one before it (``SearchSpace.after``), and is never worse than that by its own prediction.
+    Its predicted return comes from samples that had no part in choosing it (``fresh_predictor``).
 
-    model: what plans are made through, from the true observed past; None is the true simulator. space: of the whole
-    episode. planner: with the budget of each plan, ``partial(cem, candidates=96, iterations=4)`` for example. plan: the
-    first one, if it is already there, so that closed and open loop begin alike.
-    judge: what candidates are judged by, by default the model's mode. The predicted return of each plan comes from
-    samples that had no part in choosing it (``fresh_predictor``).
+    Args:
+        task: whose starts and reward are meant.
+        model: what plans are made through, from the observed past; None is the true simulator.
+        space: of the whole episode.
+        planner: with the budget of each plan, such as ``partial(cem, candidates=96)``.
+        every: steps executed before the next plan.
+        plan: the first one, if there is one already, so that closed and open loop begin alike.
+        judge: makes what candidates are judged by, by default the model's mode.
+        seed: of what judges and fresh samples draw, 0 or above.
+        progress: title of the progress bar; none without.
 
-    Of the trial's plan, ``predicted_return`` is the first plan's, ``curve`` (plans, B) every plan's for the whole
-    episode, the return executed until then included, and ``states`` (1, B, T, dx) the part of every predicted rollout
-    that was executed; where all episodes ended before, the last of them repeats.
+    Returns:
+        The trial. Of its plan ``predicted_return`` is the first plan's, ``curve`` (plans, B) every
+        plan's for the whole episode, the return executed until then included, and ``states``
+        (1, B, T, dx) the part of every predicted rollout that was executed; where all episodes
+        ended before, the last of them repeats.
+
+    Raises:
+        TypeError, ValueError: an argument that cannot be; the message names it.
+        SimulationUnstable: a state that is not finite.
     """
-    if every < 1:
-        raise ValueError(f"every is {every}, expected a positive number of steps")
-    began, horizon, past_len = (
-        time.perf_counter(),
-        task.horizon,
-        1 if model is None else as_dynamics(model).past_len,
-    )
+    _require_task(task)
+    every = require_count("every", every)
+    seed = require_count("seed", seed, least=0)
+    require_callable("planner", planner, "a function, such as tsmlib.cem")
+    require_callable("judge", judge, "a function, such as tsmlib.model_predictor")
+    if plan is not None:
+        _open_loop_actions(task, plan)
+        plan = replace(plan, start=None)  # sensors may say another
+    began, horizon = time.perf_counter(), task.horizon
+    past_len = 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(
         task, model, planner, every, judge, seed, space, start=len(task), plan=plan
     )
@@ -191,13 +269,14 @@ def mpc(
         predicted_return=returns[0],
         curve=returns,
         seconds=time.perf_counter() - began,
+        start=torch.from_numpy(task.start),
     )
     return _measured(task, run, seen, actions, made)
 
 
 @dataclass
 class _Replanning:
-    """The controller that plans to the end of the episode each time it is asked, and keeps what was predicted."""
+    """The controller that plans to the end of the episode each time, and keeps predictions."""
 
     task: Task
     model: Model | None
@@ -214,11 +293,11 @@ class _Replanning:
 
     def __call__(self, past: Segment) -> Tensor:
         """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
-        reward = _whole_episode(
-            self.task.reward, Segment(*(part[:, part.shape[1] - self.done :] for part in past))
-        )
+        so_far = Segment(*(part[:, part.shape[1] - self.done :] for part in past))
+        reward = _whole_episode(self.task.reward, so_far)
         predict, fresh = self._predictors(past)
         plan, self.plan = self.plan or self.planner(predict, reward, self.space, self.start), None
+        self._require_whole(plan)
         judged = reevaluate(plan, fresh, reward)
         self.returns.append(judged.predicted_return)
         self.rollouts.append(judged.states[:1, :, : self.every])
@@ -229,36 +308,42 @@ class _Replanning:
             self.start = left[None]
         return plan.actions[:, :steps]
 
-    def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
-        """What candidates are judged by, and what the return of the finished plan is predicted with."""
-        if self.model is None:
-            simulator = simulator_predictor(
-                self.task,
-                past.states[:, -1].numpy(),
-                done=past.actions[:, past.actions.shape[1] - self.done :],
+    def _require_whole(self, plan: Plan) -> None:
+        require_type("what the planner gave", plan, Plan, "a Plan, as of tsmlib.cem")
+        left = self.task.horizon - self.done
+        if plan.actions.shape[1] != left:
+            raise ValueError(
+                f"space gives plans of {plan.actions.shape[1]} steps, but {left} of the "
+                f"{self.task.horizon} steps of task {self.task.name!r} are left; give a space of "
+                "the whole episode, task.horizon steps"
             )
+
+    def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
+        """What candidates are judged by, and what predicts the return of the finished plan."""
+        if self.model is None:
+            done = past.actions[:, past.actions.shape[1] - self.done :]
+            simulator = simulator_predictor(self.task, past.states[:, -1].numpy(), done=done)
             return simulator, simulator
         recent, seed = past.last(as_dynamics(self.model).past_len), self.seed + 2 * self.done
-        return self.judge(self.model, recent, seed=seed), fresh_predictor(
-            self.model, recent, seed=seed + 1
-        )
+        fresh = fresh_predictor(self.model, recent, seed=seed + 1)
+        return self.judge(self.model, recent, seed=seed), fresh
 
 
 def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
-    """``reward`` of an episode that began with ``so_far`` (B, t, .), as a function of the rest of it.
+    """``reward`` of an episode that began with ``so_far`` (B, t, .), as a function of its rest.
 
-    The first step of the rest is given the return executed before, so that returns are those of the whole episode.
+    The first step of the rest is given the return executed before, so that returns are those of the
+    whole episode.
     """
 
     def total(states: Tensor, actions: Tensor) -> Tensor:
         done = so_far.states.shape[1]
-        rest = (states, actions)
         before = (
-            part.expand(*new.shape[:-2], -1, -1) for part, new in zip(so_far, rest, strict=True)
+            part.expand(*rest.shape[:-2], -1, -1)
+            for part, rest in zip(so_far, (states, actions), strict=True)
         )
-        per_step = rewarded(
-            reward, *(torch.cat(pair, -2) for pair in zip(before, rest, strict=True))
-        )
+        whole = (torch.cat(pair, -2) for pair in zip(before, (states, actions), strict=True))
+        per_step = rewarded(reward, *whole)
         executed = per_step[..., :done].sum(-1, keepdim=True)
         return torch.cat([per_step[..., done : done + 1] + executed, per_step[..., done + 1 :]], -1)
 
@@ -273,7 +358,7 @@ def _whole_actions(seen: Trajectories, horizon: int) -> Tensor:
 def _measured(
     task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None
 ) -> Trial:
-    """The trial that just ended in ``run``, of which the sensors said ``seen``; its last state repeats up to T."""
+    """The trial that just ended in ``run``; its last state repeats up to T."""
     missing = actions.shape[1] - seen.horizon
     states = observed = torch.from_numpy(
         np.pad(seen.states, ((0, 0), (0, missing), (0, 0)), mode="edge")

@@ -1,16 +1,21 @@
-"""Predictors: candidate actions to states, through a model or through the true simulator."""
+"""Predictors: candidate actions to states, through a model or through the true simulator.
+
+Letters in shapes: C candidates, B targets, S model samples, T horizon, L past length.
+"""
+
+from __future__ import annotations
 
 import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
-from itertools import chain
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tsmlib.checks import as_tensor, described, require_count
 from tsmlib.collection import collect, open_loop
 from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec
@@ -23,165 +28,295 @@ from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise
 from tsmlib.trajectory import Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
-JUDGING = (
-    8  # samples beside the mode, by which a candidate is judged (benchmarks/settings, section 3)
-)
+JUDGING = 8  # samples beside the mode by which a candidate is judged
 
 
-def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
-    """Predict by rolling out ``model`` from ``past`` (B, L, .): its mode, or samples of it.
+@dataclass(frozen=True)
+class ModelPredictor:
+    """Predict by rolling out a model: ``draws`` rollouts of every candidate, or its mode.
 
-    samples: 0 rolls out the mode (z = 0) of every candidate, S = 1, or of an ensemble the mode of each member, S of
-    them, of a ``Mixture`` those of all its models; n draws n samples of each, S = n, with the same noise, a function of
-    ``seed``, for every candidate and call.
-    ValueError for samples of a deterministic model.
+    Attributes:
+        model: of segments of steps.
+        past: what was observed, states (B, L, dx) and actions (B, L, du).
+        draws: S, rollouts of every candidate.
+        noise: makes what each call draws from; None for the mode.
     """
-    if samples < 0:
-        raise ValueError(
-            f"samples is {samples}, expected 0 (the mode) or a positive number of samples"
-        )
-    if samples and not as_dynamics(model).stochastic:
-        raise ValueError(
-            f"{samples} samples of {type(model).__name__} asked for, but it is deterministic: its one rollout is the "
-            "mode, samples=0"
-        )
-    if not samples and isinstance(model, Mixture):
-        judges = (model_predictor(each, past) for each in model.models)
-        every = (
-            [judge] if not isinstance(judge, EnsemblePredictor) else judge.each for judge in judges
-        )
-        return EnsemblePredictor(tuple(chain.from_iterable(every)))
-    if not samples and members(model) > 1:
-        n = members(model)
-        alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))
-        together = partial(_predict, model, past, n, partial(NoNoise, len(past.states)))
-        return EnsemblePredictor(
-            tuple(partial(_predict, model, past, 1, noise) for noise in alone), together
-        )
 
-    def common() -> Noise:
-        return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
+    model: Model
+    past: Segment
+    draws: int = 1
+    noise: Callable[[], Noise] | None = None
 
-    return partial(_predict, model, past, max(1, samples), common if samples else None)
+    @property
+    def start(self) -> Tensor:
+        """The states (B, dx) that predictions begin in."""
+        return self.past.states[:, -1]
 
+    def __repr__(self) -> str:
+        what = f"{self.draws} rollouts" if self.noise else "the mode"
+        n = len(self.past.states)
+        return f"ModelPredictor({what} of {type(self.model).__name__}, {n} targets)"
 
-def expected_predictor(
-    model: Model, past: Segment, *, samples: int = JUDGING, seed: int = 0
-) -> Predictor:
-    """Predict for an expectation over the model's futures (Eqs. 2 and 3): its mode and ``samples`` samples.
-
-    An ``EnsemblePredictor``, whose first member is the mode, so that ``cem(screened=0.25)`` sorts the candidates by the
-    mode and judges the best quarter by the mean over all. A deterministic model has its one rollout, an ensemble the
-    modes of its members.
-
-    Samples have the same noise, a function of ``seed``, for every candidate and call. ``fresh_predictor`` needs a seed
-    that is none of ``samples * seed`` and the ``samples - 1`` after it.
-    """
-    if samples < 1:
-        raise ValueError(
-            f"samples is {samples}, expected at least 1; the mode alone is model_predictor(model, past)"
-        )
-    mode = model_predictor(model, past)
-    if not as_dynamics(model).stochastic or isinstance(mode, EnsemblePredictor):
-        return mode
-
-    def common() -> Noise:
-        seeds = range(samples * seed, samples * (seed + 1))
-        each = SeparateNoise(tuple(torch.Generator().manual_seed(one) for one in seeds))
-        return SharedNoise(each, samples * len(past.states))
-
-    return EnsemblePredictor((mode, partial(_predict, model, past, samples, common)))
+    def __call__(self, actions: Tensor) -> Tensor:
+        """Actions (C, B, T, du) -> states (S, C, B, T, dx)."""
+        n, n_targets, _, du = actions.shape
+        if du != self.past.actions.shape[2]:
+            raise ValueError(
+                f"actions have {du} dimensions, those of the past {self.past.actions.shape[2]}; "
+                "give the search space the size of this robot's actions: "
+                "DirectActions(task.horizon, task.action_dim, rms=...)"
+            )
+        _require_targets(n_targets, len(self.past.states), "the past")
+        rows = actions[:, None].expand(-1, self.draws, -1, -1, -1).flatten(0, 2)  # (C S B, T, du)
+        pasts = Segment(*(part.repeat(n * self.draws, 1, 1) for part in self.past))
+        noise = self.noise() if self.noise else None
+        states = rollout(self.model, pasts, rows, generator=noise)
+        return states.unflatten(0, (n, self.draws, n_targets)).transpose(0, 1)
 
 
 @dataclass(frozen=True)
 class EnsemblePredictor:
-    """Predict by several predictors: by the mode of each member of an ensemble, or by a model's mode and its samples.
+    """Predict by several predictors: the modes of an ensemble's members, or a mode and samples.
 
-    each: by themselves, the first S = 1, by which ``cem`` screens. together: all at once, where one rollout can.
+    Attributes:
+        each: by themselves, the first S = 1, by which ``cem`` screens.
+        together: all at once, where one rollout can.
     """
 
     each: tuple[Predictor, ...]
     together: Predictor | None = None
 
+    @property
+    def start(self) -> Tensor | None:
+        """The states (B, dx) that predictions begin in, where they are known."""
+        return getattr(self.each[0], "start", None)
+
+    def __repr__(self) -> str:
+        return f"EnsemblePredictor({', '.join(map(repr, self.each))})"
+
     def __call__(self, actions: Tensor) -> Tensor:
-        """(C, B, T, du) -> (S, C, B, T, dx)."""
-        return (
-            self.together(actions)
-            if self.together
-            else torch.cat([predict(actions) for predict in self.each])
-        )
+        """Actions (C, B, T, du) -> states (S, C, B, T, dx)."""
+        if self.together:
+            return self.together(actions)
+        return torch.cat([predict(actions) for predict in self.each])
 
 
-def _predict(
-    model: Model, past: Segment, draws: int, noise: Callable[[], Noise] | None, actions: Tensor
-) -> Tensor:
-    """``draws`` rollouts of every candidate, or the mode without noise: (C, B, T, du) -> (S, C, B, T, dx)."""
-    n, n_targets, _, du = actions.shape
-    if du != past.actions.shape[2]:
+@dataclass(frozen=True)
+class SimulatorPredictor:
+    """Predict by executing in the true simulator, S = 1.
+
+    Attributes:
+        start: the states (B, dx) that predictions begin in.
+        outcomes: actions (C, B, T, du) -> states (C, B, T, dx).
+    """
+
+    start: Tensor
+    outcomes: Callable[[Tensor], Tensor]
+
+    def __repr__(self) -> str:
+        return f"SimulatorPredictor({len(self.start)} targets)"
+
+    def __call__(self, actions: Tensor) -> Tensor:
+        """Actions (C, B, T, du) -> states (1, C, B, T, dx)."""
+        _require_targets(actions.shape[1], len(self.start), "the simulator")
+        return self.outcomes(actions)[None]
+
+
+def _require_targets(asked: int, known: int, where: str) -> None:
+    if asked != known:
         raise ValueError(
-            f"actions have {du} dimensions, those of the past {past.actions.shape[2]}; give the search space "
-            "the size of this robot's actions: DirectActions(task.horizon, task.action_dim)"
+            f"actions for {asked} targets, but {where} has {known}; expected one start for each: "
+            f"plan for {known} targets, or take as many, task.take({asked})"
         )
-    rows = actions[:, None].expand(-1, draws, -1, -1, -1).flatten(0, 2)  # (C S B, T, du)
-    pasts = Segment(*(part.repeat(n * draws, 1, 1) for part in past))
-    states = rollout(model, pasts, rows, generator=noise() if noise else None)
-    return states.unflatten(0, (n, draws, n_targets)).transpose(0, 1)
+
+
+def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int = 0) -> Predictor:
+    """Predict by rolling out a model: its mode, or samples of it.
+
+    Args:
+        model: of segments or of one step.
+        past: what was observed, states (B, L, dx) and actions (B, L, du), L at least
+            ``model.past_len``; ``task.past(model.past_len)`` at the start of an episode.
+        samples: 0 rolls out the mode (z = 0) of every candidate, S = 1; of an ensemble the mode of
+            each member, of a ``Mixture`` those of all its models. n draws n samples of each, with
+            the same noise for every candidate and call.
+        seed: of the noise, 0 or above.
+
+    Returns:
+        The predictor, of actions (C, B, T, du).
+
+    Raises:
+        TypeError: the model cannot predict, or the past is no Segment.
+        ValueError: samples of a deterministic model, or a past that does not fit.
+    """
+    dynamics = as_dynamics(model)
+    past = _checked_past(model, past)
+    samples = require_count("samples", samples, least=0)
+    seed = require_count("seed", seed, least=0)
+    if samples and not dynamics.stochastic:
+        raise ValueError(
+            f"samples is {samples}, but {type(model).__name__} is deterministic: its one rollout "
+            "is the mode, samples=0"
+        )
+    if samples:
+
+        def common() -> Noise:
+            return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
+
+        return ModelPredictor(model, past, samples, common)
+    if isinstance(model, Mixture):
+        parts: list[Predictor] = []
+        for part in model.models:
+            predict = model_predictor(part, past)
+            parts += predict.each if isinstance(predict, EnsemblePredictor) else [predict]
+        return EnsemblePredictor(tuple(parts))
+    if (n := members(model)) > 1:
+        alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))
+        together = ModelPredictor(model, past, n, partial(NoNoise, len(past.states)))
+        each = tuple(ModelPredictor(model, past, 1, noise) for noise in alone)
+        return EnsemblePredictor(each, together)
+    return ModelPredictor(model, past)
+
+
+def expected_predictor(
+    model: Model, past: Segment, *, samples: int = JUDGING, seed: int = 0
+) -> Predictor:
+    """Predict for an expectation over the model's futures (Eqs. 2 and 3): its mode and samples.
+
+    An ``EnsemblePredictor`` whose first part is the mode, so that ``cem(screened=0.25)`` sorts the
+    candidates by the mode and judges the best quarter by the mean over all. A deterministic model
+    has its one rollout, an ensemble the modes of its members.
+
+    Args:
+        model: of segments or of one step.
+        past: states (B, L, dx) and actions (B, L, du), as of ``model_predictor``.
+        samples: beside the mode, at least 1; with the same noise for every candidate and call.
+        seed: of the noise. ``fresh_predictor`` needs a seed that is none of ``samples * seed`` and
+            the ``samples - 1`` after it.
+
+    Returns:
+        The predictor, of actions (C, B, T, du).
+
+    Raises:
+        ValueError: fewer than one sample; the mode alone is ``model_predictor(model, past)``.
+    """
+    if not require_count("samples", samples, least=0):
+        raise ValueError(
+            "samples is 0; expected at least 1. The mode alone is model_predictor(model, past)"
+        )
+    seed = require_count("seed", seed, least=0)
+    mode = model_predictor(model, past)
+    if not as_dynamics(model).stochastic or not isinstance(mode, ModelPredictor):
+        return mode
+
+    def common() -> Noise:
+        seeds = range(samples * seed, samples * (seed + 1))
+        each = SeparateNoise(tuple(torch.Generator().manual_seed(one) for one in seeds))
+        return SharedNoise(each, samples * len(mode.past.states))
+
+    return EnsemblePredictor((mode, ModelPredictor(model, mode.past, samples, common)))
 
 
 def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FRESH) -> Predictor:
-    """What the return of a finished plan is predicted with: samples that had no part in choosing it.
+    """Predict the return of a finished plan by samples that had no part in choosing it.
 
-    ``seed`` must not be the planner's. A deterministic model has no samples: its one rollout predicts.
+    Args:
+        model: of segments or of one step; a deterministic one has no samples, but its one rollout.
+        past: states (B, L, dx) and actions (B, L, du), as of ``model_predictor``.
+        seed: of the samples, another than the planner's.
+        samples: of every target, at least 1.
+
+    Returns:
+        The predictor, for ``reevaluate``.
     """
-    return model_predictor(
-        model, past, samples=samples if as_dynamics(model).stochastic else 0, seed=seed
-    )
+    samples = require_count("samples", samples)
+    stochastic = as_dynamics(model).stochastic
+    return model_predictor(model, past, samples=samples if stochastic else 0, seed=seed)
+
+
+def _checked_past(model: Model, past: object) -> Segment:
+    """The past as tensors; an error where it is none, or shorter than the model needs."""
+    if not isinstance(past, Segment):
+        raise TypeError(
+            f"past is {described(past)}; expected tsmlib.Segment(states, actions), such as "
+            "task.past(model.past_len)"
+        )
+    states, actions = past
+    if not (isinstance(states, Tensor) and states.dtype == torch.float64):  # of derivatives
+        states = as_tensor("past.states", states, ("B", "L", "dx"))
+        actions = as_tensor("past.actions", actions, (*states.shape[:2], "du"))
+    needed = as_dynamics(model).past_len
+    if states.shape[1] < needed or not len(states):
+        raise ValueError(
+            f"past holds {states.shape[1]} steps of {len(states)} targets; expected at least "
+            f"{needed} steps for {type(model).__name__}, such as task.past({needed})"
+        )
+    return Segment(states, actions)
 
 
 def simulator_predictor(
     env: str | Task, start: np.ndarray | None = None, *, done: Tensor | None = None
 ) -> Predictor:
-    """Predict by executing in the true simulator, in bulk: S = 1. Not differentiable.
+    """Predict by executing in the true simulator, S = 1. Not differentiable.
 
-    env: a task, from its starts; ``done`` (B, t, du): after these actions. Of an episode that ended the last state
-    repeats; ``rewards.until`` says what counts then. UnsupportedEnvironment where no state can be set.
+    In MuJoCo what follows is what would have followed, up to rounding; in pymunk, contacts that
+    last forget the force with which they press. Of an episode that ended the last state repeats;
+    ``rewards.until`` says what counts then.
 
-    An arm, by its id or a task, from ``start`` (B, dx): any state can be one, also one in the middle of an episode, and
-    ``done``, which led there, has no more part in it; without ``start`` a task's is executed first. In MuJoCo what
-    follows is what would have followed, up to rounding; in pymunk, contacts that last forget the force with which they
-    press. UnsupportedEnvironment for an arm with noise or delay; ValueError for an id without ``start``.
+    Args:
+        env: a task, whose starts are predicted from; or the id of an arm.
+        start: (B, dx), true states of an arm to predict from; without, the task's.
+        done: (B, t, du), actions of the task that were executed before.
+
+    Returns:
+        The predictor, of actions (C, B, T, du).
+
+    Raises:
+        UnsupportedEnvironment: no state can be set, or an arm has noise or delay.
+        ValueError: an id without ``start``.
     """
-    if isinstance(env, Task) and env.seeds:
-        sofar = np.zeros((len(env), 0, env.action_dim)) if done is None else done.numpy()
-        begun = Oracle(env.env, env.seeds, sofar)
-
-        def outcomes(actions: Tensor) -> Tensor:
-            return torch.from_numpy(begun.outcomes(actions.numpy())).float()[None]
-
-        return outcomes
-    name = env.env if isinstance(env, Task) else env
+    task = env if isinstance(env, Task) else None
+    if task is None and not isinstance(env, str):
+        raise TypeError(f"env is {described(env)}; expected a Task, or the id of an arm")
+    if done is not None:
+        if task is None:
+            raise ValueError("done is of a task, but env is an id; give the states to go on from")
+        done = as_tensor("done", done, (len(task), "t", task.action_dim))
+    if task is not None and task.seeds:
+        return _of_seeds(task, done)
+    name = task.env if task is not None else str(env)
     if name.startswith("tsm/") and name != (arm := EnvSpec.parse(name).arm.id):
         raise UnsupportedEnvironment(
-            f"{name} hides its states behind noisy sensors or delays actions, so what would follow is no function of "
-            f"what is seen; the true simulator of {arm} can be asked"
+            f"{name} hides its states behind noisy sensors or delays actions, so what would follow "
+            f"is no function of what is seen; the true simulator of {arm} can be asked"
         )
-    if start is None and isinstance(env, Task):
-        start = env.start if done is None or not done.shape[1] else _reached(env, done)
+    if start is None and task is not None:
+        start = task.start if done is None or not done.shape[1] else _reached(task, done)
     if start is None:
         raise ValueError(
             f"candidates in {name} have no common start; give start (B, dx), or a task"
         )
+    begin = as_tensor("start", start, ("B", "dx"))
     make = cache(partial(make_simulation, name))
 
-    def predict(actions: Tensor) -> Tensor:
+    def outcomes(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
-        begin = np.tile(start, (n, 1))
-        seen = collect(
-            make(n * n_targets), open_loop(actions.flatten(0, 1)), horizon=horizon, states=begin
-        )
-        return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))[None]
+        states, torques = np.tile(begin.numpy(), (n, 1)), open_loop(actions.flatten(0, 1))
+        seen = collect(make(n * n_targets), torques, horizon=horizon, states=states)
+        return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))
 
-    return predict
+    return SimulatorPredictor(begin, outcomes)
+
+
+def _of_seeds(task: Task, done: Tensor | None) -> SimulatorPredictor:
+    """Episodes that begin with a task's seeds, and go on after ``done`` (B, t, du)."""
+    before = np.zeros((len(task), 0, task.action_dim)) if done is None else done.numpy()
+    begun = Oracle(task.env, task.seeds, before)
+
+    def outcomes(actions: Tensor) -> Tensor:
+        return torch.from_numpy(begun.outcomes(actions.numpy())).float()
+
+    return SimulatorPredictor(torch.from_numpy(begun.last).float(), outcomes)
 
 
 def _reached(task: Task, done: Tensor) -> np.ndarray:

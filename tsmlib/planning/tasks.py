@@ -1,8 +1,11 @@
-"""Tasks: frozen starts, reward and measure of success in an environment; targets of the arm's; reference torques."""
+"""Tasks: frozen starts, a reward and a measure of success in one environment.
+
+Letters in shapes: B starts, T horizon, dx, du, dg size of state, action and target.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
@@ -12,34 +15,56 @@ import torch
 from torch import Tensor
 
 from tsmlib import rewards
+from tsmlib.checks import (
+    as_tensor,
+    described,
+    require_callable,
+    require_count,
+    require_number,
+    require_type,
+)
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.stepping import Arms, make_simulation
-from tsmlib.rewards import Reward, rewarded
+from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
+from tsmlib.rewards import Reward, require_reward, rewarded
 from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Segment, initial_past
 
 HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
+RANDOM_TORQUES = 1  # first part of the key of their random numbers, which no data are drawn from
 
-
-Success = Callable[
-    [Tensor], Tensor
-]  # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
+# states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
+Success = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, repr=False)
 class Task:
-    """B instances of one task in one environment. start (B, dx), horizon in steps.
+    """B instances of one task in one environment.
 
-    reward_for: targets -> reward. seeds (B,): of the resets that ``start`` was seen after, where states cannot be set.
-    success: what an executed episode is judged by, if anything; tolerance: of a distance. target (B, dg), position: of
-    the arm's tasks, in metres, and what has to arrive there, fingertip or object; (B, 0) and None of others.
+    ``Task.from_env`` makes one of any environment, ``load_task`` gives the paper's, ``with_reward``
+    another reward from the same starts.
 
-    ``from_env`` makes one of any environment; ``standard`` gives the paper's, ``with_reward`` another reward from the
-    same starts. ValueError where a target is out of the arm's reach, the horizon beyond the environment's limit of
-    time, or the reward not one number per step; FloatingPointError where it is NaN.
+    Args:
+        name: of the task, in tables and errors.
+        env: id of the environment.
+        start: (B, dx), states or first observations, physical units.
+        target: (B, dg), what the reward is about; (B, 0) where it needs none.
+        reward_for: targets (B, dg) -> reward.
+        position: of what has to arrive in an arm's state, fingertip or object; else None.
+        horizon: T, steps.
+        tolerance: distance within which a trial is a success.
+        seeds: (B,), of the resets that ``start`` was seen after; none where states can be set.
+        success: of executed states (B, T + 1, dx) whether, or how far from, success: (B,).
+        action_dim: du.
+        idle: (du,), the action in [-1, 1] that does nothing; zeros without.
+
+    Raises:
+        TypeError: an argument of another kind.
+        ValueError: a target out of the arm's reach, a horizon beyond the environment's limit of
+            time, or a reward that is not one number per step.
+        FloatingPointError: the reward is NaN for a robot that stands still.
     """
 
     name: str
@@ -53,6 +78,7 @@ class Task:
     seeds: tuple[int, ...] = ()
     success: Success | None = None
     action_dim: int = 2
+    idle: Tensor | None = None
 
     def __repr__(self) -> str:
         return f"Task({self.name!r}, {self.env!r}, {len(self.start)} starts, {self.horizon} steps)"
@@ -70,73 +96,119 @@ class Task:
         tolerance: float | None = None,
         name: str = "",
     ) -> Task:
-        """``n`` starts of any environment, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm, true
-        states whatever its sensors say, from one reset of ``seed``, in which start i is a function of it and of i.
+        """A task of any environment, whose starts are its own resets.
 
-        Neighbouring seeds share starts: ``collect_random`` begins its episode i by the reset of its ``seed + i``. The
-        default is held out from up to 1,000 episodes of its seed 0; of more, or of another seed, give the first beyond
-        theirs, which is that seed plus the number of episodes.
+        Neighbouring seeds share starts: ``collect_random`` begins its episode i by the reset of its
+        ``seed + i``. The default is held out from up to 1,000 episodes of seed 0.
 
-        reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one number per step. Where the
-        environment ends episodes early, ``rewards.until`` says to planners what it does not count after an end.
+        Args:
+            env: id of the environment.
+            n: B, starts, from the resets of the seeds ``seed``, ``seed + 1``, ...; of an arm true
+                states, from one reset of ``seed``.
+            horizon: T, steps.
+            reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one
+                number per step. ``rewards.until`` says what counts where episodes end early.
+            seed: of the first reset, 0 or above.
+            success: of executed states (B, T + 1, dx) a bool, or a distance: (B,).
+            tolerance: the distance that counts as a success; needed where ``success`` is one.
+            name: of the task; the id without.
 
-        ValueError where ``success`` gives a distance and no ``tolerance``, the distance that counts as a success.
+        Returns:
+            The task.
+
+        Raises:
+            UnsupportedEnvironment: the same seed does not give the same start twice.
+            ValueError: ``success`` is a distance and there is no ``tolerance``.
         """
-        seed, plain = int(seed), EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
+        require_type("env", env, str, "an id, such as 'Pendulum-v1'")
+        n, seed = require_count("n", n), require_count("seed", seed, least=0)
+        require_reward(reward)
+        if tolerance is not None:
+            tolerance = require_number("tolerance", tolerance, 0)
+        plain = EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
         with closing(make_simulation(plain, n)) as begun:
-            start = begun.reset(seed=seed).astype(np.float32)
-        seeds = (
-            () if isinstance(begun, Arms) else tuple(range(seed, seed + n))
-        )  # an arm begins in any state
+            start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
+        _require_repeated(env, begun.names, start, again)
         task = cls(
-            name or env,
-            env,
-            start,
-            torch.zeros(n, 0),
-            lambda _: reward,
-            None,
-            horizon,
-            tolerance or 0.0,
-            seeds,
-            success,
-            begun.action_dim,
+            name=name or env,
+            env=env,
+            start=start,
+            target=torch.zeros(n, 0),
+            reward_for=lambda _: reward,
+            horizon=horizon,
+            tolerance=tolerance or 0.0,
+            # An arm begins in any state.
+            seeds=() if isinstance(begun, Arms) else tuple(range(seed, seed + n)),
+            success=success,
+            action_dim=begun.action_dim,
+            idle=torch.from_numpy(begun.idle),
         )
         if success is not None and tolerance is None:
-            away, _ = task.judged(
-                torch.from_numpy(start)[:, None].expand(-1, horizon + 1, -1)
-            )  # standing still
-            if not away.isnan().all():
+            still = torch.from_numpy(start)[:, None].expand(-1, task.horizon + 1, -1)
+            distance, _ = task.judged(still)
+            if not distance.isnan().all():
                 raise ValueError(
-                    f"success of task {task.name!r} is a distance, {float(away[0]):.3g} at the first start, and no "
-                    "tolerance is given; give the distance within which a trial is a success, tolerance=0.05 for "
-                    "example, or a success that is true or false"
+                    f"success of task {task.name!r} is a distance, {float(distance[0]):.3g} at the "
+                    "first start, and no tolerance is given; give the distance within which a "
+                    "trial is a success, tolerance=0.05 for example, or a success that is true or "
+                    "false"
                 )
         return task
 
     @classmethod
     def standard(cls, env: str, start: np.ndarray, target: Tensor) -> Task:
-        """The paper's task of an environment: to push the object to the target, or to reach it where there is none."""
-        if EnvSpec.parse(env).task == "push":
-            return cls(
-                "push",
-                env,
-                start,
-                target,
-                rewards.push,
-                rewards.BLOCK,
-                HORIZON["push"],
-                TOLERANCE["push"],
-            )
-        return cls("reach", env, start, target, rewards.reach, rewards.TIP)
+        """The paper's task of an arm: to push the object to the target, or else to reach it.
+
+        Args:
+            env: id of the arm.
+            start: (B, dx), states.
+            target: (B, 2), metres.
+
+        Returns:
+            The task.
+        """
+        kind = EnvSpec.parse(env).task
+        push = kind == "push"
+        return cls(
+            name=kind,
+            env=env,
+            start=start,
+            target=target,
+            reward_for=rewards.push if push else rewards.reach,
+            position=rewards.BLOCK if push else rewards.TIP,
+            horizon=HORIZON[kind],
+            tolerance=TOLERANCE[kind],
+        )
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(f"horizon is {self.horizon}, expected a positive number of steps")
-        spec = gymnasium.registry.get(self.env.partition("(")[0]) if self.seeds else None  # an arm goes on
+        for field in ("name", "env"):
+            require_type(f"{field} of a task", getattr(self, field), str, "a text")
+        hint = "a function of targets that gives a reward, such as tsmlib.rewards.reach"
+        require_callable("reward_for", self.reward_for, hint)
+        if self.success is not None:
+            require_callable("success", self.success, "a function of states (B, T + 1, dx)")
+        start = as_tensor("start", self.start, ("B", "dx"))
+        if not len(start):
+            raise ValueError(f"task {self.name!r} has no start; expected at least one")
+        du = require_count("action_dim", self.action_dim)
+        idle = torch.zeros(du) if self.idle is None else as_tensor("idle", self.idle, (du,))
+        checked: dict[str, object] = {
+            "start": start.numpy(),
+            "target": as_tensor("target", self.target, (len(start), "dg")),
+            "horizon": require_count("horizon", self.horizon),
+            "tolerance": require_number("tolerance", self.tolerance, 0),
+            "seeds": tuple(require_count("a seed", seed, least=0) for seed in self.seeds),
+            "idle": idle,
+        }
+        for field, value in checked.items():
+            object.__setattr__(self, field, value)
+        base = self.env.partition("(")[0]
+        spec = gymnasium.registry.get(base) if self.seeds else None  # an arm goes on
         if spec and (limit := spec.max_episode_steps) and self.horizon > limit:
             raise ValueError(
-                f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; give horizon={limit} or "
-                f"less, or register a longer one: gymnasium.register(id, ..., max_episode_steps={self.horizon})"
+                f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; "
+                f"give horizon={limit} or less, or register a longer one: gymnasium.register(id, "
+                f"..., max_episode_steps={self.horizon})"
             )
         if self.seeds and len(self.seeds) != len(self):
             raise ValueError(
@@ -145,11 +217,9 @@ class Task:
         if self.position is not None:
             require_reachable(self.env, self.start, self.target, self.position)
         # Standing still, in the shape in which planners ask.
-        states = torch.from_numpy(self.start).float()[:, None].expand(2, 1, -1, self.horizon, -1)
-        found = rewarded(
-            self.reward, states, states.new_zeros(1, len(self), self.horizon, self.action_dim)
-        )
-        if not torch.isfinite(found).all():
+        states = start[:, None].expand(2, 1, -1, self.horizon, -1)
+        per_step = rewarded(self.reward, states, self.idle_actions()[None])
+        if not torch.isfinite(per_step).all():
             body = "a robot" if self.position is None else "an arm"
             raise ValueError(
                 f"the reward of task {self.name!r} is infinite for {body} that stands still"
@@ -165,7 +235,7 @@ class Task:
 
     @property
     def begins_by_seed(self) -> bool:
-        """Whether episodes begin by the seed of a reset: of every robot but the arms, which begin in any state."""
+        """Whether episodes begin by the seed of a reset; those of the arms begin in any state."""
         return bool(self.seeds)
 
     @property
@@ -173,100 +243,176 @@ class Task:
         """Whether the reward is the paper's."""
         return self.reward_for in (rewards.reach, rewards.push)
 
+    def idle_actions(self) -> Tensor:
+        """Doing nothing, (B, T, du): the floor below which a plan does harm."""
+        assert self.idle is not None  # see __post_init__
+        return self.idle.expand(len(self), self.horizon, -1).clone()
+
     def with_reward(
         self, name: str, reward: Reward, *, target: Tensor | None = None, horizon: int | None = None
     ) -> Task:
         """A task of one's own from these starts, in which the same has to arrive.
 
-        reward: any torch function of states (..., B, T, dx) and actions (..., B, T, du) that gives one number per
-        step, (..., B, T), differentiable if it is to be planned for with Adam. It always sees the whole episode, so
-        that it may depend on the time. target (2,) or (B, 2): where it should end, for final_distance and pictures.
+        Args:
+            name: of the task.
+            reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one
+                number per step (..., B, T), differentiable if ``adam`` is to plan. It sees the
+                whole episode, so that it may depend on the time.
+            target: (dg,) or (B, dg), where it should end, for distances and pictures.
+            horizon: T, steps; as it was without.
+
+        Returns:
+            The task.
         """
-        goal = self.target if target is None else target.float().expand(len(self), -1)
+        require_reward(reward)
+        goal = self.target
+        if target is not None:
+            dg = goal.shape[1] or "dg"
+            sizes = (dg,) if np.ndim(target) == 1 else (len(self), dg)
+            goal = as_tensor("target", target, sizes).expand(len(self), -1)
         steps = self.horizon if horizon is None else horizon
         return replace(self, name=name, target=goal, reward_for=lambda _: reward, horizon=steps)
 
     def judged(self, states: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Final distance (B,), NaN where none is measured, and success (B,) bool, of executed states (B, T + 1, dx)."""
+        """What executed episodes are judged by.
+
+        Args:
+            states: (B, T + 1, dx).
+
+        Returns:
+            Final distance (B,), NaN where none is measured; and success (B,) bool, or None.
+
+        Raises:
+            ValueError: the task's ``success`` gives something else, or NaN.
+        """
         if self.success is None and self.position is not None:
-            away = rewards.final_distance(states, self.target, self.position)
-            return away, away <= self.tolerance
+            distance = rewards.final_distance(states, self.target, self.position)
+            return distance, distance <= self.tolerance
         nothing = states.new_full((len(self),), torch.nan)
         if self.success is None:
             return nothing, None
-        found = self.success(states)
-        if not isinstance(found, Tensor) or found.shape != (len(self),):
-            what = (
-                f"a tensor {tuple(found.shape)}"
-                if isinstance(found, Tensor)
-                else f"a {type(found).__name__}"
-            )
+        success = self.success(states)
+        if not isinstance(success, Tensor) or success.shape != (len(self),):
             raise ValueError(
-                f"success of task {self.name!r} is {what} for states {tuple(states.shape)}; expected ({len(self)},), "
-                "bool or a distance"
+                f"success of task {self.name!r} is {described(success)} for states "
+                f"{tuple(states.shape)}; expected ({len(self)},), bool or a distance"
             )
-        return (nothing, found) if found.dtype == torch.bool else (found, found <= self.tolerance)
+        if success.isnan().any():
+            raise ValueError(f"success of task {self.name!r} is nan; expected a bool or a distance")
+        if success.dtype == torch.bool:
+            return nothing, success
+        return success.to(states.dtype), success <= self.tolerance
 
     def past(self, past_len: int) -> Segment:
-        """The past before the first step: x_0 repeated, zero actions."""
-        return initial_past(torch.from_numpy(self.start).float(), past_len, self.action_dim)
+        """The past before the first step.
+
+        Args:
+            past_len: L, steps, as ``model.past_len`` has it.
+
+        Returns:
+            x_0 repeated and no actions: (B, L, dx) and (B, L, du).
+        """
+        steps = require_count("past_len", past_len)
+        return initial_past(torch.from_numpy(self.start).float(), steps, self.action_dim)
 
     def take(self, chosen: int | Sequence[int]) -> Task:
-        """The first instances, or those of some indices; ValueError where there is none, or not as many."""
-        chosen = int(chosen) if isinstance(chosen, np.integer) else chosen
-        if isinstance(chosen, int) and not 1 <= chosen <= len(self):
-            raise ValueError(
-                f"{chosen} targets of {self.env} asked for; choose a number from 1 to {len(self)}"
-            )
-        each = list(range(chosen)) if isinstance(chosen, int) else list(chosen)
-        if not each or not all(0 <= i < len(self) for i in each):
-            raise ValueError(
-                f"targets {each} of {self.env} asked for; choose some from 0 to {len(self) - 1}"
-            )
-        seeds = tuple(self.seeds[i] for i in each) if self.seeds else ()
-        return replace(self, start=self.start[each], target=self.target[each], seeds=seeds)
+        """Some of the instances.
 
-    def times(self, n: int) -> Task:
-        """All instances n times over, for as many copies of a policy."""
-        start, target = np.tile(self.start, (n, 1)), self.target.repeat(n, 1)
-        return replace(self, start=start, target=target, seeds=self.seeds * n)
+        Args:
+            chosen: the number of first ones, or their indices.
+
+        Returns:
+            The task with these alone.
+
+        Raises:
+            ValueError: there is none, or not as many.
+        """
+        require_type("chosen", chosen, (int, np.integer, Iterable), "a number or indices")
+        if isinstance(chosen, int | np.integer):
+            count = require_count("the number of targets", chosen)
+            if count > len(self):
+                raise ValueError(
+                    f"{chosen} targets of {self.env} asked for; choose a number from 1 to "
+                    f"{len(self)}"
+                )
+            chosen = range(count)
+        indices = [require_count("an index of a target", i, least=0) for i in np.atleast_1d(chosen)]
+        if not indices or max(indices) >= len(self):
+            raise ValueError(
+                f"targets {indices} of {self.env} asked for; choose some from 0 to {len(self) - 1}"
+            )
+        seeds = tuple(self.seeds[i] for i in indices) if self.seeds else ()
+        return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
+
+    def require_start(self, states: Tensor, what: str) -> None:
+        """ValueError unless ``states`` (B, dx) are this task's starts, up to rounding."""
+        start = torch.from_numpy(self.start)
+        if states.shape != start.shape:
+            raise ValueError(
+                f"{what} begins in states {tuple(states.shape)}, task {self.name!r} in "
+                f"{tuple(start.shape)}; expected the same starts"
+            )
+        off = (states - start).abs()
+        rounding = 1e-5 * torch.maximum(start.abs(), states.abs()).amax(0)
+        if (off > rounding).any():
+            i, d = (off > rounding).nonzero()[0].tolist()
+            raise ValueError(
+                f"{what} begins with {float(states[i, d]):.6g} in dimension {d} of target {i}, "
+                f"task {self.name!r} of {self.env} with {float(start[i, d]):.6g}; expected the "
+                "same starts"
+            )
+
+
+def _require_repeated(env: str, names: Sequence[str], start: np.ndarray, again: np.ndarray) -> None:
+    """UnsupportedEnvironment unless resets of the same seeds gave the same starts."""
+    differs = np.argwhere(start != again)
+    if len(differs):
+        i, d = differs[0]
+        raise UnsupportedEnvironment(
+            f"{env} does not repeat itself: the same seed gave {names[d]} = {start[i, d]:.6g} and "
+            f"then {again[i, d]:.6g} at start {i}. A task needs starts that come back: seed all "
+            "random numbers by reset(seed=...), and leave out wrappers that normalise by what was "
+            "seen before, such as gymnasium.wrappers.NormalizeObservation"
+        )
 
 
 def require_reachable(env: str, start: np.ndarray, target: Tensor, position: slice) -> None:
-    """ValueError unless there is one target (B, 2) per start, in metres, where the arm's fingertip or object gets."""
+    """ValueError unless there is one target (B, 2) per start, in metres, where the arm gets."""
     if position.stop > start.shape[1]:
         raise ValueError(f"there is nothing to push in {env}; its task is 'reach'")
     if target.shape != (len(start), 2):
         raise ValueError(
-            f"target is {tuple(target.shape)}, expected ({len(start)}, 2): one per start"
+            f"target is {tuple(target.shape)}; expected ({len(start)}, 2), one per start"
         )
     physics = EnvSpec.parse(env).physics
     if position == rewards.TIP:
-        reach, inner, away = sum(physics.link_lengths), hole(physics), target.norm(dim=1)
-        within, what = (away <= reach + 1e-6) & (away >= inner - 1e-6), "fingertip"
-        limit = f"{reach:g} m from the shoulder" + (
-            f" and not into the hole around it, expected {inner:g} to {reach:g} m" if inner else ""
-        )
+        what, outer, inner = "fingertip", sum(physics.link_lengths), hole(physics)
+        away = target.norm(dim=1)
+        within = (away <= outer + 1e-6) & (away >= inner - 1e-6)
+        limit = f"{outer:g} m from the shoulder"
+        if inner:
+            limit += f" and not into the hole around it, expected {inner:g} to {outer:g} m"
     else:
-        within, what = target.abs().amax(1) <= room(physics) + 1e-6, "object"
-        limit = f"{room(physics):g} m along x and y, where the walls are"
+        what, outer = "object", room(physics)
+        within = target.abs().amax(1) <= outer + 1e-6
+        limit = f"{outer:g} m along x and y, where the walls are"
     if not within.all():
         i = int((~within).nonzero()[0])
+        x, y = target[i].tolist()
         raise ValueError(
-            f"target {i} at ({target[i, 0]:.3f}, {target[i, 1]:.3f}) m is out of reach: "
-            f"the {what} gets as far as {limit}"
+            f"target {i} at ({x:.3f}, {y:.3f}) m is out of reach: the {what} gets as far as {limit}"
         )
-
-
-def zero_torques(task: Task) -> Tensor:
-    """No torque at all: the floor below which a plan does harm. (B, T, du)."""
-    return torch.zeros(len(task), task.horizon, task.action_dim)
-
-
-RANDOM_TORQUES = 1  # first part of the key of their random numbers, which no data are drawn from
 
 
 def random_torques(task: Task, *, seed: int = 0) -> Tensor:
-    """Torques like the arm's training data's. (B, T, du)."""
+    """Torques like the arm's training data's.
+
+    Args:
+        task: of an arm.
+        seed: of the torques.
+
+    Returns:
+        (B, T, du).
+    """
     generator = generator_of(RANDOM_TORQUES, seed)
     return smooth_torques(len(task), task.horizon, generator=generator, action_dim=task.action_dim)
