@@ -15,7 +15,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import rewards, study
+import tsmlib
+from tsmlib import rewards
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
@@ -202,7 +203,7 @@ def test_a_reward_has_a_finite_slope_at_its_target() -> None:
 def test_random_torques_are_none_of_the_training_data(env: str) -> None:
     known, task = (
         torch.from_numpy(study.random_data(env, 200, seed=0).actions),
-        study.load_task(env),
+        tsmlib.load_task(env),
     )
     torques = random_torques(task)
     assert (torques[:, None] - known[:, : task.horizon]).abs().amax((2, 3)).min() > 0.01
@@ -532,11 +533,11 @@ def test_a_closed_loop_without_steps_is_refused() -> None:
 @pytest.mark.skipif(not study.FROZEN.exists(), reason="data/tasks is not there")
 @pytest.mark.parametrize("env", ENV_IDS)
 def test_frozen_tasks_are_those_their_seed_draws(env: str) -> None:
-    frozen, drawn = study.load_task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
+    frozen, drawn = tsmlib.load_task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
     assert (frozen.name, frozen.env, len(frozen)) == (drawn.name, env, 100)
     np.testing.assert_allclose(frozen.start, drawn.start, rtol=0, atol=1e-6)
     torch.testing.assert_close(frozen.target, drawn.target, rtol=0, atol=1e-6)
-    assert not np.allclose(frozen.start, study.load_task(env, "validation").start)
+    assert not np.allclose(frozen.start, tsmlib.load_task(env, "validation").start)
 
 
 @pytest.mark.parametrize("env", ENV_IDS)
@@ -552,14 +553,14 @@ def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number
 @pytest.mark.parametrize("n", [-5, 0, 101])
 def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
     with pytest.raises(ValueError, match="choose a number from 1 to 100"):
-        study.load_task(REACHER, "validation").take(n)
+        tsmlib.load_task(REACHER, "validation").take(n)
 
 
 @pytest.mark.parametrize("split", ["validation", "test"])
 @pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
 def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
     for env in (REACHER, PUSH):
-        plain, task = study.load_task(env, split), study.load_task(imperfect(env, **how), split)
+        plain, task = tsmlib.load_task(env, split), tsmlib.load_task(imperfect(env, **how), split)
         assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (
             plain.name,
             plain.horizon,

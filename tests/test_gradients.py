@@ -51,7 +51,7 @@ def test_a_value_that_does_not_depend_on_a_variable_is_refused() -> None:
 
 
 def some_task(n: int = 3, *, horizon: int = 20) -> Task:
-    return replace(study.load_task("tsm/Reacher-v0").take(n), horizon=horizon)
+    return replace(tsmlib.load_task("tsm/Reacher-v0").take(n), horizon=horizon)
 
 
 def prior() -> ActionPrior:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from untrained import in_units
 
-from tsmlib import rewards, study
+import tsmlib
+from tsmlib import rewards
 from tsmlib.envs import variant
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
@@ -131,7 +132,7 @@ def test_a_horizon_of_no_step_is_refused_and_not_the_one_before() -> None:
 
 
 def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None:
-    task = study.load_task("tsm/Reacher-v0").take(4)
+    task = tsmlib.load_task("tsm/Reacher-v0").take(4)
     some = task.take([3, 1])
     assert torch.equal(some.target, task.target[[3, 1]])
     assert (some.start == task.start[[3, 1]]).all()

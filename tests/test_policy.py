@@ -556,7 +556,7 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     net, about = study.load_or_train(run, "tsm/Reacher-v0", "onestep")
     task, method = (
-        study.load_task("tsm/Reacher-v0", "validation").take(3),
+        tsmlib.load_task("tsm/Reacher-v0", "validation").take(3),
         study.method("onestep", space, "policy"),
     )
     assert study.stored_budget(run, task.env, method) is None
@@ -594,7 +594,7 @@ def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
 def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: Path) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     task, method = (
-        study.load_task("tsm/Reacher-v0", "validation").take(3),
+        tsmlib.load_task("tsm/Reacher-v0", "validation").take(3),
         study.method("onestep", "latent", "policy"),
     )
     whole = study.Budget(copies=2)
@@ -616,7 +616,7 @@ def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: 
 def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     task = (
-        study.load_task("tsm/Reacher-v0")
+        tsmlib.load_task("tsm/Reacher-v0")
         .take(2)
         .with_reward("reach", lambda states, actions: -states[..., 0].abs())
     )
@@ -627,14 +627,14 @@ def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> 
 
 
 def test_a_policy_is_assessed_by_the_tasks_own_measure_of_success() -> None:
-    task = study.load_task("tsm/Reacher-v0").take(3)
+    task = tsmlib.load_task("tsm/Reacher-v0").take(3)
     task = replace(task, success=lambda states: torch.tensor([True, False, True]))
     found = study.assess(OneStepPolicy(6, DU), in_units(OneStep(6, DU, hidden=8)), task, seed=0)
     assert found["success"].tolist() == pytest.approx([2 / 3])
 
 
 def test_a_policy_that_reads_a_long_past_acts_in_an_episode() -> None:
-    task = study.load_task("tsm/Reacher-v0").take(2)
+    task = tsmlib.load_task("tsm/Reacher-v0").take(2)
     far = policy("segment", 6, dilations=(1, 2, 4, 8)).float()
     assert far.past_len == 16
     assert study.execute_policy(task, far).states.shape == (2, 51, 6)
@@ -646,7 +646,7 @@ def test_an_unknown_way_to_learn_is_refused_before_anything_is_trained(
 ) -> None:
     run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
     with pytest.raises(ValueError, match="expected latent or direct, 0"):
-        task, method = study.load_task("tsm/Reacher-v0"), study.method("tsm", bad[0], "policy")
+        task, method = tsmlib.load_task("tsm/Reacher-v0"), study.method("tsm", bad[0], "policy")
         study.learn(run, task, method, study.Budget(iterations=bad[1], copies=bad[2]))
     assert not run.dir.exists() or not any(run.models.rglob("*.safetensors"))
 

@@ -27,8 +27,6 @@ from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import (
     adam,
     cem,
-    evaluate,
-    expected_return,
     iterations_to,
     mppi,
     plan_at,
@@ -42,6 +40,7 @@ from tsmlib.planning.predictors import (
     model_predictor,
     simulator_predictor,
 )
+from tsmlib.planning.search import evaluate, expected_return
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward
