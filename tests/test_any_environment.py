@@ -141,7 +141,7 @@ def test_collected_episodes_are_those_of_a_loop_and_end_where_it_ends(env_id: st
 
 def test_an_episode_ends_at_the_limit_of_time_without_being_terminated() -> None:
     data = tsmlib.collect_random(PENDULUM, episodes=2, horizon=230, seed=0)
-    assert (data.horizon, data.lengths, data.terminated) == (200, (), ())
+    assert set(data.lengths) == {200} and not any(data.terminated)
 
 
 def test_a_controller_in_pieces_gets_what_one_in_a_piece_gets() -> None:
@@ -277,7 +277,7 @@ def test_an_episode_that_is_only_observed_ends_at_its_limit_of_time_too(made: Ma
         return actions[:, asked[-1] : asked[-1] + 5]
 
     data = collect(simulated, pieces, horizon=20, seed=0)
-    assert (data.horizon, data.lengths, data.terminated, asked) == (12, (), (), [0, 5, 10])
+    assert set(data.lengths) == {12} and not any(data.terminated) and asked == [0, 5, 10]
     for i, (seen, _, _) in enumerate(stepped(env_id, actions, seed=0)):
         np.testing.assert_allclose(data.states[i], seen, rtol=1e-5, atol=1e-6)
 
@@ -678,7 +678,7 @@ def test_a_policy_is_learned_and_executed_on_another_robot(kind: str) -> None:
         policy = tsmlib.SegmentPolicy(
             3, tsmlib.ActionPrior.for_data(data, channels=8), 0, channels=8
         )
-    policy.features.fit(torch.from_numpy(data.states), data.lengths)
+    policy.features.fit(data)
     begin = torch.from_numpy(data.states[:, 0])
     tsmlib.learn_policy(
         policy,

@@ -82,7 +82,7 @@ def test_a_controller_that_is_asked_again_gets_the_past() -> None:
     data = collect(arms(REACHER, 2), three_at_a_time, horizon=10, past_len=5, seed=0)
     assert len(asked) == 4
     assert data.horizon == 10  # the last answer is cut short
-    whole = data.padded(5)
+    whole = data.segment(5)
     for k, past in enumerate(asked):
         assert torch.equal(past.states, whole.states[:, 3 * k : 3 * k + 5])
         assert torch.equal(past.actions, whole.actions[:, 3 * k : 3 * k + 5])
@@ -272,7 +272,7 @@ def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
     assert trial.observed is not None
     whole = Trajectories(
         trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, ("",) * 6, ("",) * 6
-    ).padded(10)
+    ).segment(10)
     assert len(seen) == 20
     for t, past in enumerate(seen):
         assert torch.equal(past.states, whole.states[:, t : t + 10])
@@ -456,7 +456,7 @@ def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
     trial = mpc(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
     whole = Trajectories(
         trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
-    ).padded(3)
+    ).segment(3)
     observed = {
         past.states[:4].numpy().tobytes() + past.actions[:4].numpy().tobytes()
         for past in model.asked

@@ -124,7 +124,7 @@ def test_windows_hold_the_states_that_scores_are_taken_from(
     model: TSM, test_data: Trajectories
 ) -> None:
     seen = futures.sample_futures(model, test_data, samples=2, horizon=30)
-    whole = test_data.padded(0)
+    whole = test_data.segment(0)
     assert torch.equal(seen.window.future.states, prediction.cut(whole.states, futures.STARTS, 30))
     assert torch.equal(
         seen.window.past.states[1], whole.states[0, 30:40]

@@ -212,7 +212,7 @@ def test_another_object_is_refused_by_what_it_lacks() -> None:
 def test_transitions_know_where_episodes_end() -> None:
     pytest.importorskip("mbrl.types")
     episodes = [np.arange(3 * (n + 1), dtype=np.float32).reshape(-1, 3) for n in (2, 4)]
-    data = tsm.Trajectories.ragged(
+    data = tsm.Trajectories(
         episodes,
         [np.zeros((len(x) - 1, 1), np.float32) for x in episodes],
         "cart",
@@ -306,7 +306,7 @@ def test_stepped_by_mbrl_lib_a_model_predicts_its_rollout(
 
 def test_what_happened_before_is_the_past_of_a_rollout() -> None:
     model, data = an_arms(tsm.LSTM, hidden=8)
-    whole = data.take(slice(0, 1)).padded(model.past_len)
+    whole = data.take(slice(0, 1)).segment(model.past_len)
     past = Segment(*(part[:, 15 : 15 + model.past_len] for part in whole))
     adapted, actions = ForModelEnv(model, 2), torch.from_numpy(data.actions[:3, :5])
     adapted.saw(past)

@@ -246,7 +246,7 @@ def test_metadata_that_say_something_else_are_refused(change: dict[str, Any], me
 def test_ours_comes_back_as_it_was(recwarn: pytest.WarningsRecorder) -> None:
     rng = np.random.default_rng(0)
     sizes = (4, 9, 1)
-    data = Trajectories.ragged(
+    data = Trajectories(
         [rng.normal(size=(n + 1, DX)).astype(np.float32) for n in sizes],
         [rng.uniform(-1, 1, (n, DU)).astype(np.float32) for n in sizes],
         "my-cart",

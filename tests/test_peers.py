@@ -64,7 +64,7 @@ def future(
     data: Trajectories, model: Any, seed: int | None = 0, rows: int = 20, steps: int = 12
 ) -> tuple[Any, Tensor]:
     """Where each row starts (rows, 1, dx), and its rollout (rows, steps, dx)."""
-    whole = data.padded(0)
+    whole = data.segment(0)
     past = Segment(*(part[:rows, :10] for part in whole))
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     return past.states[:, -1:], rollout(
@@ -174,7 +174,7 @@ def test_stated_noise_is_added_at_every_step(data: Trajectories, features: Featu
 def test_shared_noise_gives_candidates_the_same_members(
     data: Trajectories, features: Features
 ) -> None:
-    past = Segment(*(part[:10, :10].repeat(2, 1, 1) for part in data.padded(0)))
+    past = Segment(*(part[:10, :10].repeat(2, 1, 1) for part in data.segment(0)))
     noise = SharedNoise(torch.Generator().manual_seed(0), period=10)
     states = pets.Peer(by_member, features).predict_segment(
         past, torch.zeros(20, 3, DU), generator=noise

@@ -136,7 +136,7 @@ def test_episodes_of_different_length_come_back_with_their_ends(tmp_path: Path) 
         [t.states[0], t.states[1, :3], t.states[2, :5]],
         [t.actions[0], t.actions[1, :2], t.actions[2, :4]],
     )
-    before = Trajectories.ragged(
+    before = Trajectories(
         states, actions, t.env, t.dt, NAMES, UNITS, terminated=(False, True, False)
     )
     artifacts.save_trajectories(tmp_path / "x.safetensors", before)

@@ -296,7 +296,7 @@ def test_without_muon_and_decay_it_is_adam() -> None:
     model, plain, noise = new_tsm(), new_tsm(), torch.Generator()
     train(model, steps=5, validate_every=5, seed=2)
     optimizer = torch.optim.Adam(plain.parameters(), lr=1e-3, fused=True)
-    draw = batches(TRAIN.padded(H), past_len=H, future_len=H, batch_size=8, generator=noise)
+    draw = batches(TRAIN.tensors(), past_len=H, future_len=H, batch_size=8, generator=noise)
     for step in range(5):
         optimizer.param_groups[0]["lr"] = schedule(step, 5, 1e-3, 1e-5, 3)
         noise.manual_seed(2 * 1_000_003 + step)
@@ -663,7 +663,8 @@ def test_windows_of_another_past_than_the_model_has_in_a_rollout_are_refused(pas
 
 def test_episodes_shorter_than_the_windows_are_refused() -> None:
     with pytest.raises(
-        TrajectoryError, match="5 held-out episodes of 30 steps hold no window of 36 future steps"
+        TrajectoryError,
+        match="validation .*: 5 episodes of at most 30 steps hold no window of 36 fut",
     ):
         train(new_tsm(), future_len=36)
 
@@ -693,6 +694,6 @@ def test_a_model_that_knows_no_statistics_takes_those_of_its_training_data_and_u
 def test_actions_beyond_their_bounds_are_refused_with_what_to_do() -> None:
     with pytest.raises(
         TrajectoryError,
-        match=r"go up to 2; expected them within \[-1, 1\]. Divide them by the bound",
+        match=r"go up to 2; expected them within \[-1, 1\]. Scale them by their bounds",
     ):
         replace(TRAIN, actions=np.full_like(TRAIN.actions, 2.0))

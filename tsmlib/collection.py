@@ -60,15 +60,9 @@ def collect(
         seen.append(reached)
         done.append(actions.numpy())
         taken += actions.shape[1]
-    longest = int(episodes.steps.max())
-    inside = np.arange(longest) < episodes.steps[:, None]
     return Trajectories(
-        states=np.concatenate(seen, axis=1, dtype=np.float32)[:, : longest + 1],
-        actions=np.where(
-            inside[..., None],
-            np.concatenate(done, axis=1, dtype=np.float32)[:, :longest],
-            np.float32(0),
-        ),
+        states=np.concatenate(seen, axis=1),
+        actions=np.concatenate(done, axis=1),
         env=episodes.id,
         dt=episodes.dt,
         names=episodes.names,

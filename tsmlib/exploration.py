@@ -241,9 +241,9 @@ def _require_robot(
     model: Trainable, prior: ActionPrior | None, train: Trajectories, held_out: Trajectories
 ) -> None:
     """Error unless all are of one robot, as far as their sizes and names tell."""
-    train.require_robot_of(held_out)
+    train.robot.require_same(held_out.robot, "training and held-out data")
     require_robot(model, train, "a model of the robot that explores")
-    actions = train.actions.shape[2]
+    actions = train.robot.action_dim
     if prior is not None and len(prior.std) != actions:
         raise ValueError(
             f"the prior's actions have {len(prior.std)} dimensions, those of {train.env} {actions}; expected a prior "
@@ -274,7 +274,7 @@ def _collected(
             f"round {k} has {len(task)} task; expected at least 2, since one episode is held out"
         )
     bonus = partial(
-        _with_bonus, weight=options.bonus, scale=torch.from_numpy(like.states.std((0, 1)))
+        _with_bonus, weight=options.bonus, scale=torch.from_numpy(like.flat_states.std(0))
     )
     aim = (
         replace(task, reward_for=lambda target: bonus(task.reward_for(target)))
@@ -312,12 +312,8 @@ def _collected(
         return None, _unknown(task, bonus=bool(options.bonus)) | counted | _since(began)
     record = _said(trial, bonus=bool(options.bonus)) | counted | _since(began)
     seen = cast(Trajectories, trial.seen)  # of mpc, there always
-    episodes = replace(
-        like,
-        states=seen.states,
-        actions=seen.actions,
-        lengths=seen.lengths,
-        terminated=seen.terminated,
+    episodes = Trajectories.from_rows(
+        seen.flat_states, seen.flat_actions, seen.lengths, like.robot, seen.terminated
     )
     if place is not None:
         place.keep_episodes(episodes, record)

@@ -59,7 +59,7 @@ def episode_film(data: Trajectories, episode: int) -> np.ndarray:
     Returns:
         Frames (T + 1, H, W, 3) uint8.
     """
-    states = data.states[episode]
+    states, _ = data.episode(episode)
     if not data.env.startswith("tsm/"):
         return drawing.frames(data.env, states)
     seconds = DT * np.arange(len(states))

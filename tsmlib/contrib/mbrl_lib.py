@@ -249,11 +249,11 @@ def transition_batch(data: Trajectories) -> TransitionBatch:
     """All transitions of episodes as an ``mbrl.types.TransitionBatch``, with rewards of zero, episode by episode."""
     from mbrl.types import TransitionBatch
 
-    real = np.arange(data.horizon) < data.steps[:, None]  # (N, T)
-    last = real & (np.arange(data.horizon) == data.steps[:, None] - 1)
-    over = np.array(data.terminated or [False] * len(data))[:, None]
-    ends = ((last & over)[real], (last & ~over)[real])
-    zeros = np.zeros(real.sum(), np.float32)
-    return TransitionBatch(
-        data.states[:, :-1][real], data.actions[real], data.states[:, 1:][real], zeros, *ends
-    )
+    last = np.cumsum(data.steps) - 1  # row of the last action of each episode
+    terminated, truncated = np.zeros((2, len(data.flat_actions)), bool)
+    terminated[last] = data.terminated
+    truncated[last] = ~terminated[last]
+    before = np.delete(data.flat_states, data.offsets + data.steps, axis=0)
+    after = np.delete(data.flat_states, data.offsets, axis=0)
+    zeros = np.zeros(len(before), np.float32)
+    return TransitionBatch(before, data.flat_actions, after, zeros, terminated, truncated)

@@ -63,14 +63,13 @@ def load_minari(
             states.append(x)
             actions.append(u)
             terminated.append(ended)
-        _require_paddable(folder, states, actions)
         if meaning["dt"] is None:
             warnings.warn(
                 f"{given} does not say how long a step is; one step counts as one second. Say dt=...",
                 stacklevel=2,
             )
             meaning["dt"] = 1.0
-        return Trajectories.ragged(states, actions, **meaning, terminated=terminated)
+        return Trajectories(states, actions, **meaning, terminated=terminated)
     except (
         Exception
     ) as error:  # what the files say goes through other libraries, which may fail in any way
@@ -94,18 +93,19 @@ def save_minari(
 
     minari, t = _minari(dataset_id), trajectories
     buffer = minari.data_collector.EpisodeBuffer
-    given = np.zeros(t.actions.shape[:2]) if rewards is None else rewards
-    made_by, actions = _environment(t), Box(-1, 1, t.actions.shape[2:])
+    given = np.zeros((len(t), t.horizon)) if rewards is None else rewards
+    made_by, actions = _environment(t), Box(-1, 1, (t.robot.action_dim,))
     if made_by is not None:
         actions = made_by.action_space
-    ended = t.terminated or (False,) * len(t)
+    ended = t.terminated
     episodes = []
     for i, steps in enumerate(t.steps):
         last = np.arange(steps) == steps - 1
-        u = within_bounds(t.actions[i, :steps], actions)
+        x, u = t.episode(i)
+        u = within_bounds(u, actions)
         episodes.append(
             buffer(
-                observations=t.states[i, : steps + 1],
+                observations=x,
                 actions=u,
                 rewards=given[i, :steps],
                 terminations=last & ended[i],
@@ -121,7 +121,7 @@ def save_minari(
             dataset_id,
             episodes,
             env=None if made_by is None else made_by.spec,
-            observation_space=Box(-np.inf, np.inf, t.states.shape[2:]),
+            observation_space=Box(-np.inf, np.inf, (t.robot.state_dim,)),
             action_space=actions,
             description=f"{t.env}, {t.dt} s per step. Observations: {fields}.",
         )
@@ -150,8 +150,8 @@ def _environment(t: Trajectories) -> Any:
     env = gymnasium.make(t.env, disable_env_checker=True)
     spaces = (env.observation_space, env.action_space)
     fits = [getattr(space, "shape", None) for space in spaces] == [
-        t.states.shape[2:],
-        t.actions.shape[2:],
+        (t.robot.state_dim,),
+        (t.robot.action_dim,),
     ]
     bounded = all(np.isfinite(getattr(spaces[1], side, np.inf)).all() for side in ("low", "high"))
     return env if fits and bounded else None
@@ -242,7 +242,7 @@ def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarr
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ValueError(
             f"actions have no bounds, {stated['action_space']:.100}: nothing says how to scale them to [-1, 1]; "
-            f"{_SUPPORTED}. Read it with minari, scale its actions, and make a Trajectories.ragged(...)"
+            f"{_SUPPORTED}. Read it with minari, scale its actions, and make Trajectories of it"
         )
     if stated["data_format"] != "hdf5":
         raise ValueError(

@@ -4,8 +4,6 @@ The walls are a square around the shoulder, the shoulder turns freely and the el
 commute with all eight: episodes of random torques, whose first poses lie in every direction, stay what they are.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from tsmlib.envs.spec import EnvSpec
@@ -40,13 +38,12 @@ def symmetric(data: Trajectories) -> Trajectories:
     """Episodes with all their symmetric copies (``copies``), the episodes themselves first."""
     if copies(data.env) == 1:
         return data
-    states, actions = zip(
-        (data.states, data.actions), mirrored(data.states, data.actions), strict=True
-    )
-    return replace(
-        data,
-        states=np.concatenate([turned(each, quarters) for quarters in range(4) for each in states]),
-        actions=np.concatenate([each for _ in range(4) for each in actions]),
-        lengths=data.lengths * COPIES,
-        terminated=data.terminated * COPIES,
+    states, actions = data.flat_states, data.flat_actions
+    both = ((states, actions), mirrored(states, actions))
+    return Trajectories.from_rows(
+        np.concatenate([turned(x, quarters) for quarters in range(4) for x, _ in both]),
+        np.concatenate([u for _ in range(4) for _, u in both]),
+        data.lengths * COPIES,
+        data.robot,
+        data.terminated * COPIES,
     )

@@ -16,7 +16,7 @@ from tsmlib.evaluation.exploitation import NEAR
 from tsmlib.evaluation.futures import HORIZON, Coded, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.rewards import BLOCK
-from tsmlib.trajectory import Trajectories, windows
+from tsmlib.trajectory import Trajectories
 
 
 def contact_steps(states: np.ndarray, env: str, *, gap: float = 0.002) -> Tensor:
@@ -71,8 +71,8 @@ def windows_before_contact(
             f"none of the {len(test)} episodes of {test.env} has a first touch between steps {model.past_len + LEAD} "
             f"and {test.horizon - horizon + LEAD}; take more episodes or a shorter horizon"
         )
-    first = torch.from_numpy(begin[episodes]) - model.past_len
-    window = windows(test.padded(0), torch.from_numpy(episodes), first, model.past_len, horizon)
+    begins = torch.from_numpy(begin[episodes])
+    window = test.windows(torch.from_numpy(episodes), begins, model.past_len, horizon)
     generator = torch.Generator().manual_seed(seed)
     drawn = [
         rollout(model, window.past, window.future.actions, generator=generator)

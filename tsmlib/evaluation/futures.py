@@ -13,7 +13,7 @@ from torch import Tensor
 from tsmlib.evaluation.prediction import sample_states
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
-from tsmlib.trajectory import Segment, Trajectories, Window, windows
+from tsmlib.trajectory import Segment, Trajectories, Window
 
 Coded = TSM | RecurrentTSM  # one code for H steps: ``decode``, ``code_len``, ``latent_dim``
 STARTS = (
@@ -57,8 +57,6 @@ def sample_futures(
         model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress
     )
     episodes = torch.arange(len(test)).repeat_interleave(len(STARTS))
-    before = max(0, model.past_len - min(STARTS))  # a longer past begins before the episode
-    begin = torch.tensor(STARTS).repeat(len(test)) - model.past_len + before
-    return SampledFutures(
-        test.env, windows(test.padded(before), episodes, begin, model.past_len, horizon), drawn
-    )
+    begin = torch.tensor(STARTS).repeat(len(test))
+    window = test.windows(episodes, begin, model.past_len, horizon)
+    return SampledFutures(test.env, window, drawn)

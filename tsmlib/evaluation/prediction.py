@@ -143,13 +143,8 @@ def _require_fit(
     """ValueError unless all of it belongs together."""
     if samples < 1:
         raise ValueError(f"samples is {samples}, expected at least 1")
-    for field in ("env", "dt", "names", "angles"):
-        ours, theirs = getattr(test, field), getattr(validation, field)
-        if ours != theirs:
-            raise ValueError(
-                f"test data have {field} {ours!r}, validation data {theirs!r}; score with two splits of one data set"
-            )
-    expected, found = len(features.step_std), test.states.shape[-1]
+    test.robot.require_same(validation.robot, "test and validation data")
+    expected, found = len(features.step_std), test.robot.state_dim
     if expected != found or features.angles != list(test.angles):
         raise ValueError(
             f"the model's states have {expected} dimensions with angles {features.angles}, those of {test.env} {found} "
@@ -203,9 +198,9 @@ def physical_range(*data: Trajectories) -> tuple[Tensor, Tensor]:
 
     Angles may be anything finite.
     """
-    states = np.concatenate([part.states.reshape(-1, part.states.shape[-1]) for part in data])
-    low, high = (torch.from_numpy(edge).float() for edge in (states.min(0), states.max(0)))
-    margin = 0.5 * (high - low) + 1e-6
+    states = np.concatenate([part.flat_states for part in data])
+    low, high = (torch.from_numpy(edge) for edge in (states.min(0), states.max(0)))
+    margin = 0.5 * (high - low) + 1e-6 * torch.maximum(high.abs(), low.abs())
     low, high, angles = low - margin, high + margin, list(data[0].angles)
     low[angles], high[angles] = -torch.finfo(low.dtype).max, torch.finfo(low.dtype).max
     return low, high
@@ -228,22 +223,12 @@ def _rollouts(
             f"starts {list(starts)} and horizon {horizon} do not fit: at least one step is observed first, and "
             f"episodes have {data.horizon}"
         )
-    inside = torch.from_numpy(
-        data.steps[:, None] >= np.array(starts) + horizon
-    ).flatten()  # (N len(starts),)
-    past_len = as_dynamics(model).past_len
-    before = max(0, past_len - min(starts))  # steps that the model looks back beyond the first one
-    whole, stochastic = data.padded(before), as_dynamics(model).stochastic
-    past = Segment(
-        *(
-            torch.cat([part[:, before + s - past_len : before + s] for s in starts], 1)
-            for part in whole
-        )
-    )
-    past = Segment(*(part.reshape(-1, past_len, part.shape[-1])[inside] for part in past))
-    actions, truth = (
-        cut(part[:, before:], starts, horizon)[inside] for part in (whole.actions, whole.states)
-    )
+    data.window_counts(min(starts) + horizon, "scores")  # warns of those that are left out
+    inside = torch.from_numpy(data.steps[:, None] >= np.array(starts) + horizon)
+    episodes, which = inside.nonzero(as_tuple=True)  # in the order of episodes, then of starts
+    past_len, stochastic = as_dynamics(model).past_len, as_dynamics(model).stochastic
+    window = data.windows(episodes, torch.tensor(starts)[which], past_len, horizon)
+    past, (truth, actions) = window.past, window.future
     rows = torch.arange(len(truth))
     if not stochastic:
         point = torch.cat(

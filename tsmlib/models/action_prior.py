@@ -26,7 +26,7 @@ from tsmlib.models.layers import (
 )
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Trajectories, Window, real_steps
+from tsmlib.trajectory import Trajectories, Window
 
 
 class ActionPrior(Configured):
@@ -65,15 +65,18 @@ class ActionPrior(Configured):
         """
         make = cast(Callable[..., Self], cls)
         with weights_from(seed):
-            prior = make(data.actions.shape[2], **options)
-        prior.fit_scale(torch.from_numpy(data.actions), data.lengths)
+            prior = make(data.robot.action_dim, **options)
+        prior.fit_scale(data)
         return prior
 
-    def fit_scale(self, actions: Tensor, lengths: Sequence[int] = ()) -> ActionPrior:
-        """Take the scale of training actions (N, T, du), 1 if never used; padding beyond ``lengths`` has no part."""
-        steps = actions[real_steps(lengths, actions.shape[1])] if lengths else actions.flatten(0, 1)
-        std = steps.std(0)
-        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+    def fit_scale(self, data: Trajectories | Tensor) -> ActionPrior:
+        """Take the scale of training data, or of actions (N, T, du); 1 of one that never changes."""
+        flat = (
+            data.flatten(0, 1) if isinstance(data, Tensor) else torch.from_numpy(data.flat_actions)
+        )
+        actions = flat.double()
+        varies = actions.amax(0) > actions.amin(0)
+        self.std.copy_(torch.where(varies, actions.std(0), 1.0))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Self, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tsmlib.models.config import Configured, weights_from
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Trajectories, real_steps
+from tsmlib.trajectory import Trajectories
+
+ROUNDING = 8 * float(np.finfo(np.float32).eps)  # of a value, by which it may vary and be constant
 
 
 class Features(nn.Module):
@@ -41,26 +44,38 @@ class Features(nn.Module):
             "step_std", torch.zeros(state_dim)
         )  # of x_{t+1} - x_t, physical units; 0 until fitted
 
-    def fit(self, states: Tensor, lengths: Sequence[int] = ()) -> Features:
-        """Take the statistics of training states (N, T + 1, dx); padding beyond ``lengths`` has no part."""
-        raw, steps = self._raw(states), states.diff(dim=1)
-        if lengths:
-            real = real_steps(lengths, steps.shape[1]).to(states.device)
-            raw, steps = raw[torch.nn.functional.pad(real, (1, 0), value=True)], steps[real]
+    def fit(self, data: Trajectories | Tensor) -> Features:
+        """Take the statistics of training data, or of states (N, T + 1, dx), in float64.
+
+        What changes by no more than the rounding of float32 at its size does not change; so neither
+        units nor offsets decide what moves.
+        """
+        if isinstance(data, Tensor):
+            rows, lengths = data.detach().cpu().flatten(0, 1), np.full(len(data), data.shape[1])
         else:
-            raw, steps = raw.flatten(0, 1), steps.flatten(0, 1)
+            rows, lengths = torch.from_numpy(data.flat_states), data.steps + 1
+        ends = np.cumsum(lengths)
+        states = rows.double()
+        raw = self._raw(states)
         self.mean.copy_(raw.mean(0))
         std = raw.std(0)
-        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+        varies = raw.amax(0) - raw.amin(0) > ROUNDING * raw.abs().amax(0)
+        self.std.copy_(torch.where(varies, std, torch.ones_like(std)))
+        steps = torch.from_numpy(np.delete(states.diff(dim=0).numpy(), ends[:-1] - 1, axis=0))
         step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
-        self.step_std.copy_(
-            torch.where(step_std > 1e-3 * step_rms, step_std, step_rms)
-        )  # a clock's steps are alike
+        step_std = torch.where(
+            step_std > 1e-3 * step_rms, step_std, step_rms
+        )  # a clock's are alike
+        high, low = (
+            edge.reduceat(states.numpy(), ends - lengths) for edge in (np.maximum, np.minimum)
+        )
+        within = torch.from_numpy((high - low).max(0))
+        self.step_std.copy_(step_std * (within > ROUNDING * states.abs().amax(0)))
         return self
 
     def require_states(self, data: Trajectories, expected: str) -> None:
         """ValueError where the states of ``data`` have other dimensions or angles. expected: ends the message."""
-        states = data.states.shape[2]
+        states = data.robot.state_dim
         if len(self.step_std) != states or self.angles != list(data.angles):
             raise ValueError(
                 f"the model's states have {len(self.step_std)} dimensions with angles {self.angles}, those of "
@@ -75,7 +90,7 @@ class Features(nn.Module):
     @property
     def moving(self) -> Tensor:
         """(dx,) bool: state dimensions that change within an episode."""
-        return self.step_std > 1e-9
+        return self.step_std > 0
 
     @property
     def scored(self) -> Tensor:
@@ -146,8 +161,8 @@ class Featured:
         """
         make = cast(Callable[..., Self], cls)
         with weights_from(seed):
-            model = make(data.states.shape[2], data.actions.shape[2], angles=data.angles, **options)
-        model.features.fit(torch.from_numpy(data.states), data.lengths)
+            model = make(data.robot.state_dim, data.robot.action_dim, angles=data.angles, **options)
+        model.features.fit(data)
         return model
 
 
@@ -163,8 +178,8 @@ def require_robot(model: object, data: Trajectories, expected: str) -> None:
     if isinstance(features, Features):
         features.require_states(data, expected)
     known = model.config().get("action_dim") if isinstance(model, Configured) else None
-    if known is not None and known != data.actions.shape[2]:
+    if known is not None and known != data.robot.action_dim:
         raise ValueError(
-            f"the model's actions have {known} dimensions, those of {data.env} {data.actions.shape[2]}; "
+            f"the model's actions have {known} dimensions, those of {data.env} {data.robot.action_dim}; "
             f"expected {expected}"
         )

@@ -14,7 +14,6 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -352,24 +351,22 @@ def _whole_episode(reward: Reward, so_far: Segment) -> Reward:
 
 def _whole_actions(seen: Trajectories, horizon: int) -> Tensor:
     """The actions (B, T, du) of episodes that may all have ended before: zeros from there on."""
-    return F.pad(torch.from_numpy(seen.actions), (0, 0, 0, horizon - seen.horizon))
+    return torch.from_numpy(seen.padded(horizon)[1])
 
 
 def _measured(
     task: Task, run: Simulation, seen: Trajectories, actions: Tensor, plan: Plan | None
 ) -> Trial:
     """The trial that just ended in ``run``; its last state repeats up to T."""
-    missing = actions.shape[1] - seen.horizon
-    states = observed = torch.from_numpy(
-        np.pad(seen.states, ((0, 0), (0, missing), (0, 0)), mode="edge")
-    )
+    early = min(seen.lengths) < actions.shape[1]
+    states = observed = torch.from_numpy(seen.padded(actions.shape[1])[0])
     arms = run.env if isinstance(run, Arms) else None
     if isinstance(arms, ImperfectArms) and arms.sigma:
         states = torch.from_numpy(arms.truth).float()
     late = arms.tau if isinstance(arms, ImperfectArms) else 0
     arrived = F.pad(actions, (0, 0, late, 0))[:, : actions.shape[1]]
     per_step = rewarded(task.reward, states[:, 1:], arrived)
-    if seen.lengths or missing:
+    if early:
         per_step = per_step * real_steps(seen.steps.tolist(), actions.shape[1])
     final_distance, success = task.judged(states)
     return Trial(
@@ -380,7 +377,7 @@ def _measured(
         plan=plan,
         observed=None if states is observed else observed,
         success=success,
-        lengths=seen.lengths or ((seen.horizon,) * len(seen) if missing else ()),
+        lengths=seen.lengths if early else (),
         own_return=torch.from_numpy(run.returns).float(),
         seen=seen,
     )

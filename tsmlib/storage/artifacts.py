@@ -32,7 +32,7 @@ from tsmlib.storage.files import (
     write_bytes,
 )
 from tsmlib.storage.provenance import provenance
-from tsmlib.trajectory import Trajectories, TrajectoryError
+from tsmlib.trajectory import Robot, Trajectories, TrajectoryError
 
 SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
 LARGEST = (
@@ -222,9 +222,13 @@ def save_trajectories(
         "units": t.units,
         "angles": t.angles,
     }
-    fields |= {"lengths": t.lengths} if t.lengths else {}
-    fields |= {"terminated": t.terminated} if t.terminated else {}
-    arrays = {"states": t.states.astype(np.float32), "actions": t.actions.astype(np.float32)}
+    same = len(set(t.lengths)) == 1
+    fields |= {} if same else {"lengths": t.lengths}
+    fields |= {"terminated": t.terminated} if any(t.terminated) else {}
+    arrays = {
+        "states": t.states if same else t.flat_states,
+        "actions": t.actions if same else t.flat_actions,
+    }
     save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": fields})
 
 
@@ -251,9 +255,14 @@ def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = Non
                 f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions"
             )
         arrays = (tensors["states"].numpy(), tensors["actions"].numpy())
-        meaning = (tuple(fields[name]) for name in ("names", "units", "angles"))
-        ends = (tuple(fields.get(name, ())) for name in ("lengths", "terminated"))
-        found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning, *ends)
+        meaning = (tuple(fields["names"]), tuple(fields["units"]), tuple(fields["angles"]))
+        lengths, ended = fields.get("lengths"), fields.get("terminated")
+        if arrays[0].ndim == 2:
+            robot = Robot(fields["env"], fields["dt"], *meaning, arrays[1].shape[-1])
+            found = Trajectories.from_rows(*arrays, lengths, robot, ended)
+        else:
+            ends = {"lengths": lengths, "terminated": ended}
+            found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning, **ends)
         fingerprint = {**about["header"].get("fingerprint", {}), **fields}
     except (KeyError, IndexError, TypeError, TrajectoryError) as error:
         raise StoreError(f"{path} holds no usable trajectories: {error}. {remedy(path)}") from error
@@ -390,5 +399,8 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 def trajectories_digest(data: Trajectories) -> str:
     """The first 16 digits of the ``digest`` of states, actions and, where episodes differ in length, lengths."""
-    arrays = {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
-    return digest(arrays | ({"lengths": torch.tensor(data.lengths)} if data.lengths else {}))[:16]
+    if len(set(data.lengths)) == 1:
+        return digest(
+            {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
+        )[:16]
+    return digest(data.tensors()._asdict())[:16]

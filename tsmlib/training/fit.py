@@ -3,7 +3,7 @@
 import ctypes
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,7 +18,7 @@ from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.training.muon import Muon, matrices
 from tsmlib.training.precision import native_bf16
-from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, window_at, windows
+from tsmlib.trajectory import Trajectories, Window, batches, window_at
 
 Loss = Callable[[Window, torch.Generator], Tensor]
 
@@ -30,7 +30,7 @@ class Statistics(Protocol):
     fitted: bool
 
     @property
-    def fit(self) -> Callable[[Tensor, Sequence[int]], object]: ...
+    def fit(self) -> Callable[[Trajectories], object]: ...
 
 
 @dataclass(frozen=True)
@@ -125,16 +125,15 @@ def fit(
     require_past(model, options)
     features = getattr(model, "features", None)
     if isinstance(features, Statistics) and not features.fitted:
-        features.fit(torch.from_numpy(train.states), train.lengths)
+        features.fit(train)
     o, generator, lengths = options, torch.Generator(), (options.past_len, options.future_len)
     held_out = Window(*(segment.to(device) for segment in fixed_windows(validation, *lengths)))
     draw = batches(
-        train.padded(o.past_len).to(device),
+        train.tensors().to(device),
         past_len=o.past_len,
         future_len=o.future_len,
         batch_size=o.batch_size,
         generator=generator,
-        lengths=train.lengths,
     )
     identity = asdict(options) | dict(
         seed=seed,
@@ -311,17 +310,10 @@ def fixed_windows(
     data: Trajectories, past_len: int, future_len: int, n_windows: int = 2000
 ) -> Window:
     """The same windows at every validation: evenly spread over episodes and starts, and never across an end."""
-    counts = torch.from_numpy(data.steps - future_len + 1).clamp_min(0)  # windows of each episode
+    counts = torch.from_numpy(data.window_counts(future_len, "validation"))
     n_all = int(counts.sum())
-    if not n_all:
-        raise TrajectoryError(
-            f"{len(data)} held-out episodes of {data.horizon} steps hold no window of {future_len} future steps; "
-            f"collect some of at least {future_len} steps"
-        )
     chosen = np.linspace(0, n_all - 1, min(n_windows, n_all)).round().astype(np.int64)
-    return windows(
-        data.padded(past_len), *window_at(torch.from_numpy(chosen), counts), past_len, future_len
-    )
+    return data.windows(*window_at(torch.from_numpy(chosen), counts), past_len, future_len)
 
 
 @torch.no_grad()
