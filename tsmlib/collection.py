@@ -61,8 +61,8 @@ def collect(
         done.append(actions.numpy())
         taken += actions.shape[1]
     return Trajectories(
-        states=np.concatenate(seen, axis=1),
-        actions=np.concatenate(done, axis=1),
+        states=np.concatenate(seen, axis=1, dtype=np.float32),
+        actions=np.concatenate(done, axis=1, dtype=np.float32),
         env=episodes.id,
         dt=episodes.dt,
         names=episodes.names,
