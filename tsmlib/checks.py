@@ -1,4 +1,4 @@
-"""Small checks of arguments, whose errors say what was found, what was expected, what to type."""
+"""Small checks of arguments: an error says what was found, what was expected, what to type."""
 
 from __future__ import annotations
 
@@ -12,44 +12,89 @@ import torch
 from torch import Tensor
 
 T = TypeVar("T")
+LARGEST = 10_000  # size of a layer, a segment or an ensemble
 
 
-def require_count(name: str, value: object, *, least: int = 1) -> int:
-    """``value`` as an int of at least ``least``; else a TypeError or ValueError that names it."""
+def require_count(name: str, value: object, *, least: int = 1, most: int | None = None) -> int:
+    """``value`` as an int from ``least`` to ``most``; else an error that names it."""
+    between = f"of at least {least}" if most is None else f"from {least} to {most}"
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} is {value!r:.80}; expected a whole number of at least {least}")
-    if value < least:
-        raise ValueError(f"{name} is {value}; expected a whole number of at least {least}")
+        raise TypeError(f"{name} is {value!r:.80}; expected a whole number {between}")
+    if value < least or (most is not None and value > most):
+        raise ValueError(f"{name} is {value!s:.80}; expected a whole number {between}")
     return int(value)
+
+
+def require_counts(**values: object) -> None:
+    """``require_count`` of several values by their names."""
+    for name, value in values.items():
+        require_count(name, value, most=LARGEST)
+
+
+def require_seed(name: str, value: object) -> int:
+    """``value`` as a seed: torch's generators on a CPU keep its low 32 bits alone."""
+    return require_count(name, value, least=0, most=2**32 - 1)
 
 
 def require_number(
     name: str, value: object, low: float = -math.inf, high: float = math.inf, *, above: bool = False
 ) -> float:
-    """``value`` as a finite float within [low, high], with ``above`` (low, high]; else an error."""
+    """``value`` as a finite float in [low, high], or (low, high] with ``above``; else an error."""
     between = f"a number {'above' if above else 'of at least'} {low:g} and at most {high:g}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} is {value!r:.80}; expected {between}")
-    number = float(value)
-    if not math.isfinite(number) or not low <= number <= high or (above and number == low):
+    if not math.isfinite(value) or not low <= value <= high or (above and value == low):
         raise ValueError(f"{name} is {value}; expected {between}")
-    return number
+    return float(value)
+
+
+def require_flag(name: str, value: object) -> bool:
+    """``value`` where it is True or False; TypeError that names it otherwise."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} is {value!r:.80}; expected True or False")
+    return bool(value)
+
+
+def require_type(name: str, value: object, kind: type[T], hint: str = "") -> T:
+    """``value`` where it is a ``kind``; else TypeError that ends with ``hint``, what to type."""
+    if not isinstance(value, kind):
+        raise TypeError(
+            f"{name} is {_article(value)}; expected a {kind.__name__}{hint and f', {hint}'}"
+        )
+    return value
+
+
+def require_callable(name: str, value: T, hint: str) -> T:
+    """``value`` where it can be called; TypeError otherwise, which says what it is called with."""
+    if not callable(value):
+        raise TypeError(f"{name} is {_article(value)}; expected a function, {hint}")
+    return value
 
 
 def require_choice(name: str, value: T, choices: Iterable[T]) -> T:
     """``value`` where it is one of ``choices``; ValueError that lists them otherwise."""
-    if value not in (known := tuple(choices)):
+    known = tuple(choices)
+    if not isinstance(value, type(known[0])) or value not in known:
         raise ValueError(f"{name} is {value!r:.80}; expected one of {', '.join(map(repr, known))}")
     return value
 
 
-def as_tensor(name: str, value: object, shape: tuple[int | str, ...]) -> Tensor:
-    """A tensor, array or nested list as a finite float32 tensor of ``shape``.
+def as_tensor(
+    name: str,
+    value: object,
+    shape: tuple[int | str, ...],
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | None = None,
+) -> Tensor:
+    """A tensor, array or nested list as a finite floating tensor of ``shape``.
 
     Args:
         name: of the argument, for the error.
         value: what was given.
         shape: sizes; a letter stands for any size.
+        dtype: of the result.
+        device: of the result; None: where it is.
 
     Returns:
         The tensor; the one that was given where nothing had to change.
@@ -59,11 +104,13 @@ def as_tensor(name: str, value: object, shape: tuple[int | str, ...]) -> Tensor:
         ValueError: another shape, or a value that is not finite.
     """
     try:
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value))
-        tensor = tensor.to(torch.float32)
+        tensor = value if isinstance(value, Tensor) else _from_numpy(np.asarray(value))
+        if tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError(str(tensor.dtype))
+        tensor = tensor.to(device=device, dtype=dtype)
     except (TypeError, ValueError, RuntimeError) as error:
-        found = type(value).__name__
-        raise TypeError(f"{name} is a {found}; expected numbers {_words(shape)}") from error
+        found = _article(value)
+        raise TypeError(f"{name} is {found}; expected numbers {_words(shape)}") from error
     sizes = zip(shape, tensor.shape, strict=False)
     fits = len(shape) == tensor.ndim and all(isinstance(s, str) or s == n for s, n in sizes)
     if not fits:
@@ -76,29 +123,21 @@ def as_tensor(name: str, value: object, shape: tuple[int | str, ...]) -> Tensor:
     return tensor
 
 
+def _from_numpy(array: np.ndarray) -> Tensor:
+    """A copy in torch's own byte order, with strides that torch has."""
+    if array.dtype.kind not in "fiu":
+        raise TypeError(str(array.dtype))
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
+
+
+def _article(value: object) -> str:
+    """What a value is, for an error: None, a short text or the name of its type."""
+    if value is None or isinstance(value, str):
+        return f"{value!r:.80}"
+    name = value.__name__ if isinstance(value, type) else type(value).__name__
+    kind = "the class" if isinstance(value, type) else "an" if name[0] in "AEIOaeiou" else "a"
+    return f"{kind} {name}"
+
+
 def _words(shape: tuple[int | str, ...]) -> str:
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
-
-
-def require_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
-    """TypeError unless ``value`` is of a kind; ``expected`` says in words what to give."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} is {described(value)}; expected {expected}")
-
-
-def require_callable(name: str, value: object, expected: str) -> None:
-    """TypeError unless ``value`` can be called; ``expected`` says in words what to give."""
-    if not callable(value) or isinstance(value, type):
-        raise TypeError(f"{name} is {described(value)}; expected {expected}")
-
-
-def described(value: object) -> str:
-    """A value as errors name it: its type, and where it has one its shape."""
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
-    shape = getattr(value, "shape", None)
-    kind = "tensor" if isinstance(value, Tensor) else type(value).__name__
-    if isinstance(shape, tuple):
-        return f"a {kind} {tuple(shape)}"
-    shown = f" {value!r:.60}" if isinstance(value, str | int | float | list | tuple) else ""
-    return f"a {kind}{shown}"

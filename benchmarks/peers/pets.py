@@ -29,7 +29,7 @@ from tsmlib import study
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
-from tsmlib.models.one_step_ensemble import OneStepEnsemble
+from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.contrib.mbrl_lib import transition_batch
 from tsmlib.storage import tables
 from reproduction import parameters, runs

@@ -16,7 +16,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from tsmlib.models.base import Model, Step, as_dynamics, stepper
-from tsmlib.models.one_step_ensemble import OneStepEnsemble
+from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 

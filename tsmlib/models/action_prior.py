@@ -1,4 +1,4 @@
-"""ActionPrior, the latent action prior: a conditional variational autoencoder over action segments (section 4.2, A.2).
+"""ActionPrior: a conditional variational autoencoder over action segments (section 4.2, A.2).
 
     encoder   Q(Z | U+)
     decoder   P(U+ | Z, U-)     gated dilated causal layers, autoregressive in the actions
@@ -15,6 +15,7 @@ from typing import Self, cast
 import torch
 from torch import Tensor
 
+from tsmlib.checks import as_tensor, require_counts, require_number, require_type
 from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.layers import (
     CausalDecoder,
@@ -26,13 +27,25 @@ from tsmlib.models.layers import (
 )
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Trajectories, Window
+from tsmlib.trajectory import Robot, Trajectories, Window
 
 
 class ActionPrior(Configured):
-    """Prior over the action segments of one data set. Actions are bounded to [-1, 1] by a squash on the way out.
+    """Latent prior over the action segments of one data set (section 4.2).
 
-    beta: weight of the KL divergence against the summed squared error in units of the training actions' deviation.
+    ``ActionPrior.for_data(data)`` makes one that fits the data. Actions leave it within [-1, 1].
+
+    Args:
+        action_dim: du, dimensions of an action.
+        segment_len: H, steps of a segment, and of the past actions that it reads; 10 (section 5.1).
+        latent_dim: dz, dimensions of a code z; 8 (section 5.1).
+        channels: C of every gated layer; 32, as of TSM (A.2).
+        dilations: of the gated layers, in steps; as of TSM.
+        beta: weight of the KL divergence (nats) against the summed squared error in units of the
+            training actions' deviation; 0.03, chosen on validation.
+
+    Attributes:
+        robot: whose actions it was trained on; None until there are data.
     """
 
     std: Tensor  # (du,) of the training actions
@@ -41,42 +54,53 @@ class ActionPrior(Configured):
         self,
         action_dim: int,
         *,
-        segment_len: int = 10,  # H, section 5.1
-        latent_dim: int = 8,  # section 5.1
+        segment_len: int = 10,
+        latent_dim: int = 8,
         channels: int = 32,
         dilations: Sequence[int] = (1, 2, 4, 8, 4),
         beta: float = 0.03,
     ) -> None:
         super().__init__()
-        self.segment_len = self.past_len = segment_len
-        self.latent_dim = latent_dim
-        self.beta = beta
+        require_counts(action_dim=action_dim, segment_len=segment_len, latent_dim=latent_dim)
+        self.action_dim, self.latent_dim = action_dim, latent_dim
+        self.segment_len = self.past_len = self.code_len = segment_len
+        self.beta = require_number("beta", beta, 0)
         self.encoder = Encoder(action_dim, segment_len, latent_dim)
         self.decoder = CausalDecoder(
             action_dim, action_dim, latent_dim, channels=channels, dilations=dilations
         )
         self.register_buffer("std", torch.ones(action_dim))
+        self.robot: Robot | None = None
 
     @classmethod
     def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
-        """The prior of ``data`` as training starts: its scale, and weights drawn from ``seed``.
+        """Make the prior of ``data``, ready to be trained on them.
 
-        options: those of the constructor.
+        Args:
+            data: training episodes, whose robot and scale of actions the prior takes.
+            seed: of the first weights.
+            options: arguments of the class by name, beyond action_dim.
+
+        Returns:
+            The untrained prior.
         """
-        make = cast(Callable[..., Self], cls)
+        robot, make = require_type("data", data, Trajectories).robot, cast(Callable[..., Self], cls)
         with weights_from(seed):
-            prior = make(data.robot.action_dim, **options)
-        prior.fit_scale(data)
+            prior = make(robot.action_dim, **options)
+        prior.take_robot(data)
         return prior
 
-    def fit_scale(self, data: Trajectories | Tensor) -> ActionPrior:
-        """Take the scale of training data, or of actions (N, T, du); 1 of one that never changes."""
-        flat = (
-            data.flatten(0, 1) if isinstance(data, Tensor) else torch.from_numpy(data.flat_actions)
-        )
-        actions = flat.double()
-        varies = actions.amax(0) > actions.amin(0)
-        self.std.copy_(torch.where(varies, actions.std(0), 1.0))
+    def take_robot(self, data: Trajectories) -> None:
+        """Take the robot of training data and, the first time, the scale of their actions."""
+        if self.robot is None:
+            self.fit_scale(torch.from_numpy(data.flat_actions))
+        self.robot = data.robot
+
+    def fit_scale(self, actions: Tensor) -> ActionPrior:
+        """Take the deviation of training actions (..., du); 1 of one that is never used."""
+        steps = actions.double().reshape(-1, len(self.std))
+        std, spacing = steps.std(0), 4 * torch.finfo(torch.float32).eps
+        self.std.copy_(std.where(std > spacing * steps.abs().amax(0), 1.0))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +108,7 @@ class ActionPrior(Configured):
         return self.encoder(actions / self.std)
 
     def decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
-        """P(U+ | U-, z): past actions (B, L, du) and codes (B, dz) -> actions (B, H, du) in [-1, 1]."""
+        """P(U+ | U-, z): past actions (B, L, du), codes (B, dz) -> actions (B, H, du)."""
         return chunked(self._decode, past_actions, z)
 
     def _decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
@@ -98,12 +122,24 @@ class ActionPrior(Configured):
         return torch.stack(actions, dim=1)  # (B, H, du)
 
     def first(self, past_actions: Tensor, z: Tensor) -> Tensor:
-        """The first action of ``decode`` alone, by which a segment policy acts: (B, L, du), (B, dz) -> (B, du)."""
+        """The first action (B, du) of ``decode`` alone, by which a segment policy acts."""
         step = self.decoder.last(past_actions / self.std, z)
         return (past_actions[:, -1] + self.std * step).clamp(-1, 1)
 
     def plan(self, past_actions: Tensor, z: Tensor) -> Tensor:
-        """Chain segments (Eq. 3): past actions (B, L, du) and codes (B, K, dz) -> actions (B, K H, du)."""
+        """Chain action segments (Eq. 3).
+
+        Args:
+            past_actions: (B, L, du), zeros at the start of an episode.
+            z: codes (B, K, dz), one for each segment of H steps.
+
+        Returns:
+            Actions (B, K H, du) in [-1, 1].
+        """
+        options = {"dtype": self.std.dtype, "device": self.std.device}
+        z = as_tensor("z", z, ("B", "K", self.latent_dim), **options)
+        shape = (len(z), "L", self.action_dim)
+        past_actions = as_tensor("past_actions", past_actions, shape, **options)
         segments = []
         for code in z.unbind(1):
             past_actions = self.decode(past_actions[:, -self.past_len :], code)
@@ -113,7 +149,8 @@ class ActionPrior(Configured):
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error plus beta KL per segment, free-running over the window's future.
 
-        The past of the first segment is the window's; that of each later one is the decoded segment before it.
+        The past of the first segment is the window's, that of each later one the decoded segment
+        before it.
         """
         past, loss = window.past.actions, window.past.actions.new_zeros(())
         for future in whole_segments(window.future.actions, self.segment_len):

@@ -1,27 +1,36 @@
-"""Baselines of section 5.2, with the features and targets of TSM: both predict standardised increments.
+"""Baselines of section 5.2, with the features and targets of TSM: standardised increments.
 
-OneStep    x_{t+1} = f(x_t, u_t)                       (i) one-step loss, (ii) the same with a multi-step loss
-LSTM       x_{t+1}, h_{t+1} = f(x_t, u_t, h_t)         (iii) multi-step loss, h warmed up on the past
+OneStep    x_{t+1} = f(x_t, u_t)                  (i) one-step loss, (ii) multi-step loss
+LSTM       x_{t+1}, h_{t+1} = f(x_t, u_t, h_t)    (iii) multi-step loss, h warmed up on the past
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from tsmlib.checks import require_counts
 from tsmlib.models.base import Step, predict_segment
-from tsmlib.models.config import Configured
-from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Recurrent
+from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class OneStep(Featured, Configured):
-    """A fully connected network f(x_t, u_t): a segment model with H = 1 that reads the last state alone.
+class OneStep(StateModel):
+    """A fully connected network f(x_t, u_t): a segment model with H = 1 (section 5.2, i and ii).
 
-    state_dim, action_dim: dx, du. angles: state dimensions in radians.
+    ``OneStep.for_data(data)`` makes one that fits the data. It reads the last state alone.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        hidden: size of each hidden layer; 200 as in PETS (the paper's is not stated).
+        layers: hidden layers; 3.
     """
 
     segment_len, past_len, stochastic = 1, 1, False
@@ -31,12 +40,12 @@ class OneStep(Featured, Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (),
+        angles: Sequence[int] = (),
         hidden: int = 200,
         layers: int = 3,
     ) -> None:
-        super().__init__()
-        self.features = Features(state_dim, tuple(angles))
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(hidden=hidden, layers=layers)
         widths = [self.features.dim + action_dim, *[hidden] * layers]
         inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
         self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
@@ -58,22 +67,30 @@ class OneStep(Featured, Configured):
         return step
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """(i) Squared error of one-step increments on every tuple (x_t, u_t, x_{t+1}) of the window's future."""
+        """(i) Squared error of one-step increments on every (x_t, u_t, x_{t+1}) of the future."""
         before = states_before(window)
         predicted = self.step(before, window.future.actions)
         return self.features.increments(predicted, window.future.states).square().sum((1, 2)).mean()
 
     def multi_step_loss(self, window: Window, generator: Noise) -> Tensor:
-        """(ii) Squared error of the states that the network reaches on its own predictions, over the whole future."""
+        """(ii) Squared error of the states that its own predictions reach, over the future."""
         predicted = predict_segment(self, window.past, window.future.actions)
         return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
 
 
-class LSTM(Featured, Configured):
-    """(iii) A recurrent model: its hidden state reads the true past, then runs on with the model's own predictions.
+class LSTM(StateModel):
+    """(iii) A recurrent model: its hidden state reads the true past, then its own predictions.
 
-    hidden: size of h. past_len: steps of past that warm it up. segment_len: it keeps its hidden state for as many
-    steps as one call asks for, so a whole horizon is one segment.
+    ``LSTM.for_data(data)`` makes one that fits the data.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        hidden: size of h and c; 160 trains as fast as TSM's stack.
+        past_len: steps of past that warm the hidden state up; 10, H of TSM.
+        segment_len: most steps until the hidden state is read anew; 100, an episode of section 5.1.
     """
 
     stochastic, output_layers = False, ("out",)
@@ -83,21 +100,21 @@ class LSTM(Featured, Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (),
+        angles: Sequence[int] = (),
         hidden: int = 160,
-        past_len: int = 10,  # H
-        segment_len: int = 100,  # the length of an episode
+        past_len: int = 10,
+        segment_len: int = 100,
     ) -> None:
-        super().__init__()
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(hidden=hidden, past_len=past_len, segment_len=segment_len)
         self.past_len, self.segment_len, self.hidden = past_len, segment_len, hidden
-        self.features = Features(state_dim, tuple(angles))
         self.cell = nn.Linear(self.features.dim + action_dim + hidden, 4 * hidden)
         self.out = nn.Linear(hidden, state_dim)
         with torch.no_grad():
             self.cell.bias[:hidden] = 1.0  # forget gates start open
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Warm the hidden state up on the past (B, L, .), then carry it. There is nothing to draw."""
+        """Warm the hidden state up on the past (B, L, .), then carry it; nothing is drawn."""
         return self._recurrent().begin(past)
 
     def predict_segment(

@@ -1,8 +1,9 @@
-"""Codes whose distribution is learned: P(Z) = N(mean, deviation^2) in place of N(0, I), all other weights as they are.
+"""Codes whose distribution is learned: P(Z) = N(mean, deviation^2) in place of N(0, I).
 
-A decoder knows a code by V z alone, which it adds to the pre-activations of its layers, so that z = mean + deviation e
-is the same decoder with other numbers: V diag(deviation) in place of V, and V mean more in the biases. A model that was
-adapted in this way is a model of its class like any other, with e ~ N(0, I) as its codes.
+A decoder knows a code by V z alone, which it adds to the pre-activations of its layers, so that
+z = mean + deviation e is the same decoder with other numbers: V diag(deviation) in place of V, and
+V mean more in the biases. A model that was adapted in this way is a model of its class like any
+other, with e ~ N(0, I) as its codes.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from torch.nn.utils import parametrize
 class CodeLayers(Protocol):
     """A model with codes.
 
-    ``code_layers``: V, without a bias, and the layers to whose outputs V z is added, in the order of its rows.
-    ``code_statistics``: the layer that gives an encoder's means and log variances, if there is an encoder.
+    Attributes:
+        code_layers: V, without a bias, and the layers to whose outputs V z is added, in the
+            order of its rows.
+        code_statistics: the layer of an encoder's means and log variances; None without an encoder.
     """
 
     code_statistics: nn.Linear | None
@@ -64,8 +67,10 @@ class _Shifted(nn.Module):
 
 
 class _Standardised(nn.Module):
-    """Weight or bias (2 dz, ...) of an encoder's means m and log variances v -> of (m - mean) / deviation and
-    v - 2 log deviation, so that the posterior of a segment stays what it was."""
+    """Weights (2 dz, ...) of an encoder's means m and log variances v -> of the same posterior.
+
+    That is (m - mean) / deviation and v - 2 log deviation.
+    """
 
     def __init__(self, codes: CodeDistribution) -> None:
         super().__init__()
@@ -83,7 +88,7 @@ class _Standardised(nn.Module):
 
 @contextmanager
 def learned_codes(model: CodeLayers) -> Iterator[CodeDistribution]:
-    """The distribution of the codes as parameters of ``model``; its own weights again at the end."""
+    """Make the distribution of codes parameters of ``model``, and undo it at the end."""
     changed: list[tuple[nn.Module, str]] = []
     codes, layers = model.code_layers
     found = CodeDistribution(codes.in_features).to(codes.weight)

@@ -1,20 +1,24 @@
 """Constructor arguments that travel with a module's weights."""
 
+from __future__ import annotations
+
 import functools
 import inspect
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 from torch import nn
 
+from tsmlib.checks import require_seed
 from tsmlib.storage.files import Json
 
 
 class Configured(nn.Module):
-    """A module that records the arguments of its constructor, defaults included, for the file of its weights.
+    """A module that records the arguments of its constructor, for the file of its weights.
 
-    Not recorded: ``**options`` passed on to a part, which records them itself, and the seed of weights that are stored.
+    Defaults are recorded too; the seed is not, since the weights are stored.
     """
 
     _config: dict[str, Json]
@@ -22,14 +26,13 @@ class Configured(nn.Module):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         init, signature = cls.__init__, inspect.signature(cls.__init__)
-        passed_on = {name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD}
 
         @functools.wraps(init)
         def recording(self: Configured, *args: object, **options: object) -> None:
             init(self, *args, **options)
             given = signature.bind(self, *args, **options)
             given.apply_defaults()
-            names = given.arguments.keys() - {"self", "seed"} - passed_on
+            names = given.arguments.keys() - {"self", "seed"}
             self._config = {
                 name: _json(value) for name, value in given.arguments.items() if name in names
             }
@@ -37,20 +40,31 @@ class Configured(nn.Module):
         cls.__init__ = recording  # type: ignore[method-assign, assignment]
 
     def config(self) -> dict[str, Json]:
+        """The constructor's arguments as JSON values."""
         return dict(self._config)
+
+    def __repr__(self) -> str:
+        """The class with its arguments, and how many weights it has."""
+        arguments = ", ".join(f"{name}={value!r}" for name, value in self._config.items())
+        weights = sum(weight.numel() for weight in self.parameters())
+        return f"{type(self).__name__}({arguments}), {weights:,} weights"
 
 
 @contextmanager
 def weights_from(seed: int) -> Iterator[None]:
-    """First weights drawn from ``seed``: torch's layers draw theirs from the global generator, which is left alone."""
+    """Draw first weights from ``seed``, and leave torch's global generator alone."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(require_seed("seed", seed))
         yield
 
 
-def _json(value: Json | Configured) -> Json:
+def _json(value: object) -> Json:
     if isinstance(value, Configured):
         return value.config()
     if isinstance(value, Mapping):
         return dict(value)
-    return list(value) if isinstance(value, tuple) else value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple | list):
+        return [_json(item) for item in value]
+    return value  # type: ignore[return-value]

@@ -3,25 +3,37 @@
 x_{t+1} ~ N(mean_m, variance_m)(x_t, u_t), member m drawn once per rollout
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tsmlib.checks import require_counts, require_flag
 from tsmlib.models.base import EnsembleModel, Step
-from tsmlib.models.config import Configured
-from tsmlib.models.features import Featured, Features
+from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise, draw_members, random_indices, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class Ensemble(Featured, Configured, EnsembleModel):
-    """PETS: networks that differ in their first weights and in the order of their data, each stating a Gaussian.
+class Ensemble(StateModel, EnsembleModel):
+    """PETS: networks that differ in their first weights and in the order of their data.
 
-    gaussian: each member states a variance and is trained by likelihood; if not, by squared error (then only the
-    choice of the member is random). members, hidden, layers: the defaults of PETS. segment_len: a member is drawn for
-    the whole of a segment, so that a segment as long as an episode is trajectory sampling with a fixed member.
+    ``Ensemble.for_data(data)`` makes one that fits the data. Each member states a Gaussian.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        gaussian: whether each member states a variance and is trained by likelihood, as in PETS; if
+            not, by squared error, and only the choice of the member is random.
+        members: M, number of networks; 5 in PETS.
+        hidden: size of each hidden layer; 200 in PETS.
+        layers: hidden layers; 3 in PETS.
+        segment_len: most steps for which a row keeps its member; 100, an episode of section 5.1,
+            which makes it trajectory sampling with a fixed member.
     """
 
     past_len, stochastic = 1, True
@@ -31,16 +43,17 @@ class Ensemble(Featured, Configured, EnsembleModel):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (),
+        angles: Sequence[int] = (),
         gaussian: bool = True,
         members: int = 5,
         hidden: int = 200,
         layers: int = 3,
-        segment_len: int = 100,  # the length of an episode
+        segment_len: int = 100,
     ) -> None:
-        super().__init__()
-        self.gaussian, self.members, self.segment_len = gaussian, members, segment_len
-        self.features = Features(state_dim, tuple(angles))
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(members=members, hidden=hidden, layers=layers, segment_len=segment_len)
+        self.gaussian = require_flag("gaussian", gaussian)
+        self.members, self.segment_len = members, segment_len
         widths = [
             self.features.dim + action_dim,
             *[hidden] * layers,
@@ -63,9 +76,12 @@ class Ensemble(Featured, Configured, EnsembleModel):
     def increments(
         self, x: Tensor, u: Tensor, which: slice = slice(None)
     ) -> tuple[Tensor, Tensor | None]:
-        """(M, R, dx), (M, R, du) -> mean and log variance (M, R, dx) of the increments, in units of ``step_std``.
+        """Mean and log variance (M, R, dx) of the increments, in units of ``step_std``.
 
-        which: the members asked, M of them.
+        Args:
+            x: states (M, R, dx).
+            u: actions (M, R, du).
+            which: the members that are asked, M of them.
         """
         s = torch.cat([self.features(x), u], dim=-1)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -79,20 +95,20 @@ class Ensemble(Featured, Configured, EnsembleModel):
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Go on from the last state. No generator: every step takes the mean of all members.
 
-        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which that member states,
-        drawn for a whole segment.
+        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which
+        that member states, drawn for a whole segment.
         """
         return self._begin(past, self.segment_len, generator)
 
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through, with noise drawn for as many steps as there are."""
+        """The states (B, K, dx) that ``begin`` steps through, with noise for as many steps."""
         step = self._begin(past, actions.shape[1], generator)
         return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
 
     def _begin(self, past: Segment, steps: int, generator: Noise | None) -> Step:
-        """Rows are sorted into one block per member, of equal size, so that a step is one batched product."""
+        """Rows sorted into a block per member, of equal size: a step is one batched product."""
         x, rows, taken, which = past.states[:, -1], len(past.states), 0, slice(None)
         if generator is None:
             place, noise, block = (
@@ -133,7 +149,7 @@ class Ensemble(Featured, Configured, EnsembleModel):
         return step
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Mean over members of the negative log-likelihood, or squared error, of one-step increments.
+        """Negative log-likelihood, or squared error, of one-step increments: mean over members.
 
         The tuples of the batch are dealt out to the members at random.
         """

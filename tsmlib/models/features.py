@@ -2,90 +2,81 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Self, cast
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.models.config import Configured, weights_from
-from tsmlib.storage.files import Json
+from tsmlib.checks import as_tensor, require_counts
 from tsmlib.trajectory import Trajectories
-
-ROUNDING = 8 * float(np.finfo(np.float32).eps)  # of a value, by which it may vary and be constant
 
 
 class Features(nn.Module):
-    """Physical states as networks and scores see them: angles as cosine and sine, everything standardised.
+    """Physical states as networks and scores see them: angles as cosine and sine, all standardised.
 
-    The statistics come from training data by ``fit`` and travel with the model. A state dimension that never changes
-    within an episode (the obstacle) is an input only: its increment is exactly zero and ``scored`` leaves it out. One
-    that grows evenly (a clock) has the size of its steps in place of their deviation, which is none.
+    The statistics come from training data by ``fit`` and travel with the model. A state dimension
+    that never changes within an episode (the obstacle) is an input only: its increment is exactly
+    zero and ``scored`` leaves it out. One that grows evenly (a clock) has the size of its steps in
+    place of their deviation, which is none.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        angles: indices of the dimensions that are angles in radians.
     """
 
     mean: Tensor
     std: Tensor
     step_std: Tensor
 
-    def __init__(self, state_dim: int, angles: tuple[int, ...]) -> None:
+    def __init__(self, state_dim: int, angles: Sequence[int] = ()) -> None:
         super().__init__()
-        self.angles = list(angles)
-        self.others = [d for d in range(state_dim) if d not in angles]
-        self.dim = state_dim + len(angles)
-        self._settled: tuple[slice | Tensor, slice | Tensor] | None = None
-        self._parts: tuple[slice | Tensor | list[int], ...] = (
-            _columns(self.angles),
-            _columns(self.others),
-        )
+        require_counts(state_dim=state_dim)
+        known = range(state_dim)
+        listed = list(angles) if isinstance(angles, Sequence) else [None]
+        self.angles = [d for d in listed if type(d) is int and d in known]
+        if len(set(self.angles)) < len(listed):
+            raise ValueError(
+                f"angles is {angles!r:.80}; expected some of the state dimensions 0 to "
+                f"{state_dim - 1}, each once"
+            )
+        self.others = [d for d in known if d not in self.angles]
+        self.dim = state_dim + len(self.angles)
+        self._parts = _columns(self.angles), _columns(self.others)
         self.register_buffer("mean", torch.zeros(self.dim))
         self.register_buffer("std", torch.ones(self.dim))
-        self.register_buffer(
-            "step_std", torch.zeros(state_dim)
-        )  # of x_{t+1} - x_t, physical units; 0 until fitted
+        # Of x_{t+1} - x_t in physical units; 0 until fitted.
+        self.register_buffer("step_std", torch.zeros(state_dim))
 
     def fit(self, data: Trajectories | Tensor) -> Features:
-        """Take the statistics of training data, or of states (N, T + 1, dx), in float64.
+        """Take the statistics of training data, in float64.
 
-        What changes by no more than the rounding of float32 at its size does not change; so neither
-        units nor offsets decide what moves.
+        What varies by no more than the spacing of float32 numbers of its size does not vary.
+
+        Args:
+            data: episodes, or their states (N, T + 1, dx) alone.
+
+        Returns:
+            These features.
         """
-        if isinstance(data, Tensor):
-            rows, lengths = data.detach().cpu().flatten(0, 1), np.full(len(data), data.shape[1])
+        if isinstance(data, Trajectories):
+            x, steps = torch.from_numpy(data.flat_states), torch.from_numpy(data.increments())
         else:
-            rows, lengths = torch.from_numpy(data.flat_states), data.steps + 1
-        ends = np.cumsum(lengths)
-        states = rows.double()
-        raw = self._raw(states)
+            states = as_tensor("data", data, ("N", "T + 1", len(self.step_std)))
+            x, steps = states.flatten(0, 1), states.double().diff(dim=1).flatten(0, 1)
+        x, spacing = x.double(), 4 * torch.finfo(torch.float32).eps
+        raw = self._raw(x)
+        std, size = raw.std(0), raw.abs().amax(0)
         self.mean.copy_(raw.mean(0))
-        std = raw.std(0)
-        varies = raw.amax(0) - raw.amin(0) > ROUNDING * raw.abs().amax(0)
-        self.std.copy_(torch.where(varies, std, torch.ones_like(std)))
-        steps = torch.from_numpy(np.delete(states.diff(dim=0).numpy(), ends[:-1] - 1, axis=0))
+        self.std.copy_(std.where(std > spacing * size, 1.0))
         step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
-        step_std = torch.where(
-            step_std > 1e-3 * step_rms, step_std, step_rms
-        )  # a clock's are alike
-        high, low = (
-            edge.reduceat(states.numpy(), ends - lengths) for edge in (np.maximum, np.minimum)
-        )
-        within = torch.from_numpy((high - low).max(0))
-        self.step_std.copy_(step_std * (within > ROUNDING * states.abs().amax(0)))
+        step_std = step_std.where(step_std > 1e-3 * step_rms, step_rms)  # a clock's are alike
+        self.step_std.copy_(step_std.where(step_std > spacing * x.abs().amax(0), 0.0))
         return self
-
-    def require_states(self, data: Trajectories, expected: str) -> None:
-        """ValueError where the states of ``data`` have other dimensions or angles. expected: ends the message."""
-        states = data.robot.state_dim
-        if len(self.step_std) != states or self.angles != list(data.angles):
-            raise ValueError(
-                f"the model's states have {len(self.step_std)} dimensions with angles {self.angles}, those of "
-                f"{data.env} {states} with angles {list(data.angles)}; expected {expected}"
-            )
 
     @property
     def fitted(self) -> bool:
-        """Whether there are statistics: data in which nothing moves have none. What is settled has them."""
-        return self._settled is not None or bool(self.step_std.any())
+        """Whether there are statistics: data in which nothing moves have none."""
+        return bool(self.step_std.any())
 
     @property
     def moving(self) -> Tensor:
@@ -98,88 +89,30 @@ class Features(nn.Module):
         moving = self.moving
         return torch.cat([moving[self.angles], moving[self.angles], moving[self.others]])
 
-    def settle(self) -> None:
-        """Fix which columns change, and indices on the device: within ``torch.func`` and CUDA graphs no value can be
-        looked at or brought there. After another ``fit`` call it again. ValueError without statistics."""
-        if not self.fitted:
-            raise ValueError("these features have no statistics of data; call fit first")
-
-        def fixed(index: list[int]) -> slice | Tensor:
-            at = _columns(index)
-            return (
-                at
-                if isinstance(at, slice)
-                else torch.tensor(at, dtype=torch.long).to(self.std.device)
-            )
-
-        moving, scored = (some.nonzero()[:, 0].tolist() for some in (self.moving, self.scored))
-        self._settled = fixed(moving), fixed(scored)
-        self._parts = fixed(self.angles), fixed(self.others)
-
     def forward(self, states: Tensor) -> Tensor:
-        """(..., dx) -> (..., dim): cosines, sines, the rest; zero mean and unit variance on the training data."""
+        """(..., dx) -> (..., dim): cosines, sines, the rest; of mean 0, variance 1 in training."""
         return (self._raw(states) - self.mean) / self.std
 
     def difference(self, predicted: Tensor, true: Tensor) -> Tensor:
-        """(..., dx) twice -> the difference of their features that change within an episode, standardised."""
-        difference = self(predicted) - self(true)
-        if self._settled:
-            return difference[..., self._settled[1]]
-        scored = self.scored
+        """(..., dx) twice -> the difference of their features that change, standardised."""
+        difference, scored = self(predicted) - self(true), self.scored
         return difference if scored.all() else difference[..., scored]
 
     def increments(self, predicted: Tensor, true: Tensor) -> Tensor:
-        """(..., dx) twice -> the difference of the dimensions that change, in standard deviations of one step."""
-        moving = self._moving_columns()
-        return (predicted - true)[..., moving] / self.step_std[moving]
+        """(..., dx) twice -> the difference of what changes, in deviations of one step."""
+        return self.moving_part(predicted - true) / self.moving_part(self.step_std)
 
     def moving_part(self, values: Tensor) -> Tensor:
         """(..., dx) -> those of the dimensions that change."""
-        return values[..., self._moving_columns()]
-
-    def _moving_columns(self) -> slice | Tensor:
-        if self._settled:
-            return self._settled[0]
         moving = self.moving
-        return slice(None) if moving.all() else moving
+        return values if moving.all() else values[..., moving]
 
     def _raw(self, states: Tensor) -> Tensor:
         angles, others = (states[..., part] for part in self._parts)
         return torch.cat([angles.cos(), angles.sin(), others], dim=-1)
 
 
-class Featured:
-    """A model of states, made for its training data."""
-
-    features: Features
-
-    @classmethod
-    def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
-        """The model of ``data`` as training starts: its sizes, angles and statistics, and weights drawn from ``seed``.
-
-        options: those of the constructor.
-        """
-        make = cast(Callable[..., Self], cls)
-        with weights_from(seed):
-            model = make(data.robot.state_dim, data.robot.action_dim, angles=data.angles, **options)
-        model.features.fit(data)
-        return model
-
-
 def _columns(index: list[int]) -> slice | list[int]:
-    """An index of columns, as a slice where they lie side by side: a view, and no scattered gradient."""
+    """An index of columns, as a slice where they lie side by side, which makes a view."""
     side_by_side = bool(index) and index == list(range(index[0], index[-1] + 1))
     return slice(index[0], index[-1] + 1) if side_by_side else index
-
-
-def require_robot(model: object, data: Trajectories, expected: str) -> None:
-    """ValueError where a model's states or actions are not those of ``data``, as far as it knows its own."""
-    features = getattr(model, "features", None)
-    if isinstance(features, Features):
-        features.require_states(data, expected)
-    known = model.config().get("action_dim") if isinstance(model, Configured) else None
-    if known is not None and known != data.robot.action_dim:
-        raise ValueError(
-            f"the model's actions have {known} dimensions, those of {data.env} {data.robot.action_dim}; "
-            f"expected {expected}"
-        )

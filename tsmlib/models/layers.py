@@ -1,4 +1,4 @@
-"""Layers of the segment models and policies: gated causal convolutions (Eq. 1), a convolutional encoder.
+"""Layers of segment models and policies: gated causal convolutions (Eq. 1), an encoder (A.1).
 
 Letters in shapes: B batch, M models side by side, P positions in time, C channels, dz latent size.
 """
@@ -6,13 +6,12 @@ Letters in shapes: B batch, M models side by side, P positions in time, C channe
 from collections.abc import Callable, Sequence
 from functools import cache, reduce
 from itertools import pairwise
-from typing import TypedDict
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.models.config import Configured
+from tsmlib.checks import require_count, require_counts, require_flag
 from tsmlib.sampling import Noise, standard_normal
 
 BLOCK = 1024  # rows that are decoded at once on a CPU
@@ -25,7 +24,7 @@ def on_device_of(model: object, *tensors: Tensor) -> tuple[Tensor, ...]:
 
 
 def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """``compute`` of so few rows at a time that what lies between its steps stays in a CPU's cache."""
+    """``compute`` of so few rows at a time that its steps stay in a CPU's cache."""
     if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
         return compute(*rows)
     return torch.cat(
@@ -34,24 +33,23 @@ def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
 
 
 def whole_segments(future: Tensor, segment_len: int) -> tuple[Tensor, ...]:
-    """A window's future (B, n H, .) in segments of H steps; ValueError where it is no whole number of them."""
+    """A window's future (B, n H, .) in segments of H steps; ValueError where it is not n H."""
     steps = future.shape[1]
     if steps % segment_len:
         raise ValueError(
             f"future_len is {steps}, which is not a whole number of segments of {segment_len}; "
-            f"choose {max(1, steps // segment_len) * segment_len}, or give the model segment_len={steps}"
+            f"choose {max(1, steps // segment_len) * segment_len}, or give the model "
+            f"segment_len={steps}"
         )
     return future.split(segment_len, dim=1)
 
 
 class BatchedLinear(nn.Module):
-    """M linear layers side by side: (M, B, in) -> (M, B, out). Drawn as torch draws one linear layer."""
+    """M linear layers side by side, (M, B, in) -> (M, B, out), drawn as torch draws one."""
 
     def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__()
-        bound = (
-            inputs**-0.5 if inputs else 0.0
-        )  # of no input, a target of a task without targets, as torch has it
+        bound = inputs**-0.5 if inputs else 0.0  # no input: the target of a task without targets
 
         def drawn(*shape: int) -> nn.Parameter:
             return nn.Parameter(
@@ -68,29 +66,33 @@ class BatchedLinear(nn.Module):
 
 
 class GatedLayer(nn.Module):
-    """One dilated causal layer with the gated activation of Eq. 1, a residual and a skip connection.
+    """One dilated causal layer with the gated activation of Eq. 1, residual and skip connection.
 
-        h = tanh(W_f * s + V_f z) . sigmoid(W_g * s + V_g z)
+        h = tanh(W_f * s + V_f^T z) . sigmoid(W_g * s + V_g^T z)
 
-    As one matrix product over the two taps, s_{t-d} and s_t, the same function serves all positions (B, P, C), one
-    (B, C) and one of M models (M, B, C). taps: W_f and W_g, 2 C -> 2 C; out: 1x1, residual and skip, C -> 2 C.
+    As one matrix product over the two taps, s_{t-d} and s_t, the same function serves all positions
+    (B, P, C), one (B, C) and one of M models (M, B, C).
+
+    Args:
+        taps: W_f and W_g, 2 C -> 2 C.
+        out: 1x1, residual and skip, C -> 2 C.
+        residual: without only for an ablation (section 3.1).
+        skip: without only for an ablation.
     """
 
     def __init__(
         self, taps: nn.Module, out: nn.Module, *, residual: bool = True, skip: bool = True
     ) -> None:
         super().__init__()
-        self.residual, self.skip = residual, skip  # without them only for an ablation (section 3.1)
+        self.residual, self.skip = residual, skip
         self.taps, self.out = taps, out
 
     def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs at t - d and at t (..., C) and V z (..., 2 C); returns the next layer's input and the skip output."""
+        """Inputs at t - d and t (..., C), V z (..., 2 C) -> the next layer's input and the skip."""
         filtered, gate = (self.taps(torch.cat([earlier, now], dim=-1)) + code).chunk(2, dim=-1)
         residual, skip = self.out(torch.tanh(filtered) * torch.sigmoid(gate)).chunk(2, dim=-1)
-        return (
-            now + residual if self.residual else residual,
-            skip if self.skip else torch.zeros_like(skip),
-        )
+        s = now + residual if self.residual else residual
+        return s, skip if self.skip else torch.zeros_like(skip)
 
 
 Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (..., C), oldest first
@@ -99,7 +101,7 @@ Cache = list[list[Tensor]]  # per layer, its last `dilation` inputs (..., C), ol
 def advance(
     inlet: nn.Module, layers: nn.ModuleList, inputs: Tensor, codes: Tensor, cache: Cache
 ) -> Tensor:
-    """One position: inputs (..., input_dim), V z of all layers -> sum of the skips (..., C). Moves ``cache`` on."""
+    """One position: inputs (..., input_dim), V z of all layers -> sum of the skips (..., C)."""
     s, skips = inlet(inputs), []
     for layer, code, window in zip(layers, codes.chunk(len(layers), dim=-1), cache, strict=True):
         window.append(s)
@@ -108,21 +110,12 @@ def advance(
     return reduce(torch.add, skips)
 
 
-class DecoderOptions(TypedDict, total=False):
-    """Options of a ``CausalDecoder`` that a model passes on."""
+class CausalDecoder(nn.Module):
+    """P(output | inputs up to now, z): gated layers whose output at a position sees no later one.
 
-    channels: int
-    head_channels: int
-    state_skip: int
-    dilations: Sequence[int]
-    plain: bool
-
-
-class CausalDecoder(Configured):
-    """P(output | inputs up to now, z): a stack of gated layers whose output at a position sees no later position.
-
-    ``forward`` decodes all positions at once; ``begin`` and ``step`` decode one by one with cached activations, for
-    inputs that depend on earlier outputs. Both compute the same numbers. Receptive field: 1 + sum(dilations).
+    ``forward`` decodes all positions at once; ``begin`` and ``step`` one by one with cached
+    activations, for inputs that depend on earlier outputs. Both compute the same numbers. Receptive
+    field: 1 + sum(dilations). The arguments are those of ``TSM``.
     """
 
     def __init__(
@@ -132,14 +125,23 @@ class CausalDecoder(Configured):
         latent_dim: int,
         *,
         channels: int = 32,
-        head_channels: int = 0,  # the extra 1x1 layer of appendix A.1 (128 where there are contacts); 0: none
-        state_skip: int = 0,  # width of two 1x1 layers that see the inputs beside the stack's output instead; 0: none
+        head_channels: int = 0,
+        state_skip: int = 0,
         dilations: Sequence[int] = (1, 2, 4, 8, 4),
-        plain: bool = False,  # neither residual nor skip connections: the last layer's output alone
+        plain: bool = False,
     ) -> None:
         super().__init__()
+        require_counts(channels=channels)
+        require_count("head_channels", head_channels, least=0)
+        require_count("state_skip", state_skip, least=0)
+        require_flag("plain", plain)
+        if isinstance(dilations, str) or not isinstance(dilations, Sequence) or not dilations:
+            raise TypeError(f"dilations is {dilations!r:.80}; expected a tuple such as (1, 2, 4)")
+        for dilation in dilations:
+            require_counts(dilations=dilation)
         self.inlet = nn.Linear(input_dim, channels)
         self.dilations = tuple(dilations)
+        # Plain: neither residual nor skip connections but the last layer's output.
         self.layers = nn.ModuleList(
             GatedLayer(
                 nn.Linear(2 * channels, 2 * channels),
@@ -149,9 +151,8 @@ class CausalDecoder(Configured):
             )
             for last in [*[False] * (len(dilations) - 1), True]
         )
-        self.codes = nn.Linear(
-            latent_dim, 2 * channels * len(dilations), bias=False
-        )  # V_f, V_g of every layer
+        # V_f, V_g of every layer
+        self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)
         self.state_skip = state_skip
         if state_skip:
             widths = [channels + input_dim, state_skip, state_skip]
@@ -164,13 +165,13 @@ class CausalDecoder(Configured):
             )
 
     def forward(self, inputs: Tensor, z: Tensor, n: int | None = None) -> Tensor:
-        """(B, P, input_dim), (B, dz) -> (B, n, output_dim): at the last ``n`` positions, or at all."""
+        """(B, P, input_dim), (B, dz) -> (B, n, output_dim) at the last ``n`` positions, or all."""
         first = 0 if n is None else inputs.shape[1] - n
         _, skips = self._parallel(inputs, z, inputs.shape[1] - first)
         return self._out(reduce(torch.add, skips), inputs[:, first:])
 
     def last(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """``forward`` at the last position alone, without what that does not see: (B, P, input_dim) -> (B, out)."""
+        """``forward`` at the last position alone, without what that does not see: (B, out)."""
         s, skips = self.inlet(inputs), []
         codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
         taken = _owed_to_last(self.dilations, inputs.shape[1], s.device)
@@ -190,16 +191,16 @@ class CausalDecoder(Configured):
         ]
 
     def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
-        """One position: (B, input_dim) and ``self.codes(z)`` -> (B, output_dim). Moves ``cache`` one position on."""
+        """One position: (B, input_dim), ``self.codes(z)`` -> (B, output_dim). Moves ``cache``."""
         return self._out(advance(self.inlet, self.layers, inputs, codes, cache), inputs)
 
     def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
         return self.head(torch.cat([total, inputs], dim=-1) if self.state_skip else total)
 
     def _parallel(self, inputs: Tensor, z: Tensor, n: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Each layer's inputs, as far as the outputs at the last ``n`` positions see them, and its skips there.
+        """Each layer's inputs, as far as the last ``n`` outputs see them, and its skips there.
 
-        Going down from the last layer, ``owed`` is how many last positions of a layer's inputs are needed.
+        ``owed``: how many last positions of a layer's inputs are needed, from the last layer down.
         """
         owed = [n]
         for dilation in reversed(self.dilations):
@@ -225,10 +226,9 @@ class CausalDecoder(Configured):
 def _owed_to_last(
     dilations: tuple[int, ...], n_positions: int, device: torch.device
 ) -> tuple[Tensor, ...]:
-    """For each layer, what the last position sees of its inputs: indices of those at t - d, then of those at t.
+    """For each layer, what the last position sees of its inputs: indices at t - d, then at t.
 
-    Going down from the last layer, ``owed`` are the positions, counted back from the last, that are still needed. Kept,
-    so that a CUDA graph finds them on its device.
+    ``owed``: the positions, counted back from the last, that are needed, from the last layer down.
     """
     owed = [[0]]
     for dilation in reversed(dilations[1:]):
@@ -245,7 +245,7 @@ def _owed_to_last(
 
 
 class Encoder(nn.Module):
-    """Q(Z | segment): 1-D convolutions over time with ReLU, flattened and projected to mean and log variance."""
+    """Q(Z | segment): 1-D convolutions over time with ReLU, projected to mean and log variance."""
 
     def __init__(
         self, input_dim: int, segment_len: int, latent_dim: int, *, channels: int = 32

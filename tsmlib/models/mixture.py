@@ -5,15 +5,25 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from tsmlib.models.base import EnsembleModel, Model, Step, as_dynamics, rollout, stepper
+from tsmlib.models.base import (
+    EnsembleModel,
+    Model,
+    Step,
+    as_dynamics,
+    predict,
+    rollout,
+    stepper,
+)
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, SeparateNoise, SharedNoise, draw_members
-from tsmlib.trajectory import Segment
+from tsmlib.trajectory import Robot, Segment
+
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -26,47 +36,60 @@ class _Share:
 
 
 class Mixture(nn.Module, EnsembleModel):
-    """An equal mixture of M models of one environment: p(X+ | X-, U-, U+) = 1/M sum_m p_m(X+ | X-, U-, U+).
+    """An equal mixture of M models of one robot: p(X+ | .) = 1/M sum_m p_m(X+ | X-, U-, U+).
 
-    A sample is a rollout of one of them, drawn once per rollout. The mode is the mean of theirs; planners judge a
-    candidate by its mean return over the modes of all (``model_predictor``), which is harder to exploit than one model.
-    Models may be of any kinds, with segments of any lengths; one that is given twice counts twice. Weights stay those
-    of the models, which are trained and stored one by one.
+    A sample is a rollout of one of them, drawn once per rollout. The mode is the mean of theirs;
+    planners judge a candidate by its mean return over the modes of all (``model_predictor``), which
+    is harder to exploit than one model. Weights stay those of the models, which are trained and
+    stored one by one.
 
-    TypeError where no sequence of models is given; ValueError for none, or for states of other sizes or angles. Models
-    do not know their robot, so another one with the same states is not noticed.
+    Args:
+        models: of any kinds, with segments of any lengths; one that is given twice counts twice.
+
+    Attributes:
+        robot: that of the models; None where they know none.
+
+    Raises:
+        TypeError: no sequence of models is given.
+        ValueError: none is in it, or they are of different robots.
     """
 
     segment_len = sys.maxsize  # a rollout of any length is one segment
+    predict = predict
 
     def __init__(self, models: Iterable[Model]) -> None:
-        if not isinstance(models, Iterable) or isinstance(models, nn.Module):
+        if not isinstance(models, Iterable) or isinstance(models, nn.Module | str):
             raise TypeError(
-                f"a mixture of a {type(models).__name__}; expected a list of models, as in Mixture([one, another])"
+                f"models is a {type(models).__name__}; expected a list of models, as in "
+                "Mixture([one, another])"
             )
         super().__init__()
         self.models = tuple(models)
         if not self.models:
             raise ValueError(
-                "a mixture of no models; expected at least one, as in Mixture([one, another])"
+                "models is empty; expected at least one, as in Mixture([one, another])"
             )
         dynamics = [as_dynamics(model) for model in self.models]
         self.parts = nn.ModuleList([model for model in self.models if isinstance(model, nn.Module)])
         self.members, self.past_len = len(self.models), max(model.past_len for model in dynamics)
         self.stochastic = self.members > 1 or dynamics[0].stochastic
-        states = {(len(features.step_std), tuple(features.angles)) for features in self._known()}
+        robots = self._known("robot", Robot)
+        for robot in robots[1:]:
+            robots[0].require_same(robot, "the models of a mixture")
+        self.robot = robots[0] if robots else None
+        states = {
+            f"{len(features.step_std)} dimensions with angles {features.angles}"
+            for features in self._known("features", Features)
+        }
         if len(states) > 1:
-            found = " and ".join(
-                f"{n} dimensions with angles {list(angles)}" for n, angles in sorted(states)
-            )
             raise ValueError(
-                f"models predict states of {found}; expected models of one environment"
+                f"models predict states of {' and '.join(sorted(states))}; expected one robot"
             )
 
-    def _known(self) -> list[Features]:
-        """The statistics of those models that have some."""
-        found = (getattr(model, "features", None) for model in self.models)
-        return [features for features in found if isinstance(features, Features)]
+    def _known(self, name: str, kind: type[K]) -> list[K]:
+        """What those models that have it say of robot or statistics."""
+        known = (getattr(model, name, None) for model in self.models)
+        return [value for value in known if isinstance(value, kind)]
 
     @property
     def features(self) -> Features:
@@ -74,11 +97,15 @@ class Mixture(nn.Module, EnsembleModel):
 
         AttributeError without any: then scores need features of their own (``tsmlib.score``).
         """
-        if not (known := self._known()):
+        if not (known := self._known("features", Features)):
             raise AttributeError(
                 "no model of this mixture has features (statistics of its training data)"
             )
         return known[0]
+
+    def __repr__(self) -> str:
+        """The models in it."""
+        return f"Mixture([{', '.join(type(model).__name__ for model in self.models)}])"
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Read the past (B, L, .). No generator: the mode; with one: a sample."""
@@ -117,13 +144,13 @@ class Mixture(nn.Module, EnsembleModel):
     def loss(self, *_: object) -> NoReturn:
         """TypeError: what is trained is each model."""
         raise TypeError(
-            "a Mixture is not trained; train or fine-tune each of its models, then make it of them"
+            "a Mixture is not trained; train or fine-tune each of its models, then make it anew"
         )
 
     def config(self) -> NoReturn:
         """TypeError: what is stored is each model."""
         raise TypeError(
-            "a Mixture is not stored; save each of its models, then make it of what load_model gives"
+            "a Mixture is not stored; save each of its models, and make it of what load_model gives"
         )
 
     def _shares(self, like: Tensor, noise: Noise | None) -> Iterator[_Share]:
@@ -157,7 +184,8 @@ def _of_share(noise: Noise, chosen: Tensor) -> torch.Generator | SharedNoise:
     source = noise.generator if isinstance(noise, SharedNoise) else noise
     if not isinstance(source, torch.Generator):
         raise TypeError(
-            "found several generators in SharedNoise; a Mixture takes one: SharedNoise(generator, period)"
+            "found several generators in SharedNoise; a Mixture takes one: "
+            "SharedNoise(generator, period)"
         )
     seed = int(torch.randint(2**62, (), generator=source, device=source.device))
     own = torch.Generator(device=source.device).manual_seed(seed)

@@ -1,25 +1,27 @@
-"""RecurrentTSM, a segment model whose decoder is a recurrent cell, with the codes in its gates. Not in the paper.
+"""RecurrentTSM, a segment model with a recurrent decoder, its codes in the gates. Not in the paper.
 
-    h_t, c_t = cell([x_t, u_t], h_{t-1}, c_{t-1}; gates + V z_k)        z_k ~ N(0, I), one code for H steps
-    x_{t+1}  = x_t + s * head(h_t, x_t, u_t)                            s: deviation of one step
+    h_t, c_t = cell([x_t, u_t], h_{t-1}, c_{t-1}; gates + V z_k)     z_k ~ N(0, I), for H steps
+    x_{t+1}  = x_t + s * head(h_t, x_t, u_t)                         s: deviation of one step
 
-The hidden state reads the past with z = 0 and is then carried on from code to code, so that nothing is forgotten where
-one ends and the next begins. All that is uncertain lives in the codes. There is no encoder: it is trained by the energy
-score of its own free-running samples.
+The hidden state reads the past with z = 0 and is carried on from code to code, so that nothing is
+forgotten where one ends and the next begins. All that is uncertain lives in the codes. There is no
+encoder: it is trained by the energy score of its own free-running samples.
 """
 
+from collections.abc import Sequence
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tsmlib.checks import require_counts, require_number
 from tsmlib.models.base import Step
-from tsmlib.models.config import Configured
 from tsmlib.models.energy import distance, energy_score
-from tsmlib.models.features import Featured, Features
+from tsmlib.models.features import Features
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Memory, Recurrent
+from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.trajectory import Segment, Window
 
@@ -27,7 +29,7 @@ SAMPLES = 2  # of the energy score
 
 
 class Decoder(nn.Module):
-    """Cell, codes V and head. seen: features and actions. hidden: size of h and c, and of the head."""
+    """Cell, codes V and head; ``hidden`` is the size of h, c and the head."""
 
     def __init__(self, seen: int, state_dim: int, *, hidden: int, latent_dim: int) -> None:
         super().__init__()
@@ -37,60 +39,65 @@ class Decoder(nn.Module):
         self.head = nn.Sequential(nn.Linear(hidden + seen, hidden), nn.SiLU(), out)
         with torch.no_grad():
             self.cell.bias[:hidden] = 1.0  # forget gates start open
-            out.weight.mul_(
-                0.1
-            )  # and predictions near standing still, so that long windows stay finite
-            self.codes.weight.mul_(
-                0.1
-            )  # so that the mode, learned first, is not lost when samples are drawn
+            # Predictions start near standing still, so that long windows stay finite.
+            out.weight.mul_(0.1)
+            # The mode is learned first, and not lost when samples are drawn.
+            self.codes.weight.mul_(0.1)
 
     def over(self, features: Features) -> Recurrent:
         """As it runs."""
-        hidden, _, out = self.head
-        layers = dict(
-            cell=self.cell,
-            codes=self.codes,
-            hidden=cast(nn.Linear, hidden),
-            out=cast(nn.Linear, out),
-        )
-        return Recurrent.of(features, **layers)
+        hidden, _, out = cast(Sequence[nn.Linear], self.head)
+        return Recurrent.of(features, self.cell, out, hidden=hidden, codes=self.codes)
 
 
-class RecurrentTSM(Featured, Configured):
-    """Recurrent segment model of one environment.
+class RecurrentTSM(StateModel):
+    """Recurrent segment model of one robot: the most accurate model here; not in the paper.
 
-    state_dim, action_dim: dx, du. angles: state dimensions in radians. hidden: size of h and c.
-    code_len: H, steps for which a code is held: the segment of the analyses of codes, as TSM's own.
-    segment_len: as the LSTM, it keeps its hidden state for as many steps as one call asks for, so a whole horizon is
-    one segment; within it ``begin`` draws a new code every H steps.
-    mode_weight: of the distance of the mode (z = 0) from the truth, beside the energy score.
+    ``RecurrentTSM.for_data(data)`` makes one that fits the data. H is ``code_len``: a code is held
+    for H = 10 steps, as a segment of ``TSM``. The hidden state is carried through all of them:
+    ``segment_len`` is how long, and no H.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        hidden: size of h and c; 160 trains as fast as TSM's stack.
+        latent_dim: dz, dimensions of a code z; 8 as in section 5.1.
+        past_len: steps of past that the hidden state reads; 10 as TSM reads.
+        code_len: H, steps for which a code is held; 10 as in section 5.1.
+        segment_len: most steps until the hidden state is read anew from the last ``past_len``
+            states; 100, an episode of section 5.1, so that it is carried to the end.
+        mode_weight: weight of the distance of the mode (z = 0) from the truth beside the energy
+            score; 0, for a score that is proper.
     """
 
     stochastic, code_statistics = True, None  # no encoder
+    output_layers = ("decoder.head",)
+    # Not for Muon: columns are the codes' dimensions, of which some go unused.
+    adam_only = ("decoder.codes",)
 
     def __init__(
         self,
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (),
+        angles: Sequence[int] = (),
         hidden: int = 160,
         latent_dim: int = 8,
         past_len: int = 10,
-        code_len: int = 10,  # H, section 5.1
-        segment_len: int = 100,  # the length of an episode
+        code_len: int = 10,
+        segment_len: int = 100,
         mode_weight: float = 0.0,
     ) -> None:
-        super().__init__()
-        self.hidden, self.latent_dim, self.mode_weight = hidden, latent_dim, mode_weight
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(hidden=hidden, latent_dim=latent_dim, past_len=past_len)
+        require_counts(code_len=code_len, segment_len=segment_len)
+        self.hidden, self.latent_dim = hidden, latent_dim
         self.past_len, self.code_len, self.segment_len = past_len, code_len, segment_len
-        self.features = Features(state_dim, tuple(angles))
+        self.mode_weight = require_number("mode_weight", mode_weight, 0)
         seen = self.features.dim + action_dim
         self.decoder = Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim)
-        self.output_layers = ("decoder.head",)
-        self.adam_only = (
-            "decoder.codes",
-        )  # not Muon: its columns are the codes' dimensions, of which some go unused
 
     @property
     def code_layers(self) -> tuple[nn.Linear, list[nn.Linear]]:
@@ -98,7 +105,7 @@ class RecurrentTSM(Featured, Configured):
         return self.decoder.codes, [self.decoder.cell]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read the past (B, L, .). No generator: z = 0; with one: z ~ N(0, I), a new one every H steps."""
+        """Read the past (B, L, .): z = 0, or with a generator z ~ N(0, I) anew every H steps."""
         x, taken = past.states[:, -1], 0
         codes = x.new_zeros(len(x), self.latent_dim)
         advance = self._recurrent().begin(past, lambda: codes)
@@ -116,17 +123,16 @@ class RecurrentTSM(Featured, Configured):
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
-        return chunked(
-            self._decode,
-            *past,
-            actions,
-            self._codes(past.states[:, -1], actions.shape[1], generator),
-        )
+        z = self._codes(past.states[:, -1], actions.shape[1], generator)
+        return chunked(self._decode, *past, actions, z)
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
-        """States (B, K, dx) under ``actions`` (B, K, du) and codes: free-running, each from the predicted one before.
+        """States (B, K, dx) under actions and codes, each from the predicted one before it.
 
-        z: (B, dz), of the first H steps, or (B, n, dz), of the first n times H; z = 0 after them.
+        Args:
+            past: (B, L, .).
+            actions: (B, K, du).
+            z: (B, dz), of the first H steps, or (B, n, dz), of the first n H; z = 0 after them.
         """
         return chunked(self._decode, *past, actions, z if z.ndim == 3 else z[:, None])
 
@@ -145,9 +151,9 @@ class RecurrentTSM(Featured, Configured):
         return torch.stack([distance(mode, x) for mode, x in parts]).mean()
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| of each H steps as a whole, and the mean of these.
+        """mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| of each H steps, and the mean of these.
 
-        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All of them free-running through the whole future.
+        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All free-running through the future.
         """
         (past, future), draws, decoder = window, SAMPLES + (self.mode_weight > 0), self._recurrent()
         n, steps = future.actions.shape[:2]
@@ -175,12 +181,11 @@ class RecurrentTSM(Featured, Configured):
         return states.transpose(0, 1)
 
     def _codes(self, x: Tensor, steps: int, generator: Noise | None) -> Tensor:
-        """Codes (B, n, dz) of so many steps, drawn one by one as by ``begin``; no generator: none, the mode."""
+        """Codes (B, n, dz) of so many steps, drawn as by ``begin``; the mode has none."""
         if generator is None:
             return x.new_zeros(len(x), 0, self.latent_dim)
-        return torch.stack(
-            [self._draw(x, generator) for _ in range(0, steps, self.code_len)], dim=1
-        )
+        draws = [self._draw(x, generator) for _ in range(0, steps, self.code_len)]
+        return torch.stack(draws, dim=1)
 
     def _draw(self, x: Tensor, generator: Noise) -> Tensor:
         return standard_normal((len(x), self.latent_dim), generator, x)

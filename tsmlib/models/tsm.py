@@ -1,45 +1,61 @@
-"""TSM, the temporal segment model: a conditional variational autoencoder over whole segments (section 3, A.1).
+"""TSM, the temporal segment model: a conditional variational autoencoder over segments (section 3).
 
     encoder   Q(Z | X+)                     1-D convolutions over the future segment
-    decoder   P(X+ | X-, U-, U+, Z)         gated dilated causal layers, autoregressive in the states
+    decoder   P(X+ | X-, U-, U+, Z)         gated dilated causal layers, autoregressive
     prior     P(Z) = N(0, I)
 
-All that is uncertain about a segment lives in its code. The decoder predicts increments of the physical state.
+    Eq. 1     tanh(W_f * s + V_f^T z) . sigmoid(W_g * s + V_g^T z)         models.layers.GatedLayer
+    A.1       sum |f(x) - f(x^)|^2 + beta KL(Q(Z | X+) || N(0, I))         TSM.loss
+
+All that is uncertain about a segment lives in its code z. The decoder predicts increments of the
+physical state x; f are its standardised features.
 """
 
-from typing import Unpack, cast
+from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from tsmlib.checks import require_counts, require_flag, require_number
 from tsmlib.models.base import Step
-from tsmlib.models.config import Configured
 from tsmlib.models.energy import energy_score
-from tsmlib.models.features import Featured, Features
 from tsmlib.models.layers import (
     CausalDecoder,
-    DecoderOptions,
     Encoder,
     chunked,
     kl_from_standard_normal,
     sample_posterior,
     whole_segments,
 )
+from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise, standard_normal
-from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Window
 
 
-class TSM(Featured, Configured):
-    """Temporal segment model of one environment.
+class TSM(StateModel):
+    """Temporal segment model of one robot: the paper's (section 3, Eq. 1, appendix A.1).
 
-    state_dim, action_dim: dx, du. angles: state dimensions in radians.
-    beta: weight of the KL divergence against the summed squared error in standardised units.
-    full_encoder: Q(Z | X+, X-, U-, U+) in place of Q(Z | X+), an ablation.
-    decoder: options of the ``CausalDecoder``.
-        channels, head_channels: 32 and 0 on the basic arm, 64 and 128 where there are contacts (appendix A.1).
-        state_skip: above 0, a head of that width that sees state and torque themselves, beyond the paper.
-        dilations: receptive field 1 + sum = 20 = 2 H. plain: no residual or skip connections, an ablation.
+    ``TSM.for_data(data)`` makes one that fits the data. A segment of H steps is predicted at once
+    from the H steps before it; segments are chained over a horizon (``rollout``).
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        segment_len: H, steps of a segment, and of the past that it reads; 10 in section 5.1.
+        latent_dim: dz, dimensions of a code z; 8 in section 5.1.
+        beta: weight of the KL divergence (nats) against the squared error in units of the
+            training data's deviation; 1 is the plain sum of section 3.1.
+        full_encoder: Q(Z | X+, X-, U-, U+) in place of Q(Z | X+), which section 3.1 finds as good.
+        channels: C of every gated layer; 32, and 64 where there are contacts (A.1).
+        head_channels: of the extra 1x1 layer before the last; 0 for none, 128 where there are
+            contacts (A.1).
+        state_skip: above 0, width of a head that sees state and action; not in the paper.
+        dilations: of the gated layers, in steps; their sum plus one, 20 = 2 H, is what the decoder
+            sees.
+        plain: neither residual nor skip connections, which section 3.1 finds slightly worse.
     """
 
     stochastic, output_layers = True, ("decoder.head",)
@@ -49,29 +65,33 @@ class TSM(Featured, Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (),
-        segment_len: int = 10,  # H, section 5.1
-        latent_dim: int = 8,  # section 5.1
+        angles: Sequence[int] = (),
+        segment_len: int = 10,
+        latent_dim: int = 8,
         beta: float = 1.0,
         full_encoder: bool = False,
-        **decoder: Unpack[DecoderOptions],
+        channels: int = 32,
+        head_channels: int = 0,
+        state_skip: int = 0,
+        dilations: Sequence[int] = (1, 2, 4, 8, 4),
+        plain: bool = False,
     ) -> None:
-        super().__init__()
-        self.segment_len = self.past_len = self.code_len = (
-            segment_len  # a code is held for a segment
-        )
-        self.latent_dim = latent_dim
-        self.beta = beta
-        self.features = Features(state_dim, tuple(angles))
-        self.full_encoder = full_encoder
-        seen = (
-            (self.features.dim + action_dim, 2 * segment_len)
-            if full_encoder
-            else (self.features.dim, segment_len)
-        )
-        self.encoder = Encoder(*seen, latent_dim)
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(segment_len=segment_len, latent_dim=latent_dim)
+        self.segment_len = self.past_len = self.code_len = segment_len
+        self.latent_dim, self.beta = latent_dim, require_number("beta", beta, 0)
+        self.full_encoder = require_flag("full_encoder", full_encoder)
+        seen = self.features.dim + (action_dim if full_encoder else 0)
+        self.encoder = Encoder(seen, segment_len * (2 if full_encoder else 1), latent_dim)
         self.decoder = CausalDecoder(
-            self.features.dim + action_dim, state_dim, latent_dim, **decoder
+            self.features.dim + action_dim,
+            state_dim,
+            latent_dim,
+            channels=channels,
+            head_channels=head_channels,
+            state_skip=state_skip,
+            dilations=dilations,
+            plain=plain,
         )
 
     @property
@@ -84,14 +104,8 @@ class TSM(Featured, Configured):
         """The last layer of the encoder."""
         return self.encoder.project
 
-    def config(self) -> dict[str, Json]:
-        options = DecoderOptions.__annotations__
-        return super().config() | {
-            name: value for name, value in self.decoder.config().items() if name in options
-        }
-
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read the past (B, L, .), with one code for the segment. No generator: z = 0; with one: z ~ N(0, I)."""
+        """Read the past (B, L, .), with one code for the segment: z = 0, or drawn from N(0, I)."""
         return self._begin(past, self._code(past, generator))
 
     def predict_segment(
@@ -100,8 +114,12 @@ class TSM(Featured, Configured):
         """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
         return self.decode(past, actions, self._code(past, generator))
 
+    def encode(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Q(Z | X+): (B, H, dx) -> mean and log variance of Z, (B, dz) each."""
+        return self.encoder(self.features(states))
+
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
-        """P(X+ | X-, U-, U+, z), free-running: each state is computed from the predicted one before it."""
+        """P(X+ | X-, U-, U+, z), free-running: each state from the predicted one before it."""
         return chunked(self._decode, *past, actions, z)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
@@ -109,24 +127,19 @@ class TSM(Featured, Configured):
         return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
 
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
-        """P(X+ | X-, U-, U+, z) with the true states as inputs, all positions at once: (B, K, dx)."""
+        """P(X+ | X-, U-, U+, z) with true states as inputs, all positions at once: (B, K, dx)."""
         (past, future), n = window, window.future.actions.shape[1]
         before = torch.cat([past.states, future.states[:, :-1]], dim=1)  # x_{t-L+1} .. x_{t+K-1}
-        actions = torch.cat(
-            [past.actions[:, 1:], future.actions], dim=1
-        )  # the action taken in each of them
+        actions = torch.cat([past.actions[:, 1:], future.actions], dim=1)  # taken in each of them
         increments = self.decoder(self.inputs(before, actions), z, n)
         return before[:, -n:] + self.features.step_std * increments
 
-    def encode(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Q(Z | X+): (B, H, dx) -> mean and log variance (B, dz)."""
-        return self.encoder(self.features(states))
-
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error plus beta KL per segment, free-running through every segment that the window holds (A.1).
+        """Squared error plus beta KL of each segment, free-running through the window (A.1).
 
-        The future is a chain of K = n H steps. Each segment's code comes from its own true states, its past from the
-        model's own prediction of the segment before, so that training meets the drift that rollouts meet.
+        The future is a chain of K = n H steps. Each segment's code comes from its own true states,
+        its past from the model's own prediction of the segment before, so that training meets the
+        drift that rollouts meet.
         """
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
@@ -142,49 +155,43 @@ class TSM(Featured, Configured):
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
             z, kl = self._posterior_code(past, future, generator)
-            error = self.features.increments(
-                self.decode_teacher_forced(Window(past, future), z), future.states
-            )
+            predicted = self.decode_teacher_forced(Window(past, future), z)
+            error = self.features.increments(predicted, future.states)
             loss = loss + (error.square().sum((1, 2)) + self.beta * kl).mean()
             past = past.then(future).last(self.past_len)
         return loss
 
     def energy_loss(self, window: Window, generator: Noise) -> Tensor:
-        """Energy score of two free-running samples with codes from the prior, beyond the paper.
+        """Energy score of two free-running samples with codes from the prior; not in the paper.
 
-        The sum over whole segments, see ``models.energy``. The encoder is not used.
+        The sum over segments, see ``models.energy``. The encoder is not used.
         """
-        actions, truth = window.future.actions, self.features(window.future.states)
-        samples = []
-        past = Segment(*(torch.cat([part, part]) for part in window.past))
-        for segment_actions in actions.split(self.segment_len, dim=1):
-            u = torch.cat([segment_actions, segment_actions])
-            states = self.predict_segment(past, u, generator=generator)
-            past = past.then(Segment(states, u)).last(self.past_len)
-            samples.append(states)
-        drawn = self.features(torch.cat(samples, dim=1)).unflatten(0, (2, -1))  # (2, B, K, .)
-        pieces = (part.split(self.segment_len, dim=-2) for part in (drawn, truth))
-        return torch.stack([energy_score(*piece) for piece in zip(*pieces, strict=True)]).sum()
+        past, loss = Segment(*(torch.cat([part, part]) for part in window.past)), 0.0
+        for future in self._segments(window.future):
+            actions = torch.cat([future.actions, future.actions])
+            states = self.predict_segment(past, actions, generator=generator)
+            samples = self.features(states).unflatten(0, (2, -1))  # (2, B, H, .)
+            loss = loss + energy_score(samples, self.features(future.states))
+            past = past.then(Segment(states, actions)).last(self.past_len)
+        return cast(Tensor, loss)
 
     def _posterior_code(
         self, past: Segment, future: Segment, generator: Noise
     ) -> tuple[Tensor, Tensor]:
-        """z ~ Q(Z | X+), or Q(Z | X+, X-, U-, U+), and its KL divergence from N(0, I): (B, dz), (B,)."""
+        """z ~ Q(Z | X+), or Q(Z | X+, X-, U-, U+), (B, dz), and its KL from N(0, I), (B,)."""
         if self.full_encoder:
             whole = past.last(self.segment_len).then(future)
             mean, log_variance = self.encoder(self.inputs(whole.states, whole.actions))
         else:
             mean, log_variance = self.encode(future.states)
-        return sample_posterior(mean, log_variance, generator), kl_from_standard_normal(
-            mean, log_variance
-        )
+        z = sample_posterior(mean, log_variance, generator)
+        return z, kl_from_standard_normal(mean, log_variance)
 
     def _code(self, past: Segment, generator: Noise | None) -> Tensor:
-        shape = (len(past.states), self.latent_dim)
+        """z (B, dz) of the prior: its mode without a generator."""
+        shape, like = (len(past.states), self.latent_dim), past.states
         return (
-            past.states.new_zeros(shape)
-            if generator is None
-            else standard_normal(shape, generator, past.states)
+            like.new_zeros(shape) if generator is None else standard_normal(shape, generator, like)
         )
 
     def _begin(self, past: Segment, z: Tensor) -> Step:

@@ -1,11 +1,11 @@
 """Callbacks of a training: what is called at every record, and two that write it down.
 
-    fit(model, model.loss, train, validation, options, callback=CsvCallback("losses.csv"))
+    fit(model, data, callback=CsvCallback("losses.csv"))
 
-A callback sees numbers, not the model, and a training draws nothing from the global generators: its bits are the same
-with and without one. A training that is stopped between a record and its checkpoint makes that record again when it
-goes on, and one that starts anew makes all of them; what is written down of a step therefore takes the place of what
-was there of this step and later ones, and no step stands twice.
+A callback sees numbers, not the model, and a training draws nothing from the global generators: its
+bits are the same with and without one. A training that is stopped between a record and its
+checkpoint makes that record again when it goes on, and one that starts anew makes all of them; what
+is written down of a step therefore takes the place of what was there of this step and later ones.
 """
 
 import csv
@@ -23,8 +23,11 @@ from tsmlib.storage.files import PathLike, StoreError
 class Progress:
     """A record of a training.
 
-    step: updates done. seconds: CPU time so far. values: of ``fit`` the losses ``train``, mean since the last record,
-    and ``validation``; of ``learn_policy`` the ``predicted`` return and what ``measure`` gave, means over copies.
+    Attributes:
+        step: updates done.
+        seconds: CPU time so far.
+        values: of ``fit`` the losses ``train``, mean since the last record, and ``validation``; of
+            ``learn_policy`` the ``predicted`` return and what ``measure`` gave.
     """
 
     step: int
@@ -33,13 +36,19 @@ class Progress:
 
 
 class Callback(Protocol):
-    """Called at every record of a training, before its checkpoint is written; what it raises ends the training."""
+    """Called at every record of a training; what it raises ends the training."""
 
-    def __call__(self, progress: Progress) -> None: ...
+    def __call__(self, progress: Progress) -> None:
+        """Take note of a record, before its checkpoint is written."""
+        ...
 
 
 class CsvCallback:
-    """A table of a training: a line for each record, with step, seconds and the values. One file for each training."""
+    """A table of a training: a line for each record, with step, seconds and the values.
+
+    Args:
+        path: of the CSV file, one for each training.
+    """
 
     def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
@@ -59,15 +68,20 @@ class CsvCallback:
         found, *lines = list(csv.reader(files.read_bytes(self.path).decode().splitlines())) or [[]]
         if found != columns:
             raise StoreError(
-                f"{self.path} has the columns {', '.join(found)}; expected {', '.join(columns)}. Name another file."
+                f"{self.path} has the columns {', '.join(found)}; expected {', '.join(columns)}. "
+                "Name another file."
             )
         return [line for line in lines if line and int(line[0]) < step]
 
 
 class TensorBoardCallback:
-    """Curves for TensorBoard, a scalar for each value and one for ``seconds``. One folder for each training.
+    """Curves for TensorBoard, a scalar for each value and one for ``seconds``.
 
-    Raises ImportError, before anything is trained, where TensorBoard is not installed.
+    Args:
+        folder: of the events, one for each training.
+
+    Raises:
+        ImportError: TensorBoard is not installed; before anything is trained.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -75,7 +89,8 @@ class TensorBoardCallback:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:
             raise ImportError(
-                'TensorBoardCallback needs tensorboard, an optional extra: pip install "tsmlib[tensorboard]"'
+                "TensorBoardCallback needs tensorboard, an optional extra: "
+                'pip install "tsmlib[tensorboard]"'
             ) from error
         self.folder, self._last = Path(folder), -1
         self._open = SummaryWriter
@@ -85,9 +100,8 @@ class TensorBoardCallback:
         if self._writer is None or progress.step <= self._last:
             if self._writer is not None:
                 self._writer.close()
-            self._writer = self._open(
-                str(self.folder), purge_step=progress.step
-            )  # hides this step and later ones
+            # Hides this step and later ones.
+            self._writer = self._open(str(self.folder), purge_step=progress.step)
         for name, value in {**progress.values, "seconds": progress.seconds}.items():
             self._writer.add_scalar(name, value, progress.step)
         self._writer.flush()

@@ -1,9 +1,12 @@
-"""Checkpoints: everything that a training needs to go on as if it had not stopped, in whole generations.
+"""Checkpoints: all that a training needs to go on as if it had not stopped, in whole generations.
 
-A generation is one artefact, ``<step>.safetensors``: arrays, what they are and the checksum over all of it appear with
-one rename. The last two are kept. One that is cut, damaged or not what its name says is refused, and the one before it
-is used. Numbers that JSON does not have, such as a clip that is infinite, are texts in it.
+A generation is one artefact, ``<step>.safetensors``: arrays, what they are and the checksum over
+all of it appear with one rename. The last two are kept. One that is cut, damaged or not what its
+name says is refused, and the one before it is used. Numbers that JSON does not have, such as a clip
+that is infinite, are texts in it.
 """
+
+from __future__ import annotations
 
 import contextlib
 import math
@@ -12,43 +15,41 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from tsmlib.models.config import Configured
 from tsmlib.storage import artifacts
-from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
+from tsmlib.storage.files import (
+    Json,
+    PathLike,
+    StoreError,
+    decode_nonfinite,
+    encode_nonfinite,
+    writer_lock,
+)
 from tsmlib.storage.provenance import provenance
-from tsmlib.training.precision import native_bf16
 
 KEPT = 2  # generations
-LATER = (
-    "configuration",
-    "began with",
-)  # fields of a run's identity that older checkpoints do not have
-
-
-@runtime_checkable
-class Configured(Protocol):
-    """A model that states what it is made of, as JSON."""
-
-    def config(self) -> dict[str, Json]:
-        """Arguments that make such a model."""
-        ...
 
 
 class TrainingStopped(RuntimeError):
-    """A value that is not finite; the model holds the best weights so far. The message names step and remedy."""
+    """A value that is not finite; the model holds the best weights so far."""
 
 
 @dataclass
 class Curve:
     """Record of a training: lists with one entry per record.
 
-    seconds: CPU time so far. resumed: what differed each time that the training went on elsewhere, for which the last
-    bits of the result may differ. unit: of the steps; remedy: where a value is not finite.
+    Attributes:
+        unit: of the steps.
+        remedy: where a value is not finite.
+        seconds: CPU time so far.
+        resumed: what differed each time that the training went on elsewhere, for which the last
+            bits of the result may differ.
     """
 
     unit: ClassVar[str] = "step"
@@ -61,11 +62,16 @@ C = TypeVar("C", bound=Curve)
 
 
 class TrainingState(Generic[C]):
-    """All that a run needs to continue: weights, moments, the step, the best weights and the curve so far.
+    """All that a run needs to continue: weights, moments, the step, the best weights and the curve.
 
-    optimizers: by the name of their moments in a checkpoint. total: steps of the whole run. identity: what the run is,
-    as JSON, its lr among it; the model's configuration and its weights, which are the first ones, are added. A
-    checkpoint of another run is refused. folder: of the checkpoints; none without.
+    Args:
+        model: what is trained.
+        optimizers: by the name of their moments in a checkpoint.
+        curve: the record so far.
+        total: steps of the whole run.
+        identity: what the run is, as JSON values, its lr among them; the model's configuration and
+            its weights, which are the first ones, are added. A checkpoint of another run is refused.
+        folder: of the checkpoints; None for none.
     """
 
     def __init__(
@@ -75,7 +81,7 @@ class TrainingState(Generic[C]):
         curve: C,
         total: int,
         identity: Mapping[str, Json],
-        folder: Path | None = None,
+        folder: PathLike | None = None,
     ) -> None:
         self.model, self.optimizers, self.curve, self.total = model, optimizers, curve, total
         configuration = model.config() if isinstance(model, Configured) else {}
@@ -83,15 +89,14 @@ class TrainingState(Generic[C]):
         self.identity: dict[str, Json] = encode_nonfinite(
             {**identity, "configuration": configuration, "began with": began}
         )
-        self.folder = folder
+        self.folder = None if folder is None else Path(folder)
         self.step, self.seconds = 0, 0.0
         self.keep(math.inf)
 
     def keep(self, loss: float) -> None:
         """Hold the present weights as the best."""
-        self.best = {
-            name: tensor.detach().clone() for name, tensor in self.model.state_dict().items()
-        }
+        state = self.model.state_dict().items()
+        self.best = {name: tensor.detach().clone() for name, tensor in state}
         self.best_step, self.best_loss = self.step, loss
 
     def restore_best(self) -> None:
@@ -103,8 +108,8 @@ class TrainingState(Generic[C]):
         self.restore_best()
         unit, lr = self.curve.unit, self.identity["lr"]
         return TrainingStopped(
-            f"{what} at {unit} {at} of {self.total}; the weights of {unit} {self.best_step} are kept. "
-            f"{self.curve.remedy}, or take a smaller lr than {lr}"
+            f"{what} at {unit} {at} of {self.total}; the weights of {unit} {self.best_step} are "
+            f"kept. {self.curve.remedy}, or take a smaller lr than {lr}"
         )
 
     def save(self) -> None:
@@ -130,17 +135,17 @@ class TrainingState(Generic[C]):
     def load(self) -> None:
         """Go on from the newest whole generation, if there is one.
 
-        Says and records what differs in code, libraries, CPU, its bfloat16, threads or device. StoreError for another
-        run's.
+        Says and records what differs in code, libraries, CPU, threads or device.
+
+        Raises:
+            StoreError: it is another run's; both sides of what differs are named.
         """
         if self.folder is None or (found := load_generation(self.folder)) is None:
             return
         path, tensors, header = found[0], found[1], cast(dict[str, Any], found[2])
         anew = f"Delete {self.folder} to start anew, or go back to those settings"
-        groups: dict[str, dict[str, Tensor]] = {
-            name: {} for name in ("model", "best", *self.optimizers)
-        }
         moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.optimizers}
+        groups: dict[str, dict[str, Tensor]] = {name: {} for name in ("model", "best", *moments)}
         try:
             if differs := _differences(header["identity"], self.identity):
                 raise StoreError(
@@ -149,26 +154,14 @@ class TrainingState(Generic[C]):
             for name, tensor in tensors.items():
                 group, _, rest = name.partition(".")
                 groups[group][rest] = tensor
-            planned = artifacts.layout(self.model.state_dict())
-            for group in ("model", "best"):
-                if differs := artifacts.differences(artifacts.layout(groups[group]), planned):
-                    raise StoreError(
-                        f"{path} holds the weights of another model: {'; '.join(differs[:3])}. {anew}"
-                    )
             for group, held in moments.items():
                 for name, tensor in groups[group].items():
                     index, _, moment = name.partition(".")
                     held.setdefault(int(index), {})[moment] = tensor
-            curve, made_by = (
-                type(self.curve)(**decode_nonfinite(header["curve"])),
-                {"device": "cpu", **header["made_by"]},
-            )
-            step, best_step, best_loss = (
-                int(header["step"]),
-                int(header["best_step"]),
-                float(header["best_loss"]),
-            )
-            seconds = float(header["seconds"])
+            curve = type(self.curve)(**decode_nonfinite(header["curve"]))
+            step, best_step = int(header["step"]), int(header["best_step"])
+            best_loss, seconds = float(header["best_loss"]), float(header["seconds"])
+            made_by = header["made_by"]
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, StoreError):
                 raise
@@ -183,59 +176,74 @@ class TrainingState(Generic[C]):
         self._note_changes(made_by)
 
     def _note_changes(self, made_by: Mapping[str, object]) -> None:
-        now = self._made_by().items()
         changed = [
             f"{name} {made_by.get(name)} -> {value}"
-            for name, value in now
+            for name, value in self._made_by().items()
             if made_by.get(name) != value
         ]
         if self.folder and changed:
             self.curve.resumed.append(f"at step {self.step}: {', '.join(changed)}")
             warnings.warn(
-                f"{self.folder.name} goes on {self.curve.resumed[-1]}. The result may differ in its last bits from an "
-                "uninterrupted run; this is noted with the model.",
+                f"{self.folder.name} goes on {self.curve.resumed[-1]}. The result may differ in "
+                "its last bits from an uninterrupted run; this is noted with the model.",
                 stacklevel=2,
             )
 
     def _made_by(self) -> dict[str, Json]:
         device = next(self.model.parameters()).device
         name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-        return {**provenance(), "device": name, "native_bf16": native_bf16(device)}
+        return {**provenance(), "device": name}
 
 
-def _differences(stated: Mapping[str, Json], identity: Mapping[str, Json]) -> list[str]:
-    """What tells the run of a file from this one; older files say nothing of model and first weights."""
-    asked = {name: value for name, value in identity.items() if name in stated or name not in LATER}
-    more = [
-        f"{name} is {value!r:.200} in the file, expected none"
-        for name, value in stated.items()
-        if name not in asked
+def _differences(stated: Mapping[str, Json], expected: Mapping[str, Json]) -> list[str]:
+    """Both sides of what tells the run of a file from this one; numbers up to rounding."""
+    return [
+        f"{name} is {stated.get(name)!r:.200} in the file, expected {expected.get(name)!r:.200}"
+        for name in [*expected, *(stated.keys() - expected.keys())]
+        if name not in stated
+        or name not in expected
+        or not _alike(stated[name], encode_nonfinite(expected[name]))
     ]
-    return artifacts.differences(stated, asked) + more
+
+
+def _alike(found: Json, expected: Json) -> bool:
+    """Equal; numbers up to what another processor rounds, in lists too."""
+    if isinstance(found, list) and isinstance(expected, list | tuple):
+        return len(found) == len(expected) and all(map(_alike, found, expected))
+    if isinstance(found, float) and isinstance(expected, float):
+        return math.isclose(found, expected, rel_tol=1e-5, abs_tol=1e-12)
+    if isinstance(found, dict) and isinstance(expected, Mapping):
+        return found.keys() == expected.keys() and all(_alike(found[k], expected[k]) for k in found)
+    return found == expected
 
 
 @contextmanager
-def resumable(state: TrainingState[C], *, purpose: str, progress: str) -> Iterator[tqdm]:
-    """A training that goes on from its checkpoints, as their only writer; ``purpose`` is what a second one is told."""
+def resumable(state: TrainingState[C], *, purpose: str, progress: str | bool) -> Iterator[tqdm]:
+    """A training that goes on from its checkpoints, as their only writer.
+
+    Args:
+        state: of the training.
+        purpose: what a second writer is told.
+        progress: title of the progress bar; '' or False for none.
+    """
     with ExitStack() as stack:
         if state.folder is not None:
             stack.enter_context(writer_lock(state.folder, purpose))
             state.load()
-        yield stack.enter_context(
-            tqdm(
-                total=state.total,
-                initial=state.step,
-                desc=progress,
-                disable=not progress,
-                mininterval=1.0,
-            )
+        bar = tqdm(
+            total=state.total,
+            initial=state.step,
+            desc=str(progress),
+            disable=not progress,
+            mininterval=1.0,
         )
+        yield stack.enter_context(bar)
 
 
 def save_generation(
     folder: Path, number: int, tensors: Mapping[str, Tensor], *, header: Mapping[str, Json]
 ) -> None:
-    """Write generation ``number`` of a checkpoint into its folder; the one before stays, older ones go."""
+    """Write generation ``number`` of a checkpoint; the one before stays, older ones go."""
     path = folder / f"{number:09d}.safetensors"
     artifacts.save(path, tensors, kind="checkpoint", header={**header, "generation": number})
     for old in sorted(folder.glob("*.safetensors"))[:-KEPT]:
@@ -244,9 +252,12 @@ def save_generation(
 
 
 def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Json]] | None:
-    """Path, arrays and header of the newest generation that is whole; None where there is none at all.
+    """Path, arrays and header of the newest generation that is whole; None where there is none.
 
-    Warns, naming both, where a newer one was refused. Raises StoreError where every one was.
+    Warns, naming both, where a newer one was refused.
+
+    Raises:
+        StoreError: every one was refused.
     """
     refused = []
     for path in sorted(folder.glob("*.safetensors"), reverse=True):
@@ -254,7 +265,8 @@ def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Js
             tensors, header = artifacts.load(path, kind="checkpoint")
             if f"{header.get('generation'):09}" != path.stem:
                 raise StoreError(
-                    f"{path} is stale: it holds generation {header.get('generation')!r:.80}, expected its name's."
+                    f"{path} is stale: it holds generation {header.get('generation')!r:.80}, "
+                    "expected its name's."
                 )
         except (StoreError, TypeError, ValueError) as error:
             refused.append(str(error))
@@ -266,6 +278,7 @@ def load_generation(folder: Path) -> tuple[Path, dict[str, Tensor], dict[str, Js
         return path, tensors, header
     if refused:
         raise StoreError(
-            f"no generation in {folder} can be used. {' '.join(refused)} Delete that folder to start anew."
+            f"no generation in {folder} can be used. {' '.join(refused)} Delete that folder to "
+            "start anew."
         )
     return None

@@ -1,4 +1,4 @@
-"""Ensembles of one-step networks by trajectory sampling, for networks that are not of this package."""
+"""Ensembles of one-step networks of other packages, by trajectory sampling."""
 
 from abc import ABC, abstractmethod
 
@@ -12,24 +12,24 @@ from tsmlib.trajectory import Segment
 
 
 class OneStepEnsemble(EnsembleModel, ABC):
-    """M one-step networks as a ``SegmentModel``, by trajectory sampling with a fixed member (TS-inf of PETS).
+    """M one-step networks as a ``SegmentModel``: trajectory sampling with a fixed member.
 
-    A row draws its member at the beginning of a segment and keeps it, 100 steps long.
+    TS-inf of PETS: a row draws its member at the beginning of a segment and keeps it.
     """
 
     segment_len, past_len, stochastic = 100, 1, True
 
     @abstractmethod
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(M, R, dx), (M, R, du) -> mean and standard deviation, None for none, of the increments (M, R, dx)."""
+        """(M, R, dx), (M, R, du) -> mean and deviation (or None) of the increments (M, R, dx)."""
 
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
         """(B, L, .), (B, K <= segment_len, du) -> states (B, K, dx).
 
-        No generator: every step takes the mean of all members. With one: each row keeps a member of its own, and
-        members that state a standard deviation add the noise.
+        No generator: every step takes the mean of all members. With one: each row keeps a member
+        of its own, and members that state a deviation add the noise.
         """
         n_rows, start = len(actions), past.states[:, -1]
         if generator is None:
