@@ -22,7 +22,6 @@ from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.storage import files
-from tsmlib.training import checkpoint as checkpoints
 from tsmlib.training.callbacks import Callback, CsvCallback, Progress, TensorBoardCallback
 from tsmlib.training.checkpoint import TrainingStopped, load_generation
 from tsmlib.training.fit import (
@@ -33,7 +32,7 @@ from tsmlib.training.fit import (
     optimizers,
     schedule,
 )
-from tsmlib.trajectory import Trajectories, TrajectoryError, Window, batches, initial_past
+from tsmlib.trajectory import Robot, Trajectories, Window, batches, initial_past
 
 H = 4
 SIZES: dict[str, Any] = dict(
@@ -66,15 +65,15 @@ TRAIN, HELD_OUT = episodes(30, 0), episodes(5, 1)
 def new_tsm(seed: int = 0, **given: float) -> TSM:
     torch.manual_seed(seed)
     model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2), **given)
-    model.features.fit(torch.from_numpy(TRAIN.states))
+    model.take_robot(TRAIN)
     return model
 
 
 def new_prior(seed: int = 0) -> ActionPrior:
     torch.manual_seed(seed)
-    return ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2)).fit_scale(
-        torch.from_numpy(TRAIN.actions)
-    )
+    prior = ActionPrior(2, segment_len=H, channels=8, dilations=(1, 2))
+    prior.take_robot(TRAIN)
+    return prior
 
 
 def new_rtsm(seed: int = 0) -> RecurrentTSM:
@@ -82,25 +81,8 @@ def new_rtsm(seed: int = 0) -> RecurrentTSM:
     model = RecurrentTSM(
         3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5
     )
-    model.features.fit(torch.from_numpy(TRAIN.states))
+    model.take_robot(TRAIN)
     return model
-
-
-@pytest.mark.parametrize("made_for", [TSM, RecurrentTSM, OneStep, LSTM, Ensemble, ActionPrior])
-def test_a_model_made_for_data_has_their_scale_and_weights_that_the_seed_alone_decides(
-    made_for: Any,
-) -> None:
-    torch.manual_seed(5)
-    one, later, other = (made_for.for_data(TRAIN, seed=seed) for seed in (0, 0, 1))
-    assert torch.initial_seed() == 5  # the global generator is left alone
-    assert same(weights(one), weights(later))
-    assert not same(weights(one), weights(other))
-    if made_for is ActionPrior:
-        torch.testing.assert_close(one.std, torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0))
-    else:
-        assert one.features.angles == [0]
-        states = one.features(torch.from_numpy(TRAIN.states)).flatten(0, 1)
-        torch.testing.assert_close(states.std(0), torch.ones(4), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("dt", [0.125, 0.02])  # the steps of the second differ by rounding
@@ -116,13 +98,8 @@ def test_a_clock_goes_on_and_the_statistics_of_all_else_are_as_without_it(dt: fl
     assert model.features.moving.all()
     assert torch.equal(model.features.step_std[:3], plain.features.step_std)
     torch.testing.assert_close(model.features.step_std[3], torch.tensor(dt), rtol=1e-3, atol=0)
-    fit(
-        model,
-        model.loss,
-        timed,
-        timed,
-        TrainingOptions(1, 4, steps=60, batch_size=32, lr=1e-2, warmup=3),
-    )
+    options = TrainingOptions(future_len=4, steps=60, batch_size=32, lr=1e-2, warmup=3)
+    fit(model, timed, timed, options, progress=False)
     states = torch.from_numpy(timed.states)
     past = initial_past(states[:, 0], 1, 2)
     reached = rollout(model, past, torch.from_numpy(timed.actions[:, :10]))[:, -1, 3].detach()
@@ -136,17 +113,17 @@ def test_an_action_that_is_never_used_does_not_stop_the_training_of_the_prior() 
     prior = ActionPrior.for_data(unused, segment_len=H, channels=8, dilations=(1, 2))
     assert prior.std[1] == 1
     assert prior.std[0] == torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0)[0]
-    history = fit(prior, prior.loss, unused, unused, TrainingOptions(**SIZES | {"steps": 5}))
+    options = TrainingOptions(**SIZES | {"steps": 5})
+    history = fit(prior, unused, unused, options, progress=False)
     assert math.isfinite(history.validation[-1])
 
 
 def train(
     model: nn.Module, loss: Callable[..., Tensor] | None = None, **settings: Any
 ) -> TrainingHistory:
-    schedule = SIZES | {
-        name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings
-    }
-    return fit(model, loss or model.loss, TRAIN, HELD_OUT, TrainingOptions(**schedule), **settings)
+    own = {name: settings.pop(name) for name in TrainingOptions.__annotations__ if name in settings}
+    options = TrainingOptions(**SIZES | own)
+    return fit(model, TRAIN, HELD_OUT, options, loss, progress=False, **settings)
 
 
 def weights(model: nn.Module) -> dict[str, Tensor]:
@@ -173,6 +150,69 @@ class Faulty:
         return value
 
 
+@pytest.mark.parametrize("made_for", [TSM, RecurrentTSM, OneStep, LSTM, Ensemble, ActionPrior])
+def test_a_model_made_for_data_has_their_robot_and_weights_that_the_seed_alone_decides(
+    made_for: Any,
+) -> None:
+    torch.manual_seed(5)
+    one, later, other = (made_for.for_data(TRAIN, seed=seed) for seed in (0, 0, 1))
+    assert torch.initial_seed() == 5  # the global generator is left alone
+    assert one.robot == TRAIN.robot
+    assert same(weights(one), weights(later))
+    assert not same(weights(one), weights(other))
+    if made_for is ActionPrior:
+        std = torch.from_numpy(TRAIN.actions).flatten(0, 1).std(0)
+        torch.testing.assert_close(one.std, std)
+    else:
+        states = one.features(torch.from_numpy(TRAIN.states)).flatten(0, 1)
+        torch.testing.assert_close(states.std(0), torch.ones(4), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("new", [TSM, RecurrentTSM, OneStep, LSTM, Ensemble, ActionPrior])
+def test_a_model_is_fitted_by_its_name_and_data_alone(new: Any) -> None:
+    sizes = (2,) if new is ActionPrior else (3, 2)
+    model = new(*sizes) if new is ActionPrior else new(*sizes, angles=(0,))
+    options = TrainingOptions(steps=2, batch_size=4)
+    curve = fit(model, TRAIN, options=options, progress=False)
+    assert math.isfinite(curve.validation[-1])
+    assert model.robot == TRAIN.robot
+    again = new.for_data(TRAIN)
+    if new is ActionPrior:
+        assert torch.equal(model.std, again.std)
+    else:
+        torch.testing.assert_close(model.features.state_dict(), again.features.state_dict())
+        assert model.predict(HELD_OUT.states[:, 0], HELD_OUT.actions).shape == (5, 30, 3)
+
+
+def test_the_window_of_a_short_episode_is_as_long_as_the_episode() -> None:
+    short, options = TRAIN.cut(15), TrainingOptions()
+    assert options.for_model(new_tsm(), TRAIN).future_len == 2 * H
+    assert options.for_model(TSM.for_data(short), short).future_len == 10
+    assert options.for_model(OneStep.for_data(short), short).future_len == 15
+    assert options.for_model(new_tsm(), TRAIN).past_len == H
+
+
+OTHER_ROBOTS = {
+    "env": Robot("tsm/Other-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (0,), 2),
+    "dt": Robot("tsm/Made-v0", 0.2, ("a", "b", "c"), ("m",) * 3, (0,), 2),
+    "names": Robot("tsm/Made-v0", 0.02, ("a", "b", "d"), ("m",) * 3, (0,), 2),
+    "angles": Robot("tsm/Made-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (1,), 2),
+}
+
+
+@pytest.mark.parametrize("field", OTHER_ROBOTS)
+def test_a_model_its_data_and_held_out_data_are_of_one_robot(field: str) -> None:
+    robot = OTHER_ROBOTS[field]
+    meaning = (robot.env, robot.dt, robot.names, robot.units, robot.angles)
+    other = Trajectories(TRAIN.states / 10, TRAIN.actions, *meaning)
+    model = new_tsm()
+    before = weights(model)
+    for given in ((TRAIN, other), (other, other)):
+        with pytest.raises(ValueError, match=f"not of one robot: {field} is .* and "):
+            fit(model, *given)
+    assert same(weights(model), before)
+
+
 # What comes out ------------------------------------------------------------------------------------------------------
 
 
@@ -191,13 +231,6 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not() -> Non
     assert same(weights(models[0]), weights(models[1]))
     assert curves[0].validation == curves[1].validation
     assert not same(weights(models[0]), weights(models[2]))
-
-
-def test_training_neither_uses_nor_changes_the_global_generator() -> None:
-    model = new_tsm()
-    before = torch.get_rng_state()
-    train(model)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_the_weights_with_the_best_validation_loss_are_kept() -> None:
@@ -424,16 +457,6 @@ def interrupted_after(callback: Callback, checkpoint: Path) -> None:
         train(new_tsm(), checkpoint=checkpoint, callback=stop)
 
 
-def test_a_record_made_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
-    table, checkpoint = CsvCallback(tmp_path / "losses.csv"), tmp_path / "run"
-
-    interrupted_after(table, checkpoint)
-    assert [line["step"] for line in lines(table.path)] == [5, 10]
-    curve = train(new_tsm(), checkpoint=checkpoint, callback=table)
-    assert [line["step"] for line in lines(table.path)] == curve.step
-    assert [line["train"] for line in lines(table.path)] == curve.train
-
-
 def test_a_table_of_other_columns_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.csv").write_text("name,value\na,1\n")
     with pytest.raises(
@@ -467,106 +490,61 @@ def test_without_tensorboard_its_callback_names_what_to_install(
         TensorBoardCallback("board")
 
 
-def test_a_run_that_never_clips_goes_on_from_its_checkpoint_and_is_not_one_that_clips(
-    tmp_path: Path,
-) -> None:
-    whole, stopped, again = new_tsm(), new_tsm(), new_tsm()
-    train(whole, clip=math.inf)
-    with pytest.raises(Interrupted):
-        train(stopped, Faulty(stopped, 13, interrupt), clip=math.inf, checkpoint=tmp_path / "run")
-    train(again, clip=math.inf, checkpoint=tmp_path / "run")
-    assert same(weights(again), weights(whole))
-    with pytest.raises(
-        files.StoreError, match="another run: clip is 'inf' in the file, expected 1.0"
-    ):
-        train(new_tsm(), checkpoint=tmp_path / "run")
+OTHER_RUNS: dict[str, tuple[dict[str, Any], str]] = {
+    "seed": ({"seed": 3}, "seed is 0 in the file, expected 3"),
+    "lr": ({"lr": 5e-4}, "lr is 0.001 in the file, expected 0.0005"),
+    "steps": ({"steps": 50}, "steps is 20 in the file, expected 50"),
+    "clip": ({"clip": math.inf}, "clip is 1.0 in the file, expected 'inf'"),
+    "future": ({"future_len": 2 * H}, "future_len is 4 in the file, expected 8"),
+    "muon": ({"muon": 0.02}, "muon is 0.0 in the file, expected 0.02"),
+    "span": ({"span": (0.6, 1.0)}, r"span is \[0.0, 1.0\] in the file, expected \[0.6, 1.0\]"),
+}
 
 
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        ({"seed": 3}, "seed is 0 in the file, expected 3"),
-        ({"lr": 5e-4}, "lr is 0.001 in the file, expected 0.0005"),
-        ({"steps": 50}, "steps is 20 in the file, expected 50"),
-        ({"batch_size": 4}, "batch_size is 8 in the file, expected 4"),
-        ({"future_len": 2 * H}, "future_len is 4 in the file, expected 8"),
-        ({"muon": 0.02}, "muon is 0.0 in the file, expected 0.02"),
-        ({"weight_decay": 0.1}, "weight_decay is 0.0 in the file, expected 0.1"),
-        ({"span": (0.6, 1.0)}, r"span is \[0.0, 1.0\] in the file, expected \[0.6, 1.0\]"),
-        ({"bf16": True}, "bf16 is False in the file, expected True"),
-    ],
-)
+@pytest.mark.parametrize("field", OTHER_RUNS)
 def test_a_checkpoint_of_another_run_is_refused_naming_what_differs(
-    tmp_path: Path, other: dict[str, Any], message: str
+    tmp_path: Path, field: str
 ) -> None:
-    checkpoint = tmp_path / "run"
-    train(new_tsm(), checkpoint=checkpoint)
-    content, model = folder_bytes(checkpoint), new_tsm()
+    other, message = OTHER_RUNS[field]
+    train(new_tsm(), checkpoint=str(tmp_path / "run"))
+    content, model = folder_bytes(tmp_path / "run"), new_tsm()
     before = weights(model)
-    with pytest.raises(
-        files.StoreError,
-        match=f"run/.*safetensors is the checkpoint of another run: {message}. Delete",
-    ):
-        train(model, checkpoint=checkpoint, **other)
-    assert folder_bytes(checkpoint) == content
+    expected = f"run/.*safetensors is the checkpoint of another run: .*{message}.* Delete"
+    with pytest.raises(files.StoreError, match=expected):
+        train(model, checkpoint=tmp_path / "run", **other)
+    assert folder_bytes(tmp_path / "run") == content
     assert same(weights(model), before)
 
 
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        (lambda: new_tsm(seed=7), "began with"),
-        (lambda: new_tsm(beta=0.5), "configuration"),
-    ],
-)
-def test_a_checkpoint_of_another_model_is_refused(
-    tmp_path: Path, other: Callable[[], TSM], message: str
-) -> None:
+def scaled(model: TSM, scale: float) -> Callable[..., Tensor]:
+    return lambda window, generator: scale * model.loss(window, generator)
+
+
+def test_a_loss_is_known_by_what_it_gives_and_not_by_its_name(tmp_path: Path) -> None:
+    first, same_loss, other = new_tsm(), new_tsm(), new_tsm()
+    train(first, scaled(first, 1.0), checkpoint=tmp_path / "run")
+    assert train(same_loss, same_loss.loss, checkpoint=tmp_path / "run").step == [5, 10, 15, 20]
+    message = "another run: loss of the first weights is .* in the file, expected -"
+    with pytest.raises(files.StoreError, match=message):
+        train(other, scaled(other, -100.0), checkpoint=tmp_path / "run")
+
+
+@pytest.mark.parametrize("new", [lambda: new_tsm(seed=7), lambda: new_tsm(beta=0.5)])
+def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path, new: Callable[[], TSM]) -> None:
     train(new_tsm(), checkpoint=tmp_path / "run")
-    model = other()
-    before = weights(model)
-    with pytest.raises(
-        files.StoreError, match=f"is the checkpoint of another run: .*{message} is "
-    ):
-        train(model, checkpoint=tmp_path / "run")
-    assert same(weights(model), before)
+    with pytest.raises(files.StoreError, match="another run: .*(began with|configuration) is "):
+        train(new(), checkpoint=tmp_path / "run")
+
+
+def test_a_checkpoint_of_other_data_is_refused(tmp_path: Path) -> None:
+    model, options = new_tsm(), TrainingOptions(**SIZES)
+    train(model, checkpoint=tmp_path / "run")
+    with pytest.raises(files.StoreError, match="episodes is 30 in the file, expected 20; data is"):
+        fit(new_tsm(), TRAIN.take(slice(20)), HELD_OUT, options, checkpoint=tmp_path / "run")
 
 
 def folder_bytes(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-def test_a_checkpoint_of_other_data_or_another_loss_is_refused(tmp_path: Path) -> None:
-    checkpoint, model = tmp_path / "run", new_tsm()
-    train(model, checkpoint=checkpoint)
-    with pytest.raises(
-        files.StoreError, match="loss is 'loss' in the file, expected 'teacher_forced_loss'"
-    ):
-        train(model, model.teacher_forced_loss, checkpoint=checkpoint)
-    elsewhere = replace(TRAIN, env="tsm/Other-v0").take(slice(0, 20))
-    with pytest.raises(
-        files.StoreError,
-        match="env is 'tsm/Made-v0' in the file, expected 'tsm/Other-v0'; episodes is 30 in the file, expected 20",
-    ):
-        fit(model, model.loss, elsewhere, HELD_OUT, TrainingOptions(**SIZES), checkpoint=checkpoint)
-
-
-def test_an_older_checkpoint_with_weights_of_another_shape_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        checkpoints, "_differences", lambda stated, identity: []
-    )  # it says nothing of its model
-    folder, wider = (
-        tmp_path / "run",
-        TSM(3, 2, angles=(0,), segment_len=H, channels=16, dilations=(1, 2)),
-    )
-    train(new_tsm(), checkpoint=folder)
-    with pytest.raises(
-        files.StoreError,
-        match=r"run/.*safetensors holds the weights of another model.*Delete .*run to start anew",
-    ):
-        train(wider, checkpoint=folder)
 
 
 # What goes wrong -----------------------------------------------------------------------------------------------------
@@ -611,89 +589,12 @@ def _cliff(parameter: Tensor) -> Tensor:
     return (parameter - parameter.detach()).abs().sum().sqrt()
 
 
-def test_numbers_that_are_not_positive_are_refused() -> None:
-    for name in ("steps", "batch_size", "validate_every"):
-        for value in (0, -5):
-            with pytest.raises(ValueError, match=f"{name} {value}.*expected positive"):
-                train(new_tsm(), **{name: value})
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"muon": -0.02}, "muon -0.02: expected zero or above"),
-        ({"weight_decay": -1.0}, "weight_decay -1.0: expected zero or above"),
-        ({"weight_decay": math.nan}, "weight_decay nan: expected zero or above"),
-        ({"patience": -1}, "patience -1: expected zero or above"),
-        ({"lr": 0.0}, "lr 0.0, lr_final 1e-05: expected lr above zero"),
-        (
-            {"span": (0.6, 0.6)},
-            r"span \(0.6, 0.6\): expected two numbers from 0 to 1, the first below the second",
-        ),
-        ({"span": (0.0, 1.5)}, r"span \(0.0, 1.5\): expected two numbers from 0 to 1"),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        TrainingOptions(**{**SIZES, **settings})
-
-
 @pytest.mark.parametrize(
     ("new", "future_len", "better"), [(new_tsm, 6, 4), (new_tsm, 3, 4), (new_prior, 6, 4)]
 )
 def test_a_future_of_no_whole_number_of_segments_is_refused(
     new: Any, future_len: int, better: int
 ) -> None:
-    with pytest.raises(
-        ValueError,
-        match=f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or",
-    ):
+    message = f"future_len is {future_len}, .* whole number of segments of 4; choose {better}, or"
+    with pytest.raises(ValueError, match=message):
         train(new(), future_len=future_len)
-
-
-@pytest.mark.parametrize("past_len", [H - 1, H + 1])
-def test_windows_of_another_past_than_the_model_has_in_a_rollout_are_refused(past_len: int) -> None:
-    with pytest.raises(
-        ValueError, match=rf"past_len is {past_len}, but TSM is given 4 .*past_len=model.past_len"
-    ):
-        train(new_tsm(), past_len=past_len)
-    with pytest.raises(ValueError, match=f"past_len is {past_len}, but ActionPrior is given 4"):
-        train(new_prior(), past_len=past_len)
-
-
-def test_episodes_shorter_than_the_windows_are_refused() -> None:
-    with pytest.raises(
-        TrajectoryError,
-        match="validation .*: 5 episodes of at most 30 steps hold no window of 36 fut",
-    ):
-        train(new_tsm(), future_len=36)
-
-
-def test_a_model_that_knows_no_statistics_takes_those_of_its_training_data_and_until_then_does_not_predict() -> (
-    None
-):
-    torch.manual_seed(0)
-    model = TSM(3, 2, angles=(0,), segment_len=H, channels=8, dilations=(1, 2))
-    past = initial_past(torch.from_numpy(HELD_OUT.states[:4, 0]), H, 2)
-    with pytest.raises(
-        ValueError, match=r"features of this TSM were never fitted.*TSM\.for_data\(trajectories\)"
-    ):
-        rollout(model, past, torch.zeros(4, H, 2))
-    fit(
-        model,
-        model.loss,
-        TRAIN,
-        HELD_OUT,
-        TrainingOptions(past_len=H, future_len=H, steps=2, batch_size=4),
-    )
-    found = TSM.for_data(TRAIN, segment_len=H, channels=8, dilations=(1, 2)).features.state_dict()
-    torch.testing.assert_close(model.features.state_dict(), found)
-    assert rollout(model, past, torch.zeros(4, H, 2)).isfinite().all()
-
-
-def test_actions_beyond_their_bounds_are_refused_with_what_to_do() -> None:
-    with pytest.raises(
-        TrajectoryError,
-        match=r"go up to 2; expected them within \[-1, 1\]. Scale them by their bounds",
-    ):
-        replace(TRAIN, actions=np.full_like(TRAIN.actions, 2.0))

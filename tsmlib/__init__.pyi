@@ -7,7 +7,6 @@ from .exploration import Exploration as Exploration
 from .exploration import ExplorationOptions as ExplorationOptions
 from .exploration import explore as explore
 from .film import film as film
-from .fine_tuning import fine_tune as fine_tune
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout
@@ -44,6 +43,7 @@ from .training.callbacks import Callback as Callback
 from .training.callbacks import CsvCallback as CsvCallback
 from .training.callbacks import Progress as Progress
 from .training.callbacks import TensorBoardCallback as TensorBoardCallback
+from .training.fine_tune import fine_tune as fine_tune
 from .training.fit import TrainingOptions as TrainingOptions
 from .training.fit import fit as fit
 from .trajectory import Segment as Segment

@@ -40,7 +40,8 @@ def require_number(
     name: str, value: object, low: float = -math.inf, high: float = math.inf, *, above: bool = False
 ) -> float:
     """``value`` as a finite float in [low, high], or (low, high] with ``above``; else an error."""
-    between = f"a number {'above' if above else 'of at least'} {low:g} and at most {high:g}"
+    between = f"a number {'above' if above else 'of at least'} {low:g}"
+    between += "" if high == math.inf else f" and at most {high:g}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} is {value!r:.80}; expected {between}")
     if not math.isfinite(value) or not low <= value <= high or (above and value == low):

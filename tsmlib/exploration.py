@@ -24,10 +24,8 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from tsmlib.fine_tuning import fine_tune
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.base import DynamicsModel, as_dynamics
-from tsmlib.models.features import require_robot
+from tsmlib.models.base import DynamicsModel, as_dynamics, require_robot
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import Trial, mpc, without_unstable
 from tsmlib.planning.planners import cem
@@ -38,7 +36,8 @@ from tsmlib.rewards import Reward, rewarded
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
-from tsmlib.training.fit import Loss, TrainingOptions, fixed_windows, require_past, validate
+from tsmlib.training.fine_tune import fine_tune
+from tsmlib.training.fit import Loss, TrainingOptions, fixed_windows, validate
 from tsmlib.trajectory import Trajectories
 
 
@@ -176,9 +175,9 @@ def explore(
     learned from in each round where nothing is planned, or None for what is there already; ``tasks`` are not asked.
     """
     _require_robot(model, prior, train, held_out)
-    require_past(cast(nn.Module, model), options.model)
+    options = replace(options, model=options.model.for_model(cast(nn.Module, model), train))
     if prior is not None and options.prior is not None:
-        require_past(prior, options.prior)
+        options = replace(options, prior=options.prior.for_model(prior, train))
     if options.bonus and not as_dynamics(model).stochastic:
         raise ValueError(
             f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples do not disagree. "
@@ -242,13 +241,9 @@ def _require_robot(
 ) -> None:
     """Error unless all are of one robot, as far as their sizes and names tell."""
     train.robot.require_same(held_out.robot, "training and held-out data")
-    require_robot(model, train, "a model of the robot that explores")
-    actions = train.robot.action_dim
-    if prior is not None and len(prior.std) != actions:
-        raise ValueError(
-            f"the prior's actions have {len(prior.std)} dimensions, those of {train.env} {actions}; expected a prior "
-            "of the robot that explores"
-        )
+    for net in (model, prior):
+        if net is not None:
+            require_robot(net, train.robot, "what explores and its training data", but=("env",))
 
 
 def _collected(
@@ -341,7 +336,16 @@ def _trained(
     parts.append(("validation", cast(nn.Module, model), model.loss, augmented, options.model))
     for name, part, loss, data, training in parts:
         checkpoint = None if place is None else place.folder / f"{name}.checkpoint"
-        fine_tune(part, loss, data, found.held_out, training, seed=seed + k, checkpoint=checkpoint)
+        fine_tune(
+            part,
+            data,
+            found.held_out,
+            training,
+            loss,
+            seed=seed + k,
+            checkpoint=checkpoint,
+            progress=False,
+        )
         windows = fixed_windows(found.held_out, training.past_len, training.future_len)
         record[name] = validate(loss, windows, seed + k)
     record |= {name: record.get(name, 0.0) + spent for name, spent in _since(began).items()}

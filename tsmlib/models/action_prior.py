@@ -93,14 +93,18 @@ class ActionPrior(Configured):
     def take_robot(self, data: Trajectories) -> None:
         """Take the robot of training data and, the first time, the scale of their actions."""
         if self.robot is None:
-            self.fit_scale(torch.from_numpy(data.flat_actions))
+            self.fit_scale(data)
         self.robot = data.robot
 
-    def fit_scale(self, actions: Tensor) -> ActionPrior:
-        """Take the deviation of training actions (..., du); 1 of one that is never used."""
-        steps = actions.double().reshape(-1, len(self.std))
-        std, spacing = steps.std(0), 4 * torch.finfo(torch.float32).eps
-        self.std.copy_(std.where(std > spacing * steps.abs().amax(0), 1.0))
+    def fit_scale(self, data: Trajectories | Tensor) -> ActionPrior:
+        """Take the deviation of training actions, or of (N, T, du); 1 of one that never changes."""
+        if isinstance(data, Trajectories):
+            actions = torch.from_numpy(data.flat_actions)
+        else:
+            actions = as_tensor("data", data, ("N", "T", self.action_dim)).flatten(0, 1)
+        actions = actions.double()
+        varies = actions.amax(0) > actions.amin(0)
+        self.std.copy_(actions.std(0).where(varies, 1.0))
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:

@@ -246,7 +246,8 @@ def predict(
         given = tuple(_array("past", part) for part in past)
         seen = tuple(part[None] for part in given) if one else given
     else:
-        start = as_tensor("past", past, ("dx",) if one else ("B", "dx"))
+        dx = getattr(model, "state_dim", "dx")
+        start = as_tensor("past", past, (dx,) if one else ("B", dx))
         du = moves.shape[-1] if moves.ndim else 1
         seen = initial_past(start[None] if one else start, as_dynamics(model).past_len, du)
     seen, moves, home = _inputs(model, seen, moves[None] if one else moves)
@@ -309,6 +310,8 @@ def require_robot(model: object, robot: Robot, what: str, *, but: tuple[str, ...
     Raises:
         ValueError: they differ; both sides are named.
     """
+    if not hasattr(model, "state_dim"):  # a prior knows actions alone
+        but = (*but, "env", "names", "units", "angles")
     if (own := getattr(model, "robot", None)) is not None:
         own.require_same(robot, what, but=but)
     features = getattr(model, "features", None)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tsmlib.checks import as_tensor, require_counts
 from tsmlib.trajectory import Trajectories
+
+ROUNDING = 8 * float(np.finfo(np.float32).eps)  # of a value, by which a constant may vary
 
 
 class Features(nn.Module):
@@ -50,7 +53,8 @@ class Features(nn.Module):
     def fit(self, data: Trajectories | Tensor) -> Features:
         """Take the statistics of training data, in float64.
 
-        What varies by no more than the spacing of float32 numbers of its size does not vary.
+        What changes by no more than the rounding of float32 at its size does not change, so that
+        neither units nor offsets decide what moves.
 
         Args:
             data: episodes, or their states (N, T + 1, dx) alone.
@@ -59,18 +63,24 @@ class Features(nn.Module):
             These features.
         """
         if isinstance(data, Trajectories):
-            x, steps = torch.from_numpy(data.flat_states), torch.from_numpy(data.increments())
+            rows, lengths = torch.from_numpy(data.flat_states), data.steps + 1
         else:
-            states = as_tensor("data", data, ("N", "T + 1", len(self.step_std)))
-            x, steps = states.flatten(0, 1), states.double().diff(dim=1).flatten(0, 1)
-        x, spacing = x.double(), 4 * torch.finfo(torch.float32).eps
-        raw = self._raw(x)
-        std, size = raw.std(0), raw.abs().amax(0)
+            rows = as_tensor("data", data, ("N", "T + 1", len(self.step_std))).detach().cpu()
+            lengths = np.full(len(rows), rows.shape[1])
+            rows = rows.flatten(0, 1)
+        begins, states = np.cumsum(lengths) - lengths, rows.double()
+        raw = self._raw(states)
+        varies = raw.amax(0) - raw.amin(0) > ROUNDING * raw.abs().amax(0)
         self.mean.copy_(raw.mean(0))
-        self.std.copy_(std.where(std > spacing * size, 1.0))
-        step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
+        self.std.copy_(raw.std(0).where(varies, 1.0))
+        steps = np.delete(states.diff(dim=0).numpy(), begins[1:] - 1, axis=0)
+        step_std, step_rms = (
+            torch.from_numpy(x) for x in (steps.std(0), (steps**2).mean(0) ** 0.5)
+        )
         step_std = step_std.where(step_std > 1e-3 * step_rms, step_rms)  # a clock's are alike
-        self.step_std.copy_(step_std.where(step_std > spacing * x.abs().amax(0), 0.0))
+        edges = (edge.reduceat(states.numpy(), begins) for edge in (np.maximum, np.minimum))
+        within = torch.from_numpy(np.subtract(*edges).max(0))
+        self.step_std.copy_(step_std * (within > ROUNDING * states.abs().amax(0)))
         return self
 
     @property

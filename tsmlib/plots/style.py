@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from tsmlib import zoo
-from tsmlib.plots.method import Look
+from tsmlib.zoo import Look
 from tsmlib.storage.files import write_bytes
 
 P = ParamSpec("P")

@@ -39,6 +39,7 @@ LARGEST = (
     10_000  # size among a model's arguments, length of a list of them, and parameters of a model
 )
 
+ROBOT = ("env", "dt", "names", "units", "angles")  # fields of a model's fingerprint
 _ZEROS = "0" * 64
 _MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
 _OTHER = "Name another file, or delete it and make one that fits."
@@ -281,6 +282,9 @@ def save_model(path: PathLike, model: Model, header: Mapping[str, Json] | None =
     """
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
     stated = about.get("fingerprint", {})
+    if isinstance(robot := getattr(model, "robot", None), Robot) and isinstance(stated, Mapping):
+        stated = {name: getattr(robot, name) for name in ROBOT} | stated
+        about["fingerprint"] = stated
     if hasattr(model, "segment_len") and isinstance(stated, Mapping):
         about["fingerprint"] = {"segment_len": model.segment_len, **stated}
     save(path, model.state_dict(), kind="model", header=about)
@@ -317,6 +321,8 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
     require_fit(path, fingerprint, expect, about["schema"])
     model = cls(**config)
     model.load_state_dict(tensors, strict=True)
+    if hasattr(model, "robot") and fingerprint.keys() >= set(ROBOT):
+        model.robot = Robot(*(fingerprint[name] for name in ROBOT), model.action_dim)
     return model
 
 

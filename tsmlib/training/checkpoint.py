@@ -70,7 +70,7 @@ class TrainingState(Generic[C]):
         curve: the record so far.
         total: steps of the whole run.
         identity: what the run is, as JSON values, its lr among them; the model's configuration and
-            its weights, which are the first ones, are added. A checkpoint of another run is refused.
+            its weights, which are the first ones, are added. That of another run is refused.
         folder: of the checkpoints; None for none.
     """
 

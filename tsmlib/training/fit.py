@@ -114,7 +114,7 @@ class TrainingOptions:
         return replace(self, past_len=past_len, future_len=future_len)
 
 
-@dataclass
+@dataclass(repr=False)
 class TrainingHistory(Curve):
     """Record of a ``fit``, with one entry for each validation.
 
@@ -127,6 +127,11 @@ class TrainingHistory(Curve):
     step: list[int] = field(default_factory=list)
     train: list[float] = field(default_factory=list)
     validation: list[float] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        """Updates and validation losses, first to last."""
+        losses = [f"{loss:.4g}" for loss in self.validation[:: max(1, len(self.validation) - 1)]]
+        return f"TrainingHistory({max(self.step, default=0)} steps, validation loss {' to '.join(losses)})"
 
 
 @torch.enable_grad()  # an interrupt within torch.no_grad, in a notebook, may leave gradients off
@@ -146,8 +151,8 @@ def fit(
     """Train a model, or an action prior, on random windows of episodes.
 
     The weights with the best validation loss are left in ``model``. Windows and noise are functions
-    of (seed, step), so a run that is resumed from ``checkpoint`` continues as if it had not stopped.
-    Parameters with ``requires_grad`` False stay as they are.
+    of (seed, step), so a run that is resumed from ``checkpoint`` continues as if it had not
+    stopped. Parameters with ``requires_grad`` False stay as they are.
 
     Args:
         model: made by ``TSM.for_data(data)``, say; one that was made without data takes the robot

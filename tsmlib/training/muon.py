@@ -8,6 +8,7 @@ processors without such instructions; this one computes in the type of the weigh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+
 import torch
 from torch import Tensor, nn
 
