@@ -44,9 +44,10 @@ def require_number(
     between += "" if high == math.inf else f" and at most {high:g}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} is {value!r:.80}; expected {between}")
-    if not math.isfinite(value) or not low <= value <= high or (above and value == low):
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high or (above and number == low):
         raise ValueError(f"{name} is {value}; expected {between}")
-    return float(value)
+    return number
 
 
 def require_flag(name: str, value: object) -> bool:
@@ -56,20 +57,28 @@ def require_flag(name: str, value: object) -> bool:
     return bool(value)
 
 
-def require_type(name: str, value: object, kind: type[T], hint: str = "") -> T:
-    """``value`` where it is a ``kind``; else TypeError that ends with ``hint``, what to type."""
+def require_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """TypeError unless ``value`` is of a kind; ``expected`` says in words what to give."""
     if not isinstance(value, kind):
-        raise TypeError(
-            f"{name} is {_article(value)}; expected a {kind.__name__}{hint and f', {hint}'}"
-        )
-    return value
+        raise TypeError(f"{name} is {described(value)}; expected {expected}")
 
 
-def require_callable(name: str, value: T, hint: str) -> T:
-    """``value`` where it can be called; TypeError otherwise, which says what it is called with."""
-    if not callable(value):
-        raise TypeError(f"{name} is {_article(value)}; expected a function, {hint}")
-    return value
+def require_callable(name: str, value: object, expected: str) -> None:
+    """TypeError unless ``value`` can be called; ``expected`` says in words what to give."""
+    if not callable(value) or isinstance(value, type):
+        raise TypeError(f"{name} is {described(value)}; expected {expected}")
+
+
+def described(value: object) -> str:
+    """A value as errors name it: its type, and where it has one its shape."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    shape = getattr(value, "shape", None)
+    kind = "tensor" if isinstance(value, Tensor) else type(value).__name__
+    if isinstance(shape, tuple):
+        return f"a {kind} {tuple(shape)}"
+    shown = f" {value!r:.60}" if isinstance(value, str | int | float | list | tuple) else ""
+    return f"a {kind}{shown}"
 
 
 def require_choice(name: str, value: T, choices: Iterable[T]) -> T:
@@ -110,7 +119,7 @@ def as_tensor(
             raise TypeError(str(tensor.dtype))
         tensor = tensor.to(device=device, dtype=dtype)
     except (TypeError, ValueError, RuntimeError) as error:
-        found = _article(value)
+        found = described(value)
         raise TypeError(f"{name} is {found}; expected numbers {_words(shape)}") from error
     sizes = zip(shape, tensor.shape, strict=False)
     fits = len(shape) == tensor.ndim and all(isinstance(s, str) or s == n for s, n in sizes)
@@ -129,15 +138,6 @@ def _from_numpy(array: np.ndarray) -> Tensor:
     if array.dtype.kind not in "fiu":
         raise TypeError(str(array.dtype))
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
-
-
-def _article(value: object) -> str:
-    """What a value is, for an error: None, a short text or the name of its type."""
-    if value is None or isinstance(value, str):
-        return f"{value!r:.80}"
-    name = value.__name__ if isinstance(value, type) else type(value).__name__
-    kind = "the class" if isinstance(value, type) else "an" if name[0] in "AEIOaeiou" else "a"
-    return f"{kind} {name}"
 
 
 def _words(shape: tuple[int | str, ...]) -> str:

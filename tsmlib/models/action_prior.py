@@ -84,7 +84,8 @@ class ActionPrior(Configured):
         Returns:
             The untrained prior.
         """
-        robot, make = require_type("data", data, Trajectories).robot, cast(Callable[..., Self], cls)
+        require_type("data", data, Trajectories, "tsmlib.Trajectories")
+        robot, make = data.robot, cast(Callable[..., Self], cls)
         with weights_from(seed):
             prior = make(robot.action_dim, **options)
         prior.take_robot(data)

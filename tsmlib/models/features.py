@@ -73,10 +73,8 @@ class Features(nn.Module):
         varies = raw.amax(0) - raw.amin(0) > ROUNDING * raw.abs().amax(0)
         self.mean.copy_(raw.mean(0))
         self.std.copy_(raw.std(0).where(varies, 1.0))
-        steps = np.delete(states.diff(dim=0).numpy(), begins[1:] - 1, axis=0)
-        step_std, step_rms = (
-            torch.from_numpy(x) for x in (steps.std(0), (steps**2).mean(0) ** 0.5)
-        )
+        steps = torch.from_numpy(np.delete(states.diff(dim=0).numpy(), begins[1:] - 1, axis=0))
+        step_std, step_rms = steps.std(0), steps.square().mean(0).sqrt()
         step_std = step_std.where(step_std > 1e-3 * step_rms, step_rms)  # a clock's are alike
         edges = (edge.reduceat(states.numpy(), begins) for edge in (np.maximum, np.minimum))
         within = torch.from_numpy(np.subtract(*edges).max(0))

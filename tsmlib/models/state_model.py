@@ -40,7 +40,8 @@ class StateModel(Configured):
         Returns:
             The untrained model.
         """
-        robot, make = require_type("data", data, Trajectories).robot, cast(Callable[..., Self], cls)
+        require_type("data", data, Trajectories, "tsmlib.Trajectories")
+        robot, make = data.robot, cast(Callable[..., Self], cls)
         with weights_from(seed):
             model = make(robot.state_dim, robot.action_dim, angles=robot.angles, **options)
         model.take_robot(data)

@@ -14,7 +14,7 @@ from typing import Literal
 
 from torch import nn
 
-from tsmlib.checks import require_choice, require_seed, require_type
+from tsmlib.checks import require_choice, require_seed
 from tsmlib.models.base import require_robot
 from tsmlib.models.codes import CodeLayers, learned_codes
 from tsmlib.storage.files import PathLike
@@ -24,8 +24,7 @@ from tsmlib.training.fit import (
     Loss,
     TrainingHistory,
     TrainingOptions,
-    _require_model,
-    _split,
+    checked,
     fit,
     fixed_windows,
     validate,
@@ -76,9 +75,8 @@ def fine_tune(
         ValueError: the model was never trained, has other states or actions than the data, or lacks
             the part; and as of ``fit``.
     """
-    loss = _require_model(model, loss)
+    loss, train, validation, options = checked(model, data, validation, options, loss)
     require_choice("part", part, PARTS)
-    train, validation = _split(data, validation)
     if not getattr(getattr(model, "features", None), "fitted", True):
         raise ValueError(
             f"this {type(model).__name__} was never trained: it knows no statistics of its data. "
@@ -86,8 +84,6 @@ def fine_tune(
         )
     what = "the model and data of its robot, changed,"
     require_robot(model, train.robot, what, but=("env",))
-    options = require_type("options", options or TrainingOptions(), TrainingOptions)
-    options = options.for_model(model, train)
     first = {name: weight.detach().clone() for name, weight in model.state_dict().items()}
     held_out = fixed_windows(validation, options.past_len, options.future_len)
     before = validate(loss, held_out, require_seed("seed", seed))

@@ -7,111 +7,24 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.checks import (
-    require_callable,
-    require_count,
-    require_number,
-    require_seed,
-    require_type,
-)
+from tsmlib.checks import require_callable, require_count, require_seed, require_type
 from tsmlib.models.base import require_robot
 from tsmlib.storage.artifacts import trajectories_digest
-from tsmlib.storage.files import PathLike
+from tsmlib.storage.files import Json, PathLike
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import Curve, TrainingState, resumable
 from tsmlib.training.muon import Muon, matrices
+from tsmlib.training.options import TrainingOptions, schedule
 from tsmlib.trajectory import Trajectories, Window, batches, window_at
 
 Loss = Callable[[Window, torch.Generator], Tensor]
 CALL = "as in tsmlib.fit(model, data, validation, options, loss=model.loss)"
-
-
-@dataclass(frozen=True)
-class TrainingOptions:
-    """Windows and schedule of a training.
-
-    Args:
-        past_len: steps of a window's past; None, the model's own, and nothing else fits.
-        future_len: steps of a window's future; None for two segments of H steps, 20 of a model
-            without segments, and no more than the data have.
-        steps: updates.
-        batch_size: windows of an update.
-        lr: peak learning rate of Adam; its default (appendix A).
-        lr_final: learning rate at the end of the cosine schedule.
-        warmup: updates in which the learning rates rise from zero.
-        muon: peak learning rate of Muon for the weight matrices, beside Adam for all else; it
-            follows the schedule of lr. 0: Adam for everything.
-        weight_decay: of the matrices, decoupled, per unit of their learning rate.
-        span: the part of one schedule, from 0 to 1, that this training covers, where several follow
-            each other; it warms up where it begins at 0.
-        clip: largest norm of a gradient, since windows with contact have heavy tails; math.inf
-            never clips.
-        validate_every: updates from one validation to the next; a checkpoint is written as often.
-        patience: validations without improvement after which it stops early; 0: never.
-    """
-
-    past_len: int | None = None
-    future_len: int | None = None
-    steps: int = 2000
-    batch_size: int = 256
-    lr: float = 1e-3
-    lr_final: float = 1e-5
-    warmup: int = 100
-    muon: float = 0.0
-    weight_decay: float = 0.0
-    span: tuple[float, float] = (0.0, 1.0)
-    clip: float = 1.0
-    validate_every: int = 250
-    patience: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("past_len", "future_len", "steps", "batch_size", "validate_every"):
-            if (value := getattr(self, name)) is not None or name in ("steps", "batch_size"):
-                require_count(name, value)
-        for name in ("warmup", "patience"):
-            require_count(name, getattr(self, name), least=0)
-        for name in ("lr_final", "muon", "weight_decay"):
-            require_number(name, getattr(self, name), 0)
-        require_number("lr", self.lr, 0, above=True)
-        if self.clip != math.inf:
-            require_number("clip", self.clip, 0, above=True)
-        if not isinstance(self.span, tuple | list) or len(self.span) != 2:
-            raise TypeError(f"span is {self.span!r:.80}; expected two numbers, as in (0.0, 1.0)")
-        first, last = (require_number("span", value, 0, 1) for value in self.span)
-        if first >= last:
-            raise ValueError(f"span is {self.span}; expected the first number below the second")
-
-    def for_model(self, model: nn.Module, data: Trajectories) -> TrainingOptions:
-        """Fill in what is None.
-
-        Args:
-            model: whose ``past_len`` and segments the windows have.
-            data: training episodes, of which the longest holds the windows.
-
-        Returns:
-            Options with all numbers.
-
-        Raises:
-            ValueError: ``past_len`` is not the model's.
-        """
-        past_len = getattr(model, "past_len", self.past_len or 1)
-        if self.past_len not in (None, past_len):
-            raise ValueError(
-                f"past_len is {self.past_len}, but {type(model).__name__} is given {past_len} "
-                "steps of past in a rollout; leave it out, or take past_len=model.past_len"
-            )
-        future_len, segment = self.future_len, getattr(model, "code_len", None)
-        if future_len is None and segment is not None:
-            future_len = segment * max(1, min(2, data.horizon // segment))
-        elif future_len is None:
-            future_len = min(20, data.horizon)
-        return replace(self, past_len=past_len, future_len=future_len)
 
 
 @dataclass(repr=False)
@@ -130,8 +43,9 @@ class TrainingHistory(Curve):
 
     def __repr__(self) -> str:
         """Updates and validation losses, first to last."""
-        losses = [f"{loss:.4g}" for loss in self.validation[:: max(1, len(self.validation) - 1)]]
-        return f"TrainingHistory({max(self.step, default=0)} steps, validation loss {' to '.join(losses)})"
+        ends = self.validation[:: max(1, len(self.validation) - 1)]
+        losses = " to ".join(f"{loss:.4g}" for loss in ends)
+        return f"TrainingHistory({max(self.step, default=0)} steps, validation loss {losses})"
 
 
 @torch.enable_grad()  # an interrupt within torch.no_grad, in a notebook, may leave gradients off
@@ -177,12 +91,11 @@ def fit(
         TrainingStopped: a loss or a gradient that is not finite; the model has its best weights.
         StoreError: ``checkpoint`` is of another run, or another process writes it.
     """
-    loss = _require_model(model, loss)
-    train, validation = _split(data, validation)
-    own = require_type("options", options or TrainingOptions(), TrainingOptions, CALL)
-    seed, callback = require_seed("seed", seed), _optional("callback", callback)
+    loss, train, validation, o = checked(model, data, validation, options, loss)
     require_robot(model, train.robot, "the model and its training data")
-    o = own.for_model(model, train)
+    if callback is not None:
+        require_callable("callback", callback, "a function of a Progress")
+    require_seed("seed", seed)
     if hasattr(model, "take_robot"):
         model.take_robot(train)
     lengths = {"past_len": o.past_len, "future_len": o.future_len}
@@ -193,7 +106,9 @@ def fit(
     draw = batches(episodes, **lengths, batch_size=o.batch_size, generator=generator)
     keep_freed_memory()
     with _trained_on(device, model):
-        identity = asdict(o) | _identity(model, loss, train, validation, held_out, seed)
+        identity: dict[str, Json] = asdict(o)
+        if checkpoint is not None:
+            identity |= _identity(model, loss, train, validation, held_out, seed)
         state = TrainingState(
             model, optimizers(model, o), TrainingHistory(), o.steps, identity, checkpoint
         )
@@ -217,36 +132,34 @@ def fit(
     return state.curve
 
 
-def _require_model(model: object, loss: Loss | None) -> Loss:
-    """The loss of a model that can be trained."""
-    require_type("model", model, nn.Module, CALL)
-    if loss is None and not hasattr(model, "loss"):
-        raise TypeError(f"model is a {type(model).__name__}, which has no loss; give one, {CALL}")
+def checked(
+    model: nn.Module,
+    data: Trajectories,
+    validation: Trajectories | None,
+    options: TrainingOptions | None,
+    loss: Loss | None,
+) -> tuple[Loss, Trajectories, Trajectories, TrainingOptions]:
+    """Loss, training and held-out data and options, without what is None; see ``fit``."""
+    require_type("model", model, nn.Module, f"a model, {CALL}")
     if not any(weight.requires_grad for weight in model.parameters()):
         raise ValueError("model has no weight to train; expected one with requires_grad")
-    return require_callable("loss", model.loss if loss is None else loss, CALL)
-
-
-def _split(
-    data: Trajectories, validation: Trajectories | None
-) -> tuple[Trajectories, Trajectories]:
-    """Training and held-out data of one robot."""
-    require_type("data", data, Trajectories, CALL)
+    loss = getattr(model, "loss", None) if loss is None else loss
+    require_callable("loss", loss, f"a function (window, generator) -> scalar, {CALL}")
+    require_type("data", data, Trajectories, f"Trajectories, {CALL}")
     if validation is None:
-        return data.split(0.9)
-    require_type("validation", validation, Trajectories, CALL)
+        data, validation = data.split(0.9)
+    require_type("validation", validation, Trajectories, f"Trajectories, {CALL}")
     data.robot.require_same(validation.robot, "training and validation data")
-    return data, validation
-
-
-def _optional(name: str, value: Callback | None) -> Callback | None:
-    return value if value is None else require_callable(name, value, "called with a Progress")
+    options = TrainingOptions() if options is None else options
+    require_type("options", options, TrainingOptions, "tsmlib.TrainingOptions(...)")
+    return loss, data, validation, options.for_model(model, data)
 
 
 def require_device(device: object) -> str:
     """The name of a device that is there; ValueError otherwise."""
+    require_type("device", device, str, "'cpu' or 'cuda'")
     try:
-        torch.zeros(1, device=require_type("device", device, str))
+        torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device is {device!r:.80}; expected 'cpu' or 'cuda': {reason}") from error
@@ -260,7 +173,7 @@ def _identity(
     validation: Trajectories,
     held_out: Window,
     seed: int,
-) -> dict[str, object]:
+) -> dict[str, Json]:
     """What this run is, by values: the loss is known by what it gives for the first weights."""
     return {
         "seed": seed,
@@ -362,24 +275,6 @@ def _trained_on(device: str, model: nn.Module) -> Iterator[None]:
         model.to("cpu")
 
 
-def schedule(
-    step: int,
-    steps: int,
-    lr: float,
-    lr_final: float,
-    warmup: int,
-    span: tuple[float, float] = (0.0, 1.0),
-) -> float:
-    """Linear warm-up, then half a cosine from ``lr`` to ``lr_final``, or its part ``span``."""
-    first, last = span
-    warmup = 0 if first else warmup  # which the training before it had
-    if step < warmup:
-        return lr * (step + 1) / warmup
-    done, of = step - warmup, max(1, steps - warmup)
-    part = (first * of + (last - first) * done) / of
-    return lr_final + (lr - lr_final) * 0.5 * (1 + math.cos(math.pi * part))
-
-
 def fixed_windows(
     data: Trajectories, past_len: int, future_len: int, n_windows: int = 2000
 ) -> Window:
@@ -394,7 +289,7 @@ def fixed_windows(
     Returns:
         The windows, (B, L, .) and (B, K, .).
     """
-    require_type("data", data, Trajectories)
+    require_type("data", data, Trajectories, "tsmlib.Trajectories")
     for name, value in (("past_len", past_len), ("n_windows", n_windows)):
         require_count(name, value)
     counts = data.window_counts(require_count("future_len", future_len), "validation data")
