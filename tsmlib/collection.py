@@ -29,19 +29,21 @@ def collect(
     seed: Seeds = None,
     states: np.ndarray | None = None,
 ) -> Trajectories:
-    """Run one episode in each of ``env``'s N copies for ``horizon`` steps, or until the environment ends it.
+    """Run one episode in each of ``env``'s N copies for ``horizon`` steps, or until the environment
+    ends it.
 
-    env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations and actions. Actions
-    in [-1, 1] are scaled to the bounds of its action space. Episodes start from the environment's own distribution,
-    drawn from ``seed`` (a function of it and of i in episode i; where copies are reset one by one also a seed for
-    each), or, in an arm's, from ``states`` (N, dx).
-    UnsupportedEnvironment, naming what is supported, for anything else.
+    env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations
+    and actions. Actions in [-1, 1] are scaled to the bounds of its action space. Episodes start
+    from the environment's own distribution, drawn from ``seed`` (a function of it and of i in
+    episode i; where copies are reset one by one also a seed for each), or, in an arm's, from
+    ``states`` (N, dx). UnsupportedEnvironment, naming what is supported, for anything else.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
     if isinstance(controller, OpenLoop) and controller.actions.shape[1] < horizon:
         raise ValueError(
-            f"the actions are of {controller.actions.shape[1]} steps, those of an episode of {horizon} were expected; "
+            f"the actions are of {controller.actions.shape[1]} steps, those of an episode of "
+            f"{horizon} were expected; "
             f"give as many, or horizon={controller.actions.shape[1]}"
         )
     seed = int(seed) if isinstance(seed, np.integer) else seed
@@ -83,10 +85,12 @@ def collect_random(
     time_constant: float
     | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
 ) -> Trajectories:
-    """``episodes`` of smooth random actions in the environment of an id, a function of the arguments alone.
+    """``episodes`` of smooth random actions in the environment of an id, a function of the
+    arguments alone.
 
-    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds share starts:
-    give ``Task.from_env``, which begins at 1000 by default, a seed beyond these where there are more.
+    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds
+    share starts: give ``Task.from_env``, which begins at 1000 by default, a seed beyond these where
+    there are more.
     """
     seed = int(seed)  # of NumPy, say
     with closing(make_simulation(env_id, episodes)) as run:
@@ -114,7 +118,8 @@ def smooth_torques(
 ) -> Tensor:
     """Smooth random torques (section 5.1): white noise through two poles, (n, horizon, action_dim).
 
-    The filter starts at rest, so the first torques are small; they settle to a root mean square of ``rms``, clipped.
+    The filter starts at rest, so the first torques are small; they settle to a root mean square of
+    ``rms``, clipped.
     """
     if n < 1 or horizon < 1:
         raise ValueError(

@@ -1,7 +1,8 @@
-"""Base of both simulators: resets, rewards, and the Gymnasium interface. The state's layout is in ``geometry``.
+"""Base of both simulators: resets, rewards, and the Gymnasium interface. The state's layout is in
+``geometry``.
 
-Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A simulator subclasses `ArmVectorEnv` with
-its abstract methods. One arm, `ArmEnv`, is N = 1 of the same code.
+Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A simulator subclasses
+`ArmVectorEnv` with its abstract methods. One arm, `ArmEnv`, is N = 1 of the same code.
 """
 
 import dataclasses
@@ -26,13 +27,15 @@ Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
 
 
 class ArmVectorEnv(VectorEnv, ABC):
-    """N independent arms. Episodes are not reset on their own: ``truncated`` turns true after the last step.
+    """N independent arms. Episodes are not reset on their own: ``truncated`` turns true after the
+    last step.
 
-    ``reset(seed, options)``: ``options["states"]`` (N, dx) starts the episodes there, ``options["target"]`` (2,) or
-    (N, 2) sets the target. Without them, episode i is drawn from (seed, i) alone, so it does not depend on N.
+    ``reset(seed, options)``: ``options["states"]`` (N, dx) starts the episodes there,
+    ``options["target"]`` (2,) or (N, 2) sets the target. Without them, episode i is drawn from
+    (seed, i) alone, so it does not depend on N.
 
-    mass, damping, link_lengths, object_radius, torque_gain: those of `Physics`; ``env_id`` and Gymnasium's ``spec.id``
-    name the variant that they make.
+    mass, damping, link_lengths, object_radius, torque_gain: those of `Physics`; ``env_id`` and
+    Gymnasium's ``spec.id`` name the variant that they make.
     """
 
     metadata = {  # noqa: RUF012 - as Gymnasium declares it
@@ -87,13 +90,16 @@ class ArmVectorEnv(VectorEnv, ABC):
 
     @abstractmethod
     def _start(self, states: np.ndarray) -> None:
-        """Put the N episodes into ``states`` (N, dx); the fingertip in them already fits the angles."""
+        """Put the N episodes into ``states`` (N, dx); the fingertip in them already fits the
+        angles.
+        """
 
     @abstractmethod
     def _simulate(self, actions: np.ndarray) -> np.ndarray:
         """Advance by float64 ``actions`` (N, T, 2), finite and in [-1, 1], to states (N, T, dx).
 
-        Raises SimulationUnstable, ``step`` counted from the beginning of ``actions``; `rollout` adds those before.
+        Raises SimulationUnstable, ``step`` counted from the beginning of ``actions``; `rollout`
+        adds those before.
         """
 
     @abstractmethod
@@ -142,9 +148,11 @@ class ArmVectorEnv(VectorEnv, ABC):
         return states.copy(), {"target": target.copy()}
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
-        """Advance by ``actions`` (N, T, 2), clipped to [-1, 1], and give the states (N, T, dx) after each.
+        """Advance by ``actions`` (N, T, 2), clipped to [-1, 1], and give the states (N, T, dx)
+        after each.
 
-        Raises ValueError (nothing simulated) where an action is not finite, SimulationUnstable as its name says.
+        Raises ValueError (nothing simulated) where an action is not finite, SimulationUnstable as
+        its name says.
         """
         if self._elapsed is None:
             raise gymnasium.error.ResetNeeded(
@@ -173,7 +181,8 @@ class ArmVectorEnv(VectorEnv, ABC):
         if len(bad):
             episode, step, joint = bad[0]
             raise ValueError(
-                f"{len(bad)} action(s) for {self.env_id} are not finite, the first in episode {episode}, step {step}, "
+                f"{len(bad)} action(s) for {self.env_id} are not finite, the first in episode "
+                f"{episode}, step {step}, "
                 f"joint {joint}: {actions[episode, step, joint]}. Nothing was simulated."
             )
         return actions
@@ -181,7 +190,9 @@ class ArmVectorEnv(VectorEnv, ABC):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and the targets."""
+        """One step by actions (N, 2): states (N, dx), rewards (N,), terminated, truncated (N,) and
+        the targets.
+        """
         states = self.rollout(np.asarray(actions)[:, None])[:, 0]
         moved = states[:, 6:8] if self.task == "push" else states[:, 4:6]
         torque = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
@@ -196,7 +207,9 @@ class ArmVectorEnv(VectorEnv, ABC):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """One uint8 image (height, width, 3) per episode, or None without ``render_mode="rgb_array"``."""
+        """One uint8 image (height, width, 3) per episode, or None without
+        ``render_mode="rgb_array"``.
+        """
         if self.render_mode is None:
             return None
         return tuple(
@@ -221,7 +234,9 @@ class ArmVectorEnv(VectorEnv, ABC):
                 return with_block, target
 
     def _require_apart(self, states: np.ndarray) -> None:
-        """Raise where a start puts the block into the arm, from where a simulator would throw it out."""
+        """Raise where a start puts the block into the arm, from where a simulator would throw it
+        out.
+        """
         if self.task == "reach":
             return
         gap = closest_gap(states, self.env_id)
@@ -239,7 +254,8 @@ class ArmVectorEnv(VectorEnv, ABC):
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             raise ValueError(
-                f"reset option {name!r} of {self.env_id} is not finite in episode {bad[0][0]}: {array[bad[0][0]]}"
+                f"reset option {name!r} of {self.env_id} is not finite in episode {bad[0][0]}: "
+                f"{array[bad[0][0]]}"
             )
         return array
 
@@ -260,7 +276,9 @@ def _named(made: GymnasiumSpec | None, physics: Physics) -> GymnasiumSpec | None
 
 
 class ArmEnv(gymnasium.Env):
-    """One arm: the vector environment of the same id with N = 1, so single and bulk simulation agree bit for bit."""
+    """One arm: the vector environment of the same id with N = 1, so single and bulk simulation
+    agree bit for bit.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
     angles = (0, 1)

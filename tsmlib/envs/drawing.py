@@ -1,8 +1,10 @@
-"""Pictures of robots that are not arms, drawn from their observations with Pillow: nothing needs OpenGL or pygame.
+"""Pictures of robots that are not arms, drawn from their observations with Pillow: nothing needs
+OpenGL or pygame.
 
-A predicted rollout is a sequence of observations, of which an environment's own ``render`` knows nothing. Drawn are
-Pendulum-v1, and from the side the robots of MuJoCo that observe their positions, the first of which may be left out,
-and then their velocities: HalfCheetah, Hopper, Walker2d, InvertedPendulum.
+A predicted rollout is a sequence of observations, of which an environment's own ``render`` knows
+nothing. Drawn are Pendulum-v1, and from the side the robots of MuJoCo that observe their positions,
+the first of which may be left out, and then their velocities: HalfCheetah, Hopper, Walker2d,
+InvertedPendulum.
 """
 
 from __future__ import annotations
@@ -75,13 +77,16 @@ def drawable(env_id: str) -> bool:
 
 
 def frames(env_id: str, states: np.ndarray) -> np.ndarray:
-    """Pictures (T, height, width, 3) of observations (T, dx); ValueError of an environment that is not drawable."""
+    """Pictures (T, height, width, 3) of observations (T, dx); ValueError of an environment that is
+    not drawable.
+    """
     if env_id == "Pendulum-v1":
         return np.stack([_pendulum(state) for state in states])
     hidden = _hidden_positions(env_id)
     if hidden is None:
         raise ValueError(
-            f"{env_id} cannot be drawn from its observations; film it by its own render_mode='rgb_array'"
+            f"{env_id} cannot be drawn from its observations; film it by its own "
+            "render_mode='rgb_array'"
         )
     return _from_the_side(_robot(env_id), np.asarray(states, np.float64), hidden)
 
@@ -96,7 +101,9 @@ def _pendulum(state: np.ndarray) -> np.ndarray:
 
 
 def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
-    """hidden: how many of the first positions are not observed; they are summed up from their velocities."""
+    """hidden: how many of the first positions are not observed; they are summed up from their
+    velocities.
+    """
     import mujoco
 
     model, data = robot.model, mujoco.MjData(robot.model)
@@ -145,7 +152,9 @@ def _robot(env_id: str) -> Any:
 
 @cache
 def _hidden_positions(env_id: str) -> int | None:
-    """How many of the first positions an observation leaves out, 0 or 1; None: it is something else."""
+    """How many of the first positions an observation leaves out, 0 or 1; None: it is something
+    else.
+    """
     robot = _robot(env_id)
     if type(getattr(robot, "data", None)).__name__ != "MjData":
         return None

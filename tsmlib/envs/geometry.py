@@ -2,8 +2,8 @@
 
 State (float64, all in one horizontal plane):
 
-    joint angles (2, rad, not wrapped), joint velocities (2, rad/s), fingertip (2, m)
-    and with a block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
+    joint angles (2, rad, not wrapped), joint velocities (2, rad/s), fingertip (2, m) and with a
+    block: its position (2, m) and velocity (2, m/s; zero for the obstacle, which never moves)
 """
 
 import numpy as np
@@ -11,8 +11,9 @@ import numpy as np
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 
-# The arm is Gymnasium's Reacher; a test compares these lengths with its model (m). What can differ in a variant is
-# that of the standard arm here; ``EnvSpec.parse(env_id).physics`` knows it of every arm.
+# The arm is Gymnasium's Reacher; a test compares these lengths with its model (m). What can differ
+# in a variant is that of the standard arm here; ``EnvSpec.parse(env_id).physics`` knows it of every
+# arm.
 LINK_LENGTHS = Physics.link_lengths  # shoulder to elbow, elbow to centre of the fingertip
 LINK1_CAPSULE = 0.1  # the second link's capsule ends before the fingertip's sphere begins
 ARM_RADIUS = 0.01  # links and fingertip alike
@@ -78,7 +79,9 @@ HALF_RANGE = (
 def arm_points(
     angles: np.ndarray, lengths: tuple[float, float] = LINK_LENGTHS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Forward kinematics: angles (..., 2) to elbow, end of the second capsule, and fingertip (each (..., 2), m)."""
+    """Forward kinematics: angles (..., 2) to elbow, end of the second capsule, and fingertip (each
+    (..., 2), m).
+    """
     shoulder, reach = angles[..., 0], angles[..., 0] + angles[..., 1]
     elbow = lengths[0] * np.stack([np.cos(shoulder), np.sin(shoulder)], axis=-1)
     direction = np.stack([np.cos(reach), np.sin(reach)], axis=-1)
@@ -106,7 +109,9 @@ def room(physics: Physics) -> float:
 
 
 def target_ring(spec: EnvSpec) -> tuple[float, float]:
-    """Radii between which targets are drawn, m: those of the task, as far as this arm and its object can get."""
+    """Radii between which targets are drawn, m: those of the task, as far as this arm and its
+    object can get.
+    """
     inner, outer = TARGET_RING[spec.task]
     inner, reach = max(inner, hole(spec.physics)), sum(spec.physics.link_lengths)
     return inner, min(outer, reach, room(spec.physics)) if spec.task == "push" else min(
@@ -115,7 +120,8 @@ def target_ring(spec: EnvSpec) -> tuple[float, float]:
 
 
 def hole(physics: Physics) -> float:
-    """Radius around the shoulder within which the fingertip has no target, m: of where it does not get, less 1 cm.
+    """Radius around the shoulder within which the fingertip has no target, m: of where it does not
+    get, less 1 cm.
 
     The standard arm's 1 cm are part of its task.
     """
@@ -130,9 +136,11 @@ def block_ring(spec: EnvSpec) -> tuple[float, float]:
 
 
 def closest_gap(states: np.ndarray, env_id: str) -> np.ndarray:
-    """Signed distance (...) between the arm's surface and the block's, in metres, of states (..., 10).
+    """Signed distance (...) between the arm's surface and the block's, in metres, of states (...,
+    10).
 
-    Negative where they penetrate. The same geometry for both simulators. ValueError where there is no block.
+    Negative where they penetrate. The same geometry for both simulators. ValueError where there is
+    no block.
     """
     spec = EnvSpec.parse(env_id)
     if not spec.has_block:

@@ -1,11 +1,13 @@
 """The arm in MuJoCo: Gymnasium's own Reacher, and the variants with a block edited from it.
 
-The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions, velocities and time
-are the whole state (no automatic reset, no warm start of the constraint solver). ``mujoco.rollout`` simulates all
-episodes in C++ threads; memory is bounded by passing it a few hundred episodes at a time. It stops an episode at
-MuJoCo's first warning, which its clock then shows.
+The basic arm is the file that Gymnasium ships; only two option flags are set, so that positions,
+velocities and time are the whole state (no automatic reset, no warm start of the constraint
+solver). ``mujoco.rollout`` simulates all episodes in C++ threads; memory is bounded by passing it a
+few hundred episodes at a time. It stops an episode at MuJoCo's first warning, which its clock then
+shows.
 
-Contacts have no friction: torques of 200 N m are so strong that friction would wedge the arm against the obstacle.
+Contacts have no friction: torques of 200 N m are so strong that friction would wedge the arm
+against the obstacle.
 """
 
 import hashlib
@@ -91,7 +93,9 @@ def load_model(env_id: str) -> mujoco.MjModel:
 
 @cache
 def physics_hash(env_id: str) -> str:
-    """SHA-256 of the numbers that decide how an environment moves, as compiled; the same on every machine."""
+    """SHA-256 of the numbers that decide how an environment moves, as compiled; the same on every
+    machine.
+    """
     model = load_model(env_id)
     found = hashlib.sha256(
         repr((model.opt.timestep, int(model.opt.integrator), model.opt.disableflags)).encode()
@@ -142,11 +146,13 @@ def _change_arm(spec: mujoco.MjSpec, physics: Physics) -> None:
 
 
 def _add_block(spec: mujoco.MjSpec, physics: Physics, *, moving: bool) -> None:
-    """A disc among the arm's links: on two damped slides between four walls, or fixed at its mocap position.
+    """A disc among the arm's links: on two damped slides between four walls, or fixed at its mocap
+    position.
 
-    It collides as a sphere centred in the arm's plane, where sphere and disc are the same and contacts are exact, and
-    is drawn as a cylinder. It cannot leave the plane, and walls are half spaces, so nothing passes them.
-    No friction (condim 1), its parameters rule over the links' (priority 1), and group 3 is not drawn.
+    It collides as a sphere centred in the arm's plane, where sphere and disc are the same and
+    contacts are exact, and is drawn as a cylinder. It cannot leave the plane, and walls are half
+    spaces, so nothing passes them. No friction (condim 1), its parameters rule over the links'
+    (priority 1), and group 3 is not drawn.
     """
     block = spec.worldbody.add_body(name="block", pos=[0.0, 0.0, PLANE], mocap=not moving)
     block.add_geom(
@@ -275,9 +281,11 @@ class MujocoArm(ArmVectorEnv):
     def _advance(
         self, start: np.ndarray, obstacle: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps; whether the last one warned (n,).
+        """MuJoCo states (n, T, ...) after each of T steps of ``frame_skip`` substeps; whether the
+        last one warned (n,).
 
-        One more substep is taken and forgotten: an episode that stands still in it had a warning in the one before.
+        One more substep is taken and forgotten: an episode that stands still in it had a warning in
+        the one before.
         """
         control = np.repeat(actions, self.frame_skip, axis=1)
         control = np.concatenate([control, control[:, -1:]], axis=1)
@@ -308,7 +316,9 @@ class MujocoArm(ArmVectorEnv):
         return np.concatenate(parts, axis=-1)
 
     def _warning(self, episode: int, actions: np.ndarray) -> str:
-        """What MuJoCo warns of when an episode is stepped again from where this call began, one substep at a time."""
+        """What MuJoCo warns of when an episode is stepped again from where this call began, one
+        substep at a time.
+        """
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(
             self.model, data, self._physics[episode], mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -331,7 +341,9 @@ class MujocoArm(ArmVectorEnv):
         first: int,
         warned: np.ndarray | bool = False,
     ) -> None:
-        """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond `MAX_SPEED`."""
+        """Raise where MuJoCo stopped, gave numbers that are not finite, or speeds beyond
+        `MAX_SPEED`.
+        """
         nq = self.model.nq
         clock = start_time[:, None] + DT * np.arange(1, physics.shape[1] + 1)
         stopped = np.abs(physics[..., 0] - clock) > self.model.opt.timestep / 2
@@ -355,7 +367,8 @@ class MujocoArm(ArmVectorEnv):
         return np.concatenate([self._physics, self._obstacle, self.target], axis=1)
 
     def set_state(self, snapshot: np.ndarray) -> None:
-        """Continue from `get_state`, of this or another environment of the same id and N; bit for bit.
+        """Continue from `get_state`, of this or another environment of the same id and N; bit for
+        bit.
 
         Targets and the limit of time are those of the snapshot too.
         """

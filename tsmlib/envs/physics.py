@@ -1,4 +1,6 @@
-"""Physical quantities in which variants of the arm differ: standard values, allowed ranges, and spelling in an id."""
+"""Physical quantities in which variants of the arm differ: standard values, allowed ranges, and
+spelling in an id.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,13 @@ class Changes(TypedDict, total=False):
 class Physics:
     """What can differ between two arms of the same task; the defaults are the standard arm's.
 
-    mass: of the object that is pushed, kg. Its drag stays 20 N s/m, so a heavier object slides further.
+    mass: of the object that is pushed, kg. Its drag stays 20 N s/m, so a heavier object slides
+    further.
     damping: viscous damping of both joints, N m s/rad.
     link_lengths: from shoulder to elbow, and from there to the centre of the fingertip, m.
     object_radius: of the object or obstacle, m.
-    torque_gain: factor on the 200 N m that an action of 1 stands for.
-    ValueError where a value is out of its range, within which bodies do not pass through each other.
+    torque_gain: factor on the 200 N m that an action of 1 stands for. ValueError where a value is
+    out of its range, within which bodies do not pass through each other.
     """
 
     mass: float = 1.0
@@ -41,13 +44,15 @@ class Physics:
             (value,) = _numbers(name, (getattr(self, name),), "a number")
             if not low <= value <= high:
                 raise ValueError(
-                    f"{name} is {value:g}{unit}; expected {low:g} to {high:g}{unit} ({_usual(name)})"
+                    f"{name} is {value:g}{unit}; expected {low:g} to {high:g}{unit} "
+                    f"({_usual(name)})"
                 )
             object.__setattr__(self, name, value)
         lengths = _numbers("link_lengths", self.link_lengths, "two numbers")
         if len(lengths) != 2 or min(lengths) < SHORTEST or sum(lengths) > LONGEST + 1e-9:
             raise ValueError(
-                f"link_lengths are {lengths} m; expected two lengths of at least {SHORTEST:g} m, together at most "
+                f"link_lengths are {lengths} m; expected two lengths of at least {SHORTEST:g} m, "
+                "together at most "
                 f"{LONGEST:g} m, where the walls are ({_usual('link_lengths')})"
             )
         object.__setattr__(self, "link_lengths", lengths)
@@ -64,12 +69,16 @@ class Physics:
 
     @property
     def word(self) -> str:
-        """The changed values as they stand in an id: ``"-mass2-links0.12x0.11"``; '' for the standard arm."""
+        """The changed values as they stand in an id: ``"-mass2-links0.12x0.11"``; '' for the
+        standard arm.
+        """
         return "".join(f"-{_WORDS[name]}{_spelled(value)}" for name, value in self.changed.items())
 
     @property
     def label(self) -> str:
-        """The changed values as a figure names them: ``"mass × 2, upper link × 1.2"``; '' for the standard arm."""
+        """The changed values as a figure names them: ``"mass × 2, upper link × 1.2"``; '' for the
+        standard arm.
+        """
         found = list[str]()
         for name, value in self.changed.items():
             both = zip(_LABELS[name], _several(value), _several(STANDARD[name]), strict=True)

@@ -1,12 +1,16 @@
-"""The arm in pymunk (Chipmunk): the same interface and geometry as the MuJoCo arm, and a second opinion on its physics.
+"""The arm in pymunk (Chipmunk): the same interface and geometry as the MuJoCo arm, and a second
+opinion on its physics.
 
-Two links turn in the plane. With torques tau and viscous joint damping d, away from contacts and the elbow's limit,
+Two links turn in the plane. With torques tau and viscous joint damping d, away from contacts and
+the elbow's limit,
 
-    (I + m l^2) dw_1 = tau_0 - tau_1 - d q'_0 + d q'_1        I dw_2 = tau_1 - d q'_1        q' = (w_1, w_2 - w_1)
+    (I + m l^2) dw_1 = tau_0 - tau_1 - d q'_0 + d q'_1        I dw_2 = tau_1 - d q'_1        q' =
+    (w_1, w_2 - w_1)
 
-where w are the links' speeds in the world, I and d are the armature and damping of Gymnasium's Reacher, and m is the
-second link's mass, which sits in the elbow at distance l from the shoulder. (In MuJoCo the armature is a rotor in each
-joint, so a torque at the elbow does not turn the first link there. Here it does.)
+where w are the links' speeds in the world, I and d are the armature and damping of Gymnasium's
+Reacher, and m is the second link's mass, which sits in the elbow at distance l from the shoulder.
+(In MuJoCo the armature is a rotor in each joint, so a torque at the elbow does not turn the first
+link there. Here it does.)
 """
 
 from __future__ import annotations
@@ -57,7 +61,8 @@ def physics_hash(env_id: str) -> str:
     """SHA-256 of the numbers that decide how an environment moves; the same on every machine."""
     arm = EnvSpec.parse(env_id)
     lengths, physics = arm.physics.link_lengths, arm.physics
-    # Nothing slides and there are no walls but on push; the others keep the numbers that their files were made with.
+    # Nothing slides and there are no walls but on push; the others keep the numbers that their
+    # files were made with.
     decay, wall = (geometry.slide_time(physics), WALL) if arm.task == "push" else (0.2, 0.28)
     numbers = (
         env_id,
@@ -86,9 +91,11 @@ def physics_hash(env_id: str) -> str:
 
 
 class PymunkArm(ArmVectorEnv):
-    """N arms in N pymunk spaces, built anew at every reset, so that an episode is a function of its start and actions.
+    """N arms in N pymunk spaces, built anew at every reset, so that an episode is a function of its
+    start and actions.
 
-    One space is a few microseconds of C per substep, so the episodes are simulated one after another.
+    One space is a few microseconds of C per substep, so the episodes are simulated one after
+    another.
     """
 
     def _start(self, states: np.ndarray) -> None:
@@ -127,10 +134,14 @@ class PymunkArm(ArmVectorEnv):
         return episode
 
     def get_state(self) -> np.ndarray:
-        """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot would be complete."""
+        """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot
+        would be complete.
+        """
         raise RuntimeError(
-            f"{self.env_id}: pymunk cannot restore an episode in the middle, because the cached contact impulses are "
-            "not accessible. Replay instead: reset(options={'states': <its first states>}) and rollout the same "
+            f"{self.env_id}: pymunk cannot restore an episode in the middle, because the cached "
+            "contact impulses are "
+            "not accessible. Replay instead: reset(options={'states': <its first states>}) and "
+            "rollout the same "
             "actions, which gives the same numbers bit for bit."
         )
 

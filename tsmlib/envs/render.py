@@ -12,7 +12,8 @@ from tsmlib.envs.spec import EnvSpec
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, distinct for colour-blind readers; link 2 and the block differ in lightness as well.
+# Okabe and Ito's colours, distinct for colour-blind readers; link 2 and the block differ in
+# lightness as well.
 LINK1, LINK2, TIP, BLOCK, TARGET = "#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00"
 INK, STEEL, FRAME, FLOOR = "#22303C", "#7B8794", "#D5DAE0", "#FAFAF8"
 EXTENT = WALL + 0.025  # m, half width of the picture
@@ -31,9 +32,10 @@ def draw_scene(
 ) -> None:
     """Draw one state (dx,) of ``env_id`` into ``ax``, seen from above, in metres.
 
-    target (2,): where the fingertip, or on push the block, should go. tip_path, block_path (T, 2): where they went.
-    alpha fades arm and block and ``background=False`` leaves out floor and walls, to lay several poses over another.
-    ValueError where the state's size does not fit the environment.
+    target (2,): where the fingertip, or on push the block, should go. tip_path, block_path (T, 2):
+    where they went. alpha fades arm and block and ``background=False`` leaves out floor and walls,
+    to lay several poses over another. ValueError where the state's size does not fit the
+    environment.
     """
     from matplotlib.patches import Circle, Rectangle
 

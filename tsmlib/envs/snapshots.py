@@ -1,13 +1,14 @@
-"""What would follow in a foreign environment: snapshots of its state, where these are the whole of it.
+"""What would follow in a foreign environment: snapshots of its state, where these are the whole of
+it.
 
-They are where every attribute is a plain value (numbers, texts, arrays, random generators, and lists of these) or
-MuJoCo's own data, or where the environment offers two methods of its own:
+They are where every attribute is a plain value (numbers, texts, arrays, random generators, and
+lists of these) or MuJoCo's own data, or where the environment offers two methods of its own:
 
     save_state() -> object           everything that the future depends on
     restore_state(object) -> None    the environment as it was then
 
-Elsewhere the refusal names the attribute. What is played from a snapshot is held against a copy that was stepped from
-its seed, and refused where it differs.
+Elsewhere the refusal names the attribute. What is played from a snapshot is held against a copy
+that was stepped from its seed, and refused where it differs.
 """
 
 from __future__ import annotations
@@ -126,7 +127,9 @@ def restore(env: gymnasium.Env, state: list[Any]) -> None:
 
 
 def _copied(state: list[Any]) -> list[Any]:
-    """A copy in which the same object stays the same; what never changes, and copies of data, are kept."""
+    """A copy in which the same object stays the same; what never changes, and copies of data, are
+    kept.
+    """
     memo: dict[int, Any] = {}
     for values in state:
         for value in values.values() if isinstance(values, dict) else ():
@@ -187,8 +190,10 @@ class Oracle:
                         i, t, d = np.argwhere(apart)[0]
                         raise _no_oracle(
                             self.id,
-                            f"the same seed and actions do not repeat it: {self.run.names[d]} of episode {i} after "
-                            f"{t + 1} steps is {states[-1, i, t, d]:g} from its snapshot, and {again[i, t, d]:g}",
+                            f"the same seed and actions do not repeat it: {self.run.names[d]} of "
+                            f"episode {i} after "
+                            f"{t + 1} steps is {states[-1, i, t, d]:g} from its snapshot, and "
+                            f"{again[i, t, d]:g}",
                         )
             self.checked = True
         return states
@@ -222,6 +227,8 @@ def _models(env: gymnasium.Env) -> list[bytes]:
 
 def _no_oracle(env_id: str, why: str) -> UnsupportedEnvironment:
     return UnsupportedEnvironment(
-        f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, tsmlib.model_predictor; or give "
-        "the environment the methods save_state() and restore_state(state), which hold all that its future depends on"
+        f"{env_id} has no oracle and no replay: {why}. Plan through a model instead, "
+        "tsmlib.model_predictor; or give "
+        "the environment the methods save_state() and restore_state(state), which hold all that "
+        "its future depends on"
     )

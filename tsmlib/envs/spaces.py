@@ -1,15 +1,16 @@
-"""The border to environments that are not ours: what they are called, hand out, take, and say of themselves.
+"""The border to environments that are not ours: what they are called, hand out, take, and say of
+themselves.
 
-An observation is copied and cast to float64 when it arrives, once; data sets hold float32 (`collect`). Observations
-that are Boxes, or Dicts and Tuples of them, are flattened into states (dx,). Actions are (du,) in [-1, 1] here and
-scaled to the bounds of the action space when they leave.
+An observation is copied and cast to float64 when it arrives, once; data sets hold float32
+(`collect`). Observations that are Boxes, or Dicts and Tuples of them, are flattened into states
+(dx,). Actions are (du,) in [-1, 1] here and scaled to the bounds of the action space when they
+leave.
 """
 
 from __future__ import annotations
 
 import ast
 import importlib
-import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -35,7 +36,8 @@ class UnsupportedEnvironment(ValueError):
     """An environment that cannot do what was asked of it; the message says what it would take."""
 
 
-# Names ----------------------------------------------------------------------------------------------------------------
+# Names
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def find_spec(env_id: str) -> GymnasiumSpec:
@@ -50,9 +52,11 @@ def find_spec(env_id: str) -> GymnasiumSpec:
     """
     if "+" in env_id or env_id.endswith("(copies differ)"):
         raise UnsupportedEnvironment(
-            f"{env_id} cannot be made from its id: its data came from wrapped copies, or from copies "
+            f"{env_id} cannot be made from its id: its data came from wrapped copies, or from "
+            "copies "
             "made with different arguments. Give the robot an id of its own: gymnasium.register("
-            "'Mine-v0', entry_point, kwargs={...}, additional_wrappers=(Wrapper.wrapper_spec(...),))"
+            "'Mine-v0', entry_point, kwargs={...}, "
+            "additional_wrappers=(Wrapper.wrapper_spec(...),))"
         )
     name, bracket, given = env_id.partition("(")
     module, colon, plain = name.partition(":")
@@ -73,14 +77,16 @@ def find_spec(env_id: str) -> GymnasiumSpec:
         arguments = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise UnsupportedEnvironment(
-            f"the arguments of {env_id!r} cannot be read; expected numbers, texts, lists and the like "
+            f"the arguments of {env_id!r} cannot be read; expected numbers, texts, lists and the "
+            "like "
             "by name, as in 'Pendulum-v1(g=1.0)'"
         ) from error
     return replace(spec, kwargs={**spec.kwargs, **arguments})
 
 
 def environment_id(env: gymnasium.Env) -> str:
-    """The id of an environment with the arguments and wrappers in which it differs from the registered one.
+    """The id of an environment with the arguments and wrappers in which it differs from the
+    registered one.
 
     UnsupportedEnvironment where an id cannot carry an argument.
     """
@@ -142,15 +148,18 @@ def _arguments(
         word = _literal(value)
         if word is None and strict:
             raise UnsupportedEnvironment(
-                f"argument {name} of {env_id} is {value!r:.80}, which no id can carry, so its data could not be "
-                "told from another robot's; register it by itself: gymnasium.register('Mine-v0', entry_point, "
+                f"argument {name} of {env_id} is {value!r:.80}, which no id can carry, so its data "
+                "could not be "
+                "told from another robot's; register it by itself: gymnasium.register('Mine-v0', "
+                "entry_point, "
                 f"kwargs={{{name!r}: ...}})"
             )
         words.append(f"{name}={word or type(value).__name__}")
     text = ", ".join(words)
     if len(text) > LONGEST and strict:
         raise UnsupportedEnvironment(
-            f"the arguments of {env_id} are longer than an id can carry, {text:.80}...; register it by itself: "
+            f"the arguments of {env_id} are longer than an id can carry, {text:.80}...; register "
+            "it by itself: "
             "gymnasium.register('Mine-v0', entry_point, kwargs={...})"
         )
     return f"({text})" if text else ""
@@ -184,7 +193,8 @@ def layers(env: Any) -> Iterator[Any]:
     yield env
 
 
-# Observations ---------------------------------------------------------------------------------------------------------
+# Observations
+# ---------------------------------------------------------------------------------------------------------
 
 
 def state_names(env_id: str, space: Space) -> tuple[str, ...]:
@@ -208,8 +218,10 @@ def _names(env_id: str, space: Space, name: str) -> Iterator[str]:
     elif not isinstance(space, Box) or (space.dtype == np.uint8 and len(space.shape) > 1):
         kind = "images" if isinstance(space, Box) else f"a {type(space).__name__}"
         raise UnsupportedEnvironment(
-            f"observations of {env_id} are {kind}, {space!s:.100}{name and f', in {name!r}'}; {SUPPORTED}. Wrap it "
-            "in gymnasium.wrappers.TransformObservation, or FilterObservation, that gives its features"
+            f"observations of {env_id} are {kind}, {space!s:.100}{name and f', in {name!r}'}; "
+            f"{SUPPORTED}. Wrap it "
+            "in gymnasium.wrappers.TransformObservation, or FilterObservation, that gives its "
+            "features"
         )
     elif not name:
         yield from (f"x{i}" for i in range(int(np.prod(space.shape))))
@@ -221,7 +233,9 @@ def _names(env_id: str, space: Space, name: str) -> Iterator[str]:
 
 
 def flat(env_id: str, space: Space, observation: Any) -> np.ndarray:
-    """A copy (dx,) of an observation as float64. UnsupportedEnvironment where it is not of its space."""
+    """A copy (dx,) of an observation as float64. UnsupportedEnvironment where it is not of its
+    space.
+    """
     values = np.concatenate(list(_values(env_id, space, observation, "")))
     return values.astype(np.float64)
 
@@ -249,16 +263,20 @@ def _values(env_id: str, space: Any, value: Any, name: str) -> Iterator[np.ndarr
 
 def _changed(env_id: str, name: str, found: str, expected: str) -> UnsupportedEnvironment:
     return UnsupportedEnvironment(
-        f"{env_id} gave an observation{name and f' {name!r}'} {found}, but says that they are {expected}: correct its "
+        f"{env_id} gave an observation{name and f' {name!r}'} {found}, but says that they are "
+        f"{expected}: correct its "
         "observation_space, or what its reset and step return"
     )
 
 
-# Actions --------------------------------------------------------------------------------------------------------------
+# Actions
+# --------------------------------------------------------------------------------------------------------------
 
 
 def require_actions(env_id: str, space: Space) -> Box:
-    """The action space where it is a Box with bounds; UnsupportedEnvironment that says what to do otherwise."""
+    """The action space where it is a Box with bounds; UnsupportedEnvironment that says what to do
+    otherwise.
+    """
     if not isinstance(space, Box) or space.dtype is None or space.dtype.kind != "f":
         kind = f"of type {space.dtype}" if isinstance(space, Box) else f"a {type(space).__name__}"
         kind = "discrete" if "Discrete" in kind or "Binary" in kind else kind
@@ -266,14 +284,17 @@ def require_actions(env_id: str, space: Space) -> Box:
     bounds = np.abs([space.low, space.high]).astype(np.float64)
     if not bounds.size or not (bounds <= FARTHEST).all():
         raise UnsupportedEnvironment(
-            f"actions of {env_id} have no bounds, {space!s:.100}; {SUPPORTED}. Give it those that you mean: "
+            f"actions of {env_id} have no bounds, {space!s:.100}; {SUPPORTED}. Give it those that "
+            "you mean: "
             "gymnasium.wrappers.TransformAction(env, lambda u: u, gymnasium.spaces.Box(low, high))"
         )
     return space
 
 
 def within_bounds(actions: np.ndarray, space: Box) -> np.ndarray:
-    """Actions (..., du) in [-1, 1], scaled to the bounds of ``space``: (..., *space.shape) in its type."""
+    """Actions (..., du) in [-1, 1], scaled to the bounds of ``space``: (..., *space.shape) in its
+    type.
+    """
     low, high = (side.astype(np.float64).reshape(-1) for side in (space.low, space.high))
     scaled = (low + high) / 2 + (high - low) / 2 * np.clip(np.asarray(actions, np.float64), -1, 1)
     scaled = scaled.astype(space.dtype).reshape(*scaled.shape[:-1], *space.shape)
@@ -281,21 +302,26 @@ def within_bounds(actions: np.ndarray, space: Box) -> np.ndarray:
 
 
 def idle_action(space: Box) -> np.ndarray:
-    """The action (du,) in [-1, 1] that is zero in the environment's own units, or its bound nearest to zero."""
+    """The action (du,) in [-1, 1] that is zero in the environment's own units, or its bound nearest
+    to zero.
+    """
     low, high = (side.astype(np.float64).reshape(-1) for side in (space.low, space.high))
     half = (high - low) / 2
     idle = np.divide(-(low + high) / 2, half, out=np.zeros_like(half), where=half > 0)
     return np.clip(idle, -1, 1).astype(np.float32)
 
 
-# What an environment says of itself -----------------------------------------------------------------------------------
+# What an environment says of itself
+# -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Description:
-    """A robot: its id with arguments, seconds per step, and one name and unit per dimension of its state.
+    """A robot: its id with arguments, seconds per step, and one name and unit per dimension of its
+    state.
 
-    angles: dimensions that are angles in radians. observations, actions: its spaces. idle (du,): no action.
+    angles: dimensions that are angles in radians. observations, actions: its spaces. idle (du,): no
+    action.
     """
 
     id: str
@@ -311,8 +337,8 @@ class Description:
 def describe(env_id: str, env: Any, observations: Space, actions: Space) -> Description:
     """The robot of ``env``, an environment with its wrappers.
 
-    names, units, angles and dt are taken from attributes of these names, the outermost layer first, where they are
-    what they are called: texts, one per dimension; whole numbers below dx; seconds.
+    names, units, angles and dt are taken from attributes of these names, the outermost layer first,
+    where they are what they are called: texts, one per dimension; whole numbers below dx; seconds.
     """
     names = state_names(env_id, observations)
     box = require_actions(env_id, actions)
@@ -348,7 +374,8 @@ def _dt(env_id: str, dt: Any, fps: Any) -> float:
         if number and 0 < seconds < np.inf:
             return float(seconds)
     warnings.warn(
-        f"{env_id} does not say how long a step is; one step counts as one second. Give it an attribute dt",
+        f"{env_id} does not say how long a step is; one step counts as one second. Give it an "
+        "attribute dt",
         stacklevel=5,
     )
     return 1.0

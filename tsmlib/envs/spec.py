@@ -1,7 +1,8 @@
-"""Environment ids, and what each says: simulator, task, physics, noise and delay. The version is the task's.
+"""Environment ids, and what each says: simulator, task, physics, noise and delay. The version is
+the task's.
 
-Gymnasium knows the six standard arms, and each with the paper's noise or delay. Another one is registered when its id
-is first parsed, so that data and models bring their environment with them.
+Gymnasium knows the six standard arms, and each with the paper's noise or delay. Another one is
+registered when its id is first parsed, so that data and models bring their environment with them.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ _CHANGED = {
 
 @dataclass(frozen=True)
 class EnvSpec:
-    """One environment: an arm in a simulator, with a task, noisy sensors (sigma) and delayed actions (steps)."""
+    """One environment: an arm in a simulator, with a task, noisy sensors (sigma) and delayed
+    actions (steps).
+    """
 
     simulator: Simulator
     task: TaskName
@@ -70,7 +73,9 @@ class EnvSpec:
         return spec
 
     def varied(self, **changes: Unpack[Changes]) -> EnvSpec:
-        """The same environment with other physics. ValueError where a value, or it in this task, makes no sense."""
+        """The same environment with other physics. ValueError where a value, or it in this task,
+        makes no sense.
+        """
         allowed = [name for name in STANDARD if name not in _NOTHING_TO_CHANGE[self.task]]
         if refused := [name for name in changes if name not in allowed]:
             why = _NOTHING_TO_CHANGE[self.task].get(refused[0], "there is no such quantity")
@@ -81,7 +86,9 @@ class EnvSpec:
 
     @property
     def name(self) -> str:
-        """Name in folders and titles: ``"ReacherPush"``, ``"ReacherPush-mass2"``, ``"Reacher-delay5"``."""
+        """Name in folders and titles: ``"ReacherPush"``, ``"ReacherPush-mass2"``,
+        ``"Reacher-delay5"``.
+        """
         noise, delay = (
             f"-noise{self.noise:g}" if self.noise else "",
             f"-delay{self.delay}" if self.delay else "",
@@ -121,7 +128,9 @@ _VECTOR_ARMS = {
 
 
 def _register(spec: EnvSpec) -> None:
-    """Make an environment known to Gymnasium. A simulator is imported when an arm in it is first made."""
+    """Make an environment known to Gymnasium. A simulator is imported when an arm in it is first
+    made.
+    """
     if spec.id in registry:
         return
     made_by = ("tsmlib.envs.arm:ArmEnv", _VECTOR_ARMS[spec.simulator])
@@ -163,7 +172,9 @@ def gone(env_id: str) -> str:
 
 
 def _parts(env_id: str) -> tuple[str, tuple[str | None, ...], str | None, str | None, str]:
-    """Arm, changed physics, noise, delay and version as they stand in an id; empty where it is none."""
+    """Arm, changed physics, noise, delay and version as they stand in an id; empty where it is
+    none.
+    """
     parts = re.fullmatch(
         rf"(.*?){physics.PATTERN}(?:-noise([0-9.]+))?(?:-delay([0-9]+))?-v([0-9]+)", env_id
     )

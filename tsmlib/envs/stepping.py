@@ -1,7 +1,8 @@
 """Episodes of any environment: our arms in bulk, any other one stepped, N copies for N episodes.
 
-No copy is shared between episodes. An observation is not a state, so an episode begins by the seed of a reset. One that
-ended is not stepped any further: its last state repeats. What reset and step return is copied (``spaces``).
+No copy is shared between episodes. An observation is not a state, so an episode begins by the seed
+of a reset. One that ended is not stepped any further: its last state repeats. What reset and step
+return is copied (``spaces``).
 
 Letters in shapes: N episodes, T steps, dx size of a state, du of an action.
 """
@@ -16,7 +17,7 @@ from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from tsmlib.checks import require_count
@@ -132,7 +133,8 @@ def copies(env_id: str, n: int) -> list[gymnasium.Env]:
 
 
 def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
-    """The environment of an id, which may carry arguments; ``render_mode`` only where it is asked for.
+    """The environment of an id, which may carry arguments; ``render_mode`` only where it is asked
+    for.
 
     What MuJoCo has to say of Gymnasium's own robots, whose files are old, is left out.
     """
@@ -176,7 +178,7 @@ class _Episodes:
 
     def __init__(self, robot: Description, n: int, another: Callable[[], Any] | None) -> None:
         self.robot, self.num_envs, self.another = robot, n, another
-        self.id, self.dt, self.idle = robot.id, robot.dt, robot.idle
+        self.id, self.dt, self.idle, self.actions = robot.id, robot.dt, robot.idle, robot.actions
         self.names, self.units, self.angles = robot.names, robot.units, robot.angles
         self.action_dim = len(robot.idle)
         self._begin([np.zeros(len(robot.names))] * n)
@@ -192,7 +194,8 @@ class _Episodes:
     def _seeds(self, seed: Seeds, states: np.ndarray | None) -> list[int]:
         if states is not None:
             raise UnsupportedEnvironment(
-                f"{self.id} cannot begin in given states, since an observation is not all of its state; name the seed "
+                f"{self.id} cannot begin in given states, since an observation is not all of its "
+                "state; name the seed "
                 "of its reset instead, or one for each episode: seed=[0, 1, ...]"
             )
         if seed is None:
@@ -207,10 +210,13 @@ class _Episodes:
         return seeds
 
     def _commands(self, actions: np.ndarray) -> np.ndarray:
-        """Actions (N, T, du) as the environment takes them; ValueError where they are something else."""
+        """Actions (N, T, du) as the environment takes them; ValueError where they are something
+        else.
+        """
         if actions.ndim != 3 or actions.shape[::2] != (self.num_envs, self.action_dim):
             raise ValueError(
-                f"actions are {actions.shape}; {self.id} expected ({self.num_envs}, T, {self.action_dim})"
+                f"actions are {actions.shape}; {self.id} expected ({self.num_envs}, T, "
+                f"{self.action_dim})"
             )
         if not np.isfinite(actions).all():
             raise ValueError(f"an action for {self.id} is not finite; nothing was simulated")
@@ -239,7 +245,8 @@ class _Episodes:
     def _examine(self, seed: int, envs: Sequence[Any] = ()) -> None:
         """Before the first episode: reset a copy that is none of ``envs`` twice, and step it once.
 
-        It is said aloud where the two begin apart, and dt is the time that passed, where its clocks know.
+        It is said aloud where the two begin apart, and dt is the time that passed, where its clocks
+        know.
         """
         another, self.another = self.another, None
         made = another() if another else None
@@ -250,9 +257,12 @@ class _Episodes:
             if not np.array_equal(one, two):
                 d = int(np.argmax(np.abs(one - two)))
                 warnings.warn(
-                    f"{self.id} does not begin again where it began: two resets with seed {seed} gave "
-                    f"{self.names[d]} = {one[d]:g} and {two[d]:g}. Its episodes cannot be repeated, so plans are "
-                    "executed from elsewhere than they were made for. Let its reset draw from self.np_random "
+                    f"{self.id} does not begin again where it began: two resets with seed {seed} "
+                    "gave "
+                    f"{self.names[d]} = {one[d]:g} and {two[d]:g}. Its episodes cannot be "
+                    "repeated, so plans are "
+                    "executed from elsewhere than they were made for. Let its reset draw from "
+                    "self.np_random "
                     "after super().reset(seed=seed), and leave out wrappers that remember",
                     stacklevel=6,
                 )
@@ -270,12 +280,15 @@ class Stepping(_Episodes):
         another: Callable[[], gymnasium.Env] | None = None,
         env_id: str = "",
     ) -> None:
-        """envs: the copies. another: makes one more, to try things on. env_id: by default what the first says."""
+        """envs: the copies. another: makes one more, to try things on. env_id: by default what the
+        first says.
+        """
         ids = {env_id} if env_id else {environment_id(env) for env in envs}
         env_id = ids.pop() if len(ids) == 1 else _mixed(ids)
         if len({id(env.unwrapped) for env in envs}) < len(envs):
             raise UnsupportedEnvironment(
-                f"the {len(envs)} copies of {env_id} are one and the same object; make a new one for each episode: "
+                f"the {len(envs)} copies of {env_id} are one and the same object; make a new one "
+                "for each episode: "
                 "SyncVectorEnv([lambda: Robot()] * N)"
             )
         _require_steady(env_id, envs[0])
@@ -344,7 +357,8 @@ class Vectorised(_Episodes):
             if given is not seeds:
                 raise
             raise UnsupportedEnvironment(
-                f"{self.id} takes no seed for each of its episodes ({error!s:.100}); give one for all of them, seed=0"
+                f"{self.id} takes no seed for each of its episodes ({error!s:.100}); give one for "
+                "all of them, seed=0"
             ) from error
         return self._begin([self._state(x) for x in self._rows(first)])
 
@@ -381,7 +395,8 @@ class Vectorised(_Episodes):
         array = np.asarray(values)
         if array.size != self.num_envs:
             raise UnsupportedEnvironment(
-                f"{self.id} gave rewards or ends of shape {array.shape} for {self.num_envs} copies; expected one each"
+                f"{self.id} gave rewards or ends of shape {array.shape} for {self.num_envs} "
+                "copies; expected one each"
             )
         return array.reshape(-1)
 
@@ -394,8 +409,10 @@ class Vectorised(_Episodes):
         if mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             return seen
         raise UnsupportedEnvironment(
-            f"{self.id} does not say what an episode that ended came to: put it into info['final_obs'], or say in "
-            "metadata['autoreset_mode'] that it is not reset within the step, gymnasium.vector.AutoresetMode.NEXT_STEP"
+            f"{self.id} does not say what an episode that ended came to: put it into "
+            "info['final_obs'], or say in "
+            "metadata['autoreset_mode'] that it is not reset within the step, "
+            "gymnasium.vector.AutoresetMode.NEXT_STEP"
         )
 
     def _restart(self, over: np.ndarray) -> None:
@@ -408,7 +425,8 @@ class Vectorised(_Episodes):
         for i in np.flatnonzero(~self.ended):
             if not np.array_equal(self._state(rows[i]), self.last[i]):
                 raise UnsupportedEnvironment(
-                    f"{self.id} was to be reset in the copies that ended, options['reset_mask'], and reset copy {i} "
+                    f"{self.id} was to be reset in the copies that ended, options['reset_mask'], "
+                    f"and reset copy {i} "
                     "too, in the middle of its episode; heed the mask, or end all copies together"
                 )
 
@@ -430,7 +448,8 @@ def _step(env_id: str, env: gymnasium.Env, command: np.ndarray) -> tuple[Any, ..
     result = env.step(command)
     if not isinstance(result, tuple) or len(result) != 5:
         raise UnsupportedEnvironment(
-            f"step of {env_id} returned {result!s:.80}; Gymnasium expects (observation, reward, terminated, truncated, "
+            f"step of {env_id} returned {result!s:.80}; Gymnasium expects (observation, reward, "
+            "terminated, truncated, "
             "info)"
         )
     return result
@@ -448,8 +467,10 @@ def _require_steady(env_id: str, env: Any) -> None:
     """UnsupportedEnvironment where an observation depends on all that was seen before."""
     if any(type(layer).__name__ == "NormalizeObservation" for layer in layers(env)):
         raise UnsupportedEnvironment(
-            f"{env_id} is wrapped in NormalizeObservation, whose units drift with all that it has seen: the same seed "
-            "and actions do not repeat an episode. Leave it out; models here scale their data themselves"
+            f"{env_id} is wrapped in NormalizeObservation, whose units drift with all that it has "
+            "seen: the same seed "
+            "and actions do not repeat an episode. Leave it out; models here scale their data "
+            "themselves"
         )
 
 
@@ -462,7 +483,9 @@ def _clocks(env: gymnasium.Env) -> tuple[int | None, float | None]:
 
 
 def _repeats(env: gymnasium.Env, before: tuple[int | None, float | None], dt: float) -> float:
-    """How many times as long as ``dt`` the step since ``before`` took, by the clocks that there are."""
+    """How many times as long as ``dt`` the step since ``before`` took, by the clocks that there
+    are.
+    """
     steps, seconds = _clocks(env)
     if seconds is not None and before[1] is not None and seconds > before[1]:
         ratio = (seconds - before[1]) / dt

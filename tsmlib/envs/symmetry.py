@@ -1,7 +1,8 @@
 """Symmetries of the pushing arm: quarter turns about the shoulder, and mirror images along x.
 
-The walls are a square around the shoulder, the shoulder turns freely and the elbow's limits are even, so the physics
-commute with all eight: episodes of random torques, whose first poses lie in every direction, stay what they are.
+The walls are a square around the shoulder, the shoulder turns freely and the elbow's limits are
+even, so the physics commute with all eight: episodes of random torques, whose first poses lie in
+every direction, stay what they are.
 """
 
 import numpy as np
@@ -13,12 +14,16 @@ COPIES = 8
 
 
 def copies(env_id: str) -> int:
-    """Symmetric copies of the training data: 8 of pushing, 1 of the others, whose first poses lie along x."""
+    """Symmetric copies of the training data: 8 of pushing, 1 of the others, whose first poses lie
+    along x.
+    """
     return COPIES if EnvSpec.parse(env_id).task == "push" else 1
 
 
 def turned(states: np.ndarray, quarters: int) -> np.ndarray:
-    """States (..., 10) as seen after ``quarters`` quarter turns of everything about the shoulder; torques stay."""
+    """States (..., 10) as seen after ``quarters`` quarter turns of everything about the shoulder;
+    torques stay.
+    """
     cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
     found = states.copy()
     found[..., 0] += quarters * np.pi / 2
@@ -29,7 +34,9 @@ def turned(states: np.ndarray, quarters: int) -> np.ndarray:
 
 
 def mirrored(states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States (..., 10) and torques (..., 2) with y negated: joint angles, their velocities and torques change sign."""
+    """States (..., 10) and torques (..., 2) with y negated: joint angles, their velocities and
+    torques change sign.
+    """
     signs = np.array([-1, -1, -1, -1, 1, -1, 1, -1, 1, -1], states.dtype)
     return states * signs, -actions
 

@@ -16,7 +16,8 @@ class SimulationUnstable(RuntimeError):
 
     def __init__(self, env: str, episode: int, step: int, reason: str) -> None:
         super().__init__(
-            f"the simulation of {env} became unstable in episode {episode} at step {step}: {reason}. "
+            f"the simulation of {env} became unstable in episode {episode} at step {step}: "
+            f"{reason}. "
             "Check the state this episode started from; the other episodes of this call were not "
             "returned."
         )

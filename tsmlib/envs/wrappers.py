@@ -1,4 +1,6 @@
-"""Imperfect sensors and actuators, as ordinary Gymnasium wrappers (the paper's robustness study, section 5)."""
+"""Imperfect sensors and actuators, as ordinary Gymnasium wrappers (the paper's robustness study,
+section 5).
+"""
 
 from collections import deque
 from typing import Unpack
@@ -19,11 +21,12 @@ NOISE_STREAM = (
 
 
 class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
-    """The observed state is x + sigma * scale * eps with eps ~ N(0, 1), drawn anew at each step and dimension.
+    """The observed state is x + sigma * scale * eps with eps ~ N(0, 1), drawn anew at each step and
+    dimension.
 
-    sigma: noise in units of data scaled to [-1, 1]; scale (dx,): half of each dimension's range in the data.
-    The world and the reward stay as they are; ``info["state"]`` (dx,) holds the true state.
-    Drawn from the seed given to ``reset``. ValueError where sigma or scale make no sense.
+    sigma: noise in units of data scaled to [-1, 1]; scale (dx,): half of each dimension's range in
+    the data. The world and the reward stay as they are; ``info["state"]`` (dx,) holds the true
+    state. Drawn from the seed given to ``reset``. ValueError where sigma or scale make no sense.
     """
 
     def __init__(self, env: gymnasium.Env, sigma: float, scale: np.ndarray) -> None:
@@ -35,7 +38,8 @@ class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
         expected = env.observation_space.shape
         if self.scale.shape != expected:
             raise ValueError(
-                f"scale is {self.scale.shape}; expected {expected}, one half range per state dimension"
+                f"scale is {self.scale.shape}; expected {expected}, one half range per state "
+                "dimension"
             )
         if not (np.isfinite(self.scale).all() and (self.scale >= 0.0).all()):
             raise ValueError(f"scale is {self.scale}; expected finite half ranges of at least 0")
@@ -58,10 +62,11 @@ class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
-    """Actions arrive ``tau`` steps late: step t applies u_{t - tau}, and the first ``tau`` steps apply zero.
+    """Actions arrive ``tau`` steps late: step t applies u_{t - tau}, and the first ``tau`` steps
+    apply zero.
 
-    The reward charges the action that is applied; ``reset`` forgets those on the way. ValueError where tau is not a
-    whole number of at least 0.
+    The reward charges the action that is applied; ``reset`` forgets those on the way. ValueError
+    where tau is not a whole number of at least 0.
     """
 
     def __init__(self, env: gymnasium.Env, tau: int) -> None:
@@ -71,7 +76,8 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
             raise ValueError(f"tau is {tau!r}; expected a whole number of steps, at least 0")
         if not isinstance(env.action_space, gymnasium.spaces.Box):
             raise ValueError(
-                f"the action space is {env.action_space}; expected a Box, where zero means no torque"
+                f"the action space is {env.action_space}; expected a Box, where zero means no "
+                "torque"
             )
         self.tau, self._nothing = int(tau), np.zeros_like(env.action_space.low)
         self._on_the_way: deque[np.ndarray] = deque()
@@ -90,10 +96,12 @@ class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 class ImperfectArms(VectorWrapper):
-    """What `SensorNoise` and `ActionDelay` do to one arm, done to N of them, with ``rollout`` for whole sequences.
+    """What `SensorNoise` and `ActionDelay` do to one arm, done to N of them, with ``rollout`` for
+    whole sequences.
 
-    sigma, scale (dx,): noise of the observed states; tau: delay of the actions, steps. The noise of episode i is a
-    function of the seed given to ``reset`` and of i, so it does not depend on N. The reward is that of the true states.
+    sigma, scale (dx,): noise of the observed states; tau: delay of the actions, steps. The noise of
+    episode i is a function of the seed given to ``reset`` and of i, so it does not depend on N. The
+    reward is that of the true states.
     """
 
     def __init__(self, env: VectorEnv, *, sigma: float, scale: np.ndarray, tau: int) -> None:
@@ -122,7 +130,9 @@ class ImperfectArms(VectorWrapper):
         return self._observed(states[:, None])[:, 0], info | {"state": states}
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
-        """Take actions (N, T, 2), apply those from tau steps ago, and give the noisy states (N, T, dx) after each."""
+        """Take actions (N, T, 2), apply those from tau steps ago, and give the noisy states (N, T,
+        dx) after each.
+        """
         given = np.concatenate([self._on_the_way, self._arms.checked(actions)], axis=1)
         split = given.shape[1] - self.tau
         states = self._arms.rollout(given[:, :split])
