@@ -67,7 +67,8 @@ def _offers(layer: Any) -> bool:
 def _fixed(value: Any) -> bool:
     """Whether a value never changes, or is MuJoCo's data, which are copied by MuJoCo."""
     if isinstance(value, FunctionType):
-        return value.__closure__ is None and not vars(value)
+        own = value.__closure__ is None and not vars(value)
+        return own or value.__module__.startswith("gymnasium.")
     known = isinstance(value, BuiltinFunctionType | gymnasium.Space | GymnasiumSpec | type)
     return known or type(value).__name__ in (*_FIXED, "MjData")
 

@@ -36,6 +36,7 @@ from tsmlib.envs.spaces import (
 )
 from tsmlib.envs.unstable import SimulationUnstable, without_log
 
+TRIED = 10  # steps of a copy, before the first episode
 Seeds = int | Sequence[int] | None  # of the first episode, those after it following; or of each
 
 
@@ -243,32 +244,34 @@ class _Episodes:
         self.last[i] = state
 
     def _examine(self, seed: int, envs: Sequence[Any] = ()) -> None:
-        """Before the first episode: reset a copy that is none of ``envs`` twice, and step it once.
+        """Before the first episode: what a copy does that is none of ``envs``.
 
-        It is said aloud where the two begin apart, and dt is the time that passed, where its clocks
-        know.
+        It is said aloud where it does not begin again where it began, and dt is the time that
+        passed, where its clocks know.
         """
         another, self.another = self.another, None
         made = another() if another else None
         if made is None or any(made.unwrapped is env.unwrapped for env in envs):
             return
         with closing(made) as env:
-            one, two = (self._state(_reset(self.id, env, seed)) for _ in range(2))
-            if not np.array_equal(one, two):
-                d = int(np.argmax(np.abs(one - two)))
-                warnings.warn(
-                    f"{self.id} does not begin again where it began: two resets with seed {seed} "
-                    "gave "
-                    f"{self.names[d]} = {one[d]:g} and {two[d]:g}. Its episodes cannot be "
-                    "repeated, so plans are "
-                    "executed from elsewhere than they were made for. Let its reset draw from "
-                    "self.np_random "
-                    "after super().reset(seed=seed), and leave out wrappers that remember",
-                    stacklevel=6,
-                )
-            before = _clocks(env)
-            env.step(within_bounds(self.idle, self.robot.actions))
-            self.dt *= _repeats(env, before, self.dt)
+            first = self._state(_reset(self.id, env, seed))
+            before, taken, over = _clocks(env), 0, False
+            for u in np.random.default_rng(0).uniform(-1, 1, (TRIED, self.action_dim)):
+                if not over:
+                    result = _step(self.id, env, within_bounds(u, self.robot.actions))
+                    taken, over = taken + 1, bool(np.any(result[2]) or np.any(result[3]))
+            self.dt *= _repeats(env, before, self.dt * taken, taken)
+            again = self._state(_reset(self.id, env, seed))
+        if not np.array_equal(first, again, equal_nan=True):
+            d = int(np.argmax(np.abs(first - again)))
+            warnings.warn(
+                f"{self.id} does not begin again where it began: two resets with seed {seed} gave "
+                f"{self.names[d]} = {first[d]:g} and {again[d]:g}. Its episodes cannot be repeated, "
+                "so plans are executed from elsewhere than they were made for. Let its reset draw "
+                "from self.np_random after super().reset(seed=seed), and leave out wrappers that "
+                "remember",
+                stacklevel=6,
+            )
 
 
 class Stepping(_Episodes):
@@ -445,7 +448,12 @@ def _reset(env_id: str, env: gymnasium.Env, seed: int) -> Any:
 
 
 def _step(env_id: str, env: gymnasium.Env, command: np.ndarray) -> tuple[Any, ...]:
-    result = env.step(command)
+    try:
+        result = env.step(command)
+    except ValueError as error:  # a wrapper that unpacks it
+        result = error if "values to unpack" in str(error) else None
+        if result is None:
+            raise
     if not isinstance(result, tuple) or len(result) != 5:
         raise UnsupportedEnvironment(
             f"step of {env_id} returned {result!s:.80}; Gymnasium expects (observation, reward, "
@@ -482,19 +490,17 @@ def _clocks(env: gymnasium.Env) -> tuple[int | None, float | None]:
     return next((count for count in counts if count is not None), None), time
 
 
-def _repeats(env: gymnasium.Env, before: tuple[int | None, float | None], dt: float) -> float:
-    """How many times as long as ``dt`` the step since ``before`` took, by the clocks that there
-    are.
-    """
-    steps, seconds = _clocks(env)
-    if seconds is not None and before[1] is not None and seconds > before[1]:
-        ratio = (seconds - before[1]) / dt
+def _repeats(
+    env: gymnasium.Env, before: tuple[int | None, float | None], seconds: float, taken: int
+) -> float:
+    """How many times as long as ``seconds`` the steps since ``before`` took, by the clocks."""
+    (begun, start), (steps, time) = before, _clocks(env)
+    if time is not None and start is not None and time > start:
+        ratio = (time - start) / seconds
         return 1.0 if abs(ratio - 1) < 0.01 else ratio
     for layer in layers(env):
         if hasattr(layer, "dt"):
             return 1.0  # said by a wrapper outside of the limit of time
         if getattr(layer, "_elapsed_steps", None) is not None:
             break
-    return (
-        float(steps - before[0]) if steps and before[0] is not None and steps > before[0] else 1.0
-    )
+    return 1.0 if steps is None or begun is None or steps < begun else (steps - begun) / taken
