@@ -247,6 +247,8 @@ def test_full_actions_are_the_bounds_and_the_idle_one_is_zero_or_nearest_to_it()
 def test_actions_of_another_size_or_without_a_number_are_refused() -> None:
     run = make_simulation(PENDULUM, 2)
     with pytest.raises(ValueError, match=r"actions are \(2, 3, 2\); Pendulum-v1 expected \(2, T, 1\)"):
+        run.rollout(np.zeros((2, 3, 2)))
+    with pytest.raises(ValueError, match=r"actions has shape \(2, 3, 2\); expected \(2, T, 1\)"):
         collect(run, open_loop(torch.zeros(2, 3, 2)), horizon=3)
     with pytest.raises(ValueError, match="not finite; nothing was simulated"):
         run.rollout(np.full((2, 1, 1), np.nan))
@@ -273,7 +275,16 @@ def test_a_controller_in_pieces_gets_what_one_in_a_piece_gets() -> None:
         for each in (open_loop(actions), pieces)
     )
     assert whole.steps.tolist() == cut.steps.tolist()
-    np.testing.assert_array_equal(whole.episode(1).states if hasattr(whole, "episode") else whole.states[1], cut.episode(1).states if hasattr(cut, "episode") else cut.states[1])
+    for i in range(3):
+        np.testing.assert_array_equal(whole.episode(i)[0], cut.episode(i)[0])
+
+
+def test_what_float32_cannot_tell_apart_is_said_and_not_only_lost(made: Made) -> None:
+    far = made(type("Far", (Cart,), {"seen": lambda self: self.x + 1e7}))
+    with pytest.warns(UserWarning, match=r"x0 of .* is about 1e\+07 .* take off an offset"):
+        tsmlib.collect_random(far, 2, horizon=5)
+    with closing(make_simulation(far, 2)) as run:
+        assert run.reset(seed=0)[0, 0] != np.float32(run.reset(seed=0)[0, 0])
 
 
 def test_other_robots_begin_from_seeds_and_not_from_observations() -> None:

@@ -6,18 +6,18 @@ Random data, a running planner and a policy under test are the same call with an
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from warnings import warn
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
+from tsmlib.checks import as_tensor, require_count, require_number
 from tsmlib.envs.stepping import Seeds, Simulation, make_simulation, simulation
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
-Controller = Callable[
-    [Segment], Tensor
-]  # the past (N, L, .) -> the next K actions (N, K, du), then asked again
+Controller = Callable[[Segment], Tensor]  # the past (N, L, .) -> the next K actions (N, K, du)
 
 
 def collect(
@@ -29,49 +29,69 @@ def collect(
     seed: Seeds = None,
     states: np.ndarray | None = None,
 ) -> Trajectories:
-    """Run one episode in each of ``env``'s N copies for ``horizon`` steps, or until the environment
-    ends it.
+    """Run one episode in each of an environment's N copies.
 
-    env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment with flat Boxes of observations
-    and actions. Actions in [-1, 1] are scaled to the bounds of its action space. Episodes start
-    from the environment's own distribution, drawn from ``seed`` (a function of it and of i in
-    episode i; where copies are reset one by one also a seed for each), or, in an arm's, from
-    ``states`` (N, dx). UnsupportedEnvironment, naming what is supported, for anything else.
+    Args:
+        env: ``gymnasium.make_vec(id, num_envs=N)`` of any environment whose observations are Boxes,
+            or Dicts and Tuples of them, and whose actions are a Box with bounds. Asynchronous
+            copies pay where a step takes longer than about a millisecond.
+        controller: gives the next actions in [-1, 1], which stand for the bounds of the action
+            space; asked again when they are executed. ``open_loop`` makes one of given actions.
+        horizon: steps, unless the environment ends an episode before.
+        past_len: steps of past that the controller sees.
+        seed: episode i begins by the reset of ``seed + i``; or one seed for each. An arm's start
+            is a function of ``seed`` and i.
+        states: (N, dx), where the episodes of an arm begin.
+
+    Returns:
+        The episodes, in float32.
+
+    Raises:
+        UnsupportedEnvironment: an environment that cannot be collected from; says what it takes.
+        SimulationUnstable: a state is not finite.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, expected a positive number of steps")
+    horizon = require_count("horizon", horizon)
     if isinstance(controller, OpenLoop) and controller.actions.shape[1] < horizon:
+        steps = controller.actions.shape[1]
         raise ValueError(
-            f"the actions are of {controller.actions.shape[1]} steps, those of an episode of "
-            f"{horizon} were expected; "
-            f"give as many, or horizon={controller.actions.shape[1]}"
+            f"the actions are of {steps} steps; expected those of an episode of {horizon}. Give as "
+            f"many, or horizon={steps}"
         )
-    seed = int(seed) if isinstance(seed, np.integer) else seed
-    episodes: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
-    start = episodes.reset(seed=seed, states=states)
-    past = initial_past(torch.from_numpy(start).float(), past_len, episodes.action_dim)
+    run: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
+    start = run.reset(seed=seed, states=states)
+    past = initial_past(torch.from_numpy(start).float(), past_len, run.action_dim)
     seen, done, taken = [start[:, None]], [], 0
-    while taken < horizon and not episodes.ended.all():
-        actions = controller(past).detach().clamp(-1, 1)[:, : horizon - taken]
+    while taken < horizon and not run.ended.all():
+        given = as_tensor("actions", controller(past), (len(start), "T", run.action_dim))
+        actions = given.detach().cpu().clamp(-1, 1)[:, : horizon - taken]
         if actions.shape[1] < 1:
-            raise ValueError(
-                f"the controller gave no actions when asked at step {taken} of {horizon}"
-            )
-        reached = episodes.rollout(actions.numpy())
+            raise ValueError(f"the controller gave no actions at step {taken} of {horizon}")
+        reached = run.rollout(actions.numpy())
         past = past.then(Segment(torch.from_numpy(reached).float(), actions)).last(past_len)
         seen.append(reached)
         done.append(actions.numpy())
         taken += actions.shape[1]
+    exact = np.concatenate(seen, axis=1)
+    most, spread = np.abs(exact).max((0, 1)), exact.std((0, 1))
+    kept = np.spacing(most.astype(np.float32))
+    # Variation below 1e-10 of a value is what arithmetic leaves.
+    for d in np.flatnonzero((kept > 0.01 * spread) & (spread > 1e-10 * most))[:1]:
+        warn(
+            f"{run.names[d]} of {run.id} is about {most[d]:g} and varies by {spread[d]:.3g}, where "
+            f"float32 tells no less than {kept[d]:.3g} apart; take off an offset first: "
+            "gymnasium.wrappers.TransformObservation",
+            stacklevel=2,
+        )
     return Trajectories(
-        states=np.concatenate(seen, axis=1, dtype=np.float32),
-        actions=np.concatenate(done, axis=1, dtype=np.float32),
-        env=episodes.id,
-        dt=episodes.dt,
-        names=episodes.names,
-        units=episodes.units,
-        angles=episodes.angles,
-        lengths=tuple(episodes.steps.tolist()),
-        terminated=tuple(episodes.terminated.tolist()),
+        exact.astype(np.float32),
+        np.concatenate(done, axis=1),
+        run.id,
+        run.dt,
+        run.names,
+        run.units,
+        run.angles,
+        lengths=run.steps.tolist(),
+        terminated=run.terminated.tolist(),
     )
 
 
@@ -81,18 +101,28 @@ def collect_random(
     *,
     horizon: int = 100,
     seed: int = 0,
-    rms: float = 0.5,  # of full action
-    time_constant: float
-    | None = None,  # s, see ``smooth_torques``; one and a half steps, as the arm's
+    rms: float = 0.5,
+    time_constant: float | None = None,
 ) -> Trajectories:
-    """``episodes`` of smooth random actions in the environment of an id, a function of the
-    arguments alone.
+    """Collect episodes of smooth random actions, a function of the arguments alone.
 
-    Episode i of any robot but the arms begins by the reset of ``seed + i``, so neighbouring seeds
-    share starts: give ``Task.from_env``, which begins at 1000 by default, a seed beyond these where
-    there are more.
+    Args:
+        env_id: of the environment, with its arguments: ``"Pendulum-v1(g=1.0)"``.
+        episodes: how many.
+        horizon: steps, unless the environment ends an episode before.
+        seed: of the actions and starts. Episode i of any robot but the arms begins by the reset of
+            ``seed + i``, so neighbouring seeds share starts: give ``Task.from_env``, which begins
+            at 1000 by default, a seed beyond these where there are more.
+        rms: of the actions, full action being 1.
+        time_constant: s, see ``smooth_torques``; one and a half steps by default.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        UnsupportedEnvironment: an environment that cannot be collected from; says what it takes.
     """
-    seed = int(seed)  # of NumPy, say
+    seed = require_count("seed", seed, least=0)
     with closing(make_simulation(env_id, episodes)) as run:
         actions = smooth_torques(
             episodes,
@@ -112,33 +142,40 @@ def smooth_torques(
     *,
     generator: torch.Generator,
     action_dim: int = 2,
-    rms: float = 0.1,  # of full torque; at most 10 % of steps at the elbow stop, most objects met (01_collect)
-    time_constant: float = 0.03,  # s, of each of the two poles: their power density halves at 3.4 Hz
+    rms: float = 0.1,
+    time_constant: float = 0.03,
     dt: float = 0.02,
 ) -> Tensor:
-    """Smooth random torques (section 5.1): white noise through two poles, (n, horizon, action_dim).
+    """Draw smooth random torques (section 5.1): white noise through two poles.
 
-    The filter starts at rest, so the first torques are small; they settle to a root mean square of
-    ``rms``, clipped.
+    The filter starts at rest, so the first torques are small.
+
+    Args:
+        n: episodes.
+        horizon: steps.
+        generator: of the noise.
+        action_dim: du.
+        rms: to which they settle, of full torque, clipped. At 0.1 at most 10 % of steps are at the
+            elbow's stop, and most objects are met.
+        time_constant: s, of each of the two poles; at 0.03 s power density halves at 3.4 Hz.
+        dt: s per step.
+
+    Returns:
+        Torques (n, horizon, action_dim) in [-1, 1].
     """
-    if n < 1 or horizon < 1:
-        raise ValueError(
-            f"n is {n}, horizon is {horizon}, expected a positive number of episodes and of steps"
-        )
-    keep = np.exp(-dt / time_constant)
-    noise = torch.randn(n, horizon, action_dim, generator=generator).numpy()
-    once, twice, torques = (
-        np.zeros((n, action_dim)),
-        np.zeros((n, action_dim)),
-        np.empty_like(noise),
-    )
+    sizes = {"n": n, "horizon": horizon, "action_dim": action_dim}
+    shape = [require_count(name, size) for name, size in sizes.items()]
+    require_number("rms", rms, 0)
+    require_number("time_constant", time_constant, 0, above=True)
+    keep = np.exp(-require_number("dt", dt, 0, above=True) / time_constant)
+    noise = torch.randn(shape, generator=generator).numpy()
+    once, twice, torques = np.zeros(shape[::2]), np.zeros(shape[::2]), np.empty_like(noise)
     for step in range(horizon):
         once = keep * once + (1 - keep) * noise[:, step]
         twice = keep * twice + (1 - keep) * once
         torques[:, step] = twice
-    settled = (1 - keep) ** 2 * np.sqrt(
-        (1 + keep**2) / (1 - keep**2) ** 3
-    )  # standard deviation of two equal poles
+    # Standard deviation of two equal poles.
+    settled = (1 - keep) ** 2 * np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)
     return torch.from_numpy((torques * (rms / settled)).clip(-1, 1).astype(np.float32))
 
 
@@ -153,5 +190,9 @@ class OpenLoop:
 
 
 def open_loop(actions: Tensor) -> OpenLoop:
-    """The open-loop controller that plays ``actions`` (N, T, du) from the start of an episode."""
-    return OpenLoop(actions)
+    """The open-loop controller that plays actions from the start of an episode.
+
+    Args:
+        actions: (N, T, du) in [-1, 1].
+    """
+    return OpenLoop(as_tensor("actions", actions, ("N", "T", "du")))

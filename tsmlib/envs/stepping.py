@@ -177,8 +177,8 @@ class Arms:
 class _Episodes:
     """What is the same however an environment is stepped: its description, and the episodes so far."""
 
-    def __init__(self, robot: Description, n: int, another: Callable[[], Any] | None) -> None:
-        self.robot, self.num_envs, self.another = robot, n, another
+    def __init__(self, robot: Description, n: int) -> None:
+        self.robot, self.num_envs = robot, n
         self.id, self.dt, self.idle, self.actions = robot.id, robot.dt, robot.idle, robot.actions
         self.names, self.units, self.angles = robot.names, robot.units, robot.angles
         self.action_dim = len(robot.idle)
@@ -243,15 +243,14 @@ class _Episodes:
         self.ended[i] = self.terminated[i] or bool(_number(self.id, "truncated", late))
         self.last[i] = state
 
-    def _examine(self, seed: int, envs: Sequence[Any] = ()) -> None:
-        """Before the first episode: what a copy does that is none of ``envs``.
+    def _examine(self, another: Callable[[], Any], envs: Sequence[Any] = ()) -> None:
+        """Try another copy, before the first episode, unless it is one of ``envs``.
 
         It is said aloud where it does not begin again where it began, and dt is the time that
         passed, where its clocks know.
         """
-        another, self.another = self.another, None
-        made = another() if another else None
-        if made is None or any(made.unwrapped is env.unwrapped for env in envs):
+        made, seed = another(), 0
+        if any(made.unwrapped is env.unwrapped for env in envs):
             return
         with closing(made) as env:
             first = self._state(_reset(self.id, env, seed))
@@ -270,7 +269,7 @@ class _Episodes:
                 "so plans are executed from elsewhere than they were made for. Let its reset draw "
                 "from self.np_random after super().reset(seed=seed), and leave out wrappers that "
                 "remember",
-                stacklevel=6,
+                stacklevel=5,
             )
 
 
@@ -299,13 +298,13 @@ class Stepping(_Episodes):
         super().__init__(
             describe(env_id, first, first.observation_space, first.action_space),
             len(envs),
-            another,
         )
         self.envs = envs
+        if another is not None:
+            self._examine(another, envs)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
         seeds = self._seeds(seed, states)
-        self._examine(seeds[0], self.envs)
         begun = zip(self.envs, seeds, strict=True)
         return self._begin([self._state(_reset(self.id, env, own)) for env, own in begun])
 
@@ -345,12 +344,13 @@ class Vectorised(_Episodes):
             for layer in (env, one):
                 _require_steady(env_id, layer)
             robot = describe(env_id, one, env.single_observation_space, env.single_action_space)
-        super().__init__(robot, env.num_envs, makers[0] if makers and not wrappers else None)
+        super().__init__(robot, env.num_envs)
+        if makers and not wrappers:
+            self._examine(makers[0])
         self.batch = batch_space(env.single_observation_space, env.num_envs)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
         seeds = self._seeds(seed, states)
-        self._examine(seeds[0])
         given: Any = seeds  # as copies take them, whatever the signature of VectorEnv.reset says
         if not hasattr(self.env.unwrapped, "env_fns") and (seed is None or np.ndim(seed) == 0):
             given = seeds[0]

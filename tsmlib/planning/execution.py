@@ -194,7 +194,8 @@ def _run(
             run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states
         )
     if task.begins_by_seed:
-        task.require_start(torch.from_numpy(seen.states[:, 0]), "the executed episode")
+        starts = [torch.from_numpy(seen.episode(i)[0][0]) for i in range(len(seen))]
+        task.require_start(torch.stack(starts), "the executed episode")
     return seen, run
 
 
