@@ -15,152 +15,33 @@ length, dx state size, du action size.
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tsmlib import casting
+from tsmlib.casting import Arrays
 from tsmlib.checks import require_count, require_number
-
-Arrays = np.ndarray | Tensor | Sequence[np.ndarray] | Sequence[Tensor]
-
-
-class TrajectoryError(ValueError):
-    """Data that cannot be trajectories; the message names the array, episode, step and field."""
-
-
-class Segment(NamedTuple):
-    """States (B, L, dx), in physical units, with the actions (B, L, du) that led to them."""
-
-    states: Tensor
-    actions: Tensor
-
-    def then(self, following: Segment) -> Segment:
-        """This segment with ``following`` appended: (B, L, .) and (B, K, .) give (B, L + K, .)."""
-        return Segment(*(torch.cat(pair, dim=1) for pair in zip(self, following, strict=True)))
-
-    def last(self, length: int) -> Segment:
-        """The last ``length`` steps, as the past of what follows."""
-        return Segment(self.states[:, -length:], self.actions[:, -length:])
-
-    def to(self, device: torch.device | str) -> Segment:
-        """The same segment on ``device``."""
-        return Segment(self.states.to(device), self.actions.to(device))
-
-
-class Window(NamedTuple):
-    """A past segment X-, U- (B, L, .) and the future X+, U+ (B, K, .) that followed it."""
-
-    past: Segment
-    future: Segment
-
-
-@dataclass(frozen=True)
-class Robot:
-    """What the numbers of states and actions mean; data, models and tasks are compared by it.
-
-    Args:
-        env: id of the environment, with its arguments where it has some; any name for a log.
-        dt: seconds per step.
-        names: one word per state dimension.
-        units: one unit per state dimension, '' where unknown.
-        angles: state dimensions that are angles in radians, by index or by name.
-        action_dim: number of actions, du.
-    """
-
-    env: str
-    dt: float
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    angles: tuple[int, ...]
-    action_dim: int
-
-    def __post_init__(self) -> None:
-        names, units = _words("names", self.names), _words("units", self.units)
-        if not isinstance(self.env, str) or not self.env:
-            raise TrajectoryError(f"env is {self.env!r:.80}; expected the name of an environment")
-        if not names or len(set(names)) < len(names) or len(units) != len(names):
-            raise TrajectoryError(
-                f"names are {names!r:.200} and units {units!r:.200}; expected one of each per "
-                "state dimension, and no name twice"
-            )
-        angles = _columns(self.angles, names)
-        for angle in angles:
-            if units[angle].lower() in ("deg", "degree", "degrees", "°"):
-                raise TrajectoryError(
-                    f"the angle '{names[angle]}' has the unit {units[angle]!r}; expected radians: "
-                    "convert it by np.radians(...) and name its unit 'rad'"
-                )
-        require_count("action_dim", self.action_dim)
-        dt = require_number("dt", self.dt, 0, above=True)
-        self.__dict__.update(names=names, units=units, angles=angles, dt=dt)
-
-    @property
-    def state_dim(self) -> int:
-        """Number of state dimensions, dx."""
-        return len(self.names)
-
-    def require_same(self, other: Robot, what: str, *, but: Collection[str] = ()) -> None:
-        """Compare two robots; time steps within 0.1 % of each other count as the same.
-
-        Args:
-            other: the robot to compare with.
-            what: what the two are of, such as "training and validation data".
-            but: names of fields that may differ.
-
-        Raises:
-            TrajectoryError: they differ; it names both sides of every field that does.
-        """
-        differing = []
-        for name in (field.name for field in fields(Robot) if field.name not in but):
-            ours, theirs = getattr(self, name), getattr(other, name)
-            alike = math.isclose(ours, theirs, rel_tol=1e-3) if name == "dt" else ours == theirs
-            if not alike:
-                differing.append(f"{name} is {ours!r:.200} and {theirs!r:.200}")
-        if differing:
-            raise TrajectoryError(
-                f"{what} are not of one robot: {'; '.join(differing)}. Expected the same robot on "
-                "both sides: check where each of the two comes from"
-            )
-
-
-class Episodes(NamedTuple):
-    """Episodes one after the other, without padding, as tensors.
-
-    Args:
-        states: (sum of T_i + 1, dx).
-        actions: (sum of T_i, du).
-        lengths: (N,), the steps T_i of each episode; always on the CPU.
-    """
-
-    states: Tensor
-    actions: Tensor
-    lengths: Tensor
-
-    def to(self, device: torch.device | str) -> Episodes:
-        """The same episodes on ``device``."""
-        return Episodes(self.states.to(device), self.actions.to(device), self.lengths)
-
-    def window(self, episodes: Tensor, starts: Tensor, past_len: int, future_len: int) -> Window:
-        """The windows of Trajectories.windows, without its checks."""
-        first = (self.lengths.cumsum(0) - self.lengths)[episodes]  # action of each episode
-        at = starts[:, None] + torch.arange(-past_len, future_len)  # t of u_t, which led to x_{t+1}
-        states = self.states[(first + episodes)[:, None] + (at + 1).clamp_min(0)]
-        actions = self.actions[first[:, None] + at.clamp_min(0)]
-        actions = actions.where((at >= 0)[..., None].to(actions.device), 0.0)
-        return Window(
-            Segment(states[:, :past_len], actions[:, :past_len]),
-            Segment(states[:, past_len:], actions[:, past_len:]),
-        )
+from tsmlib.logs import FromLogs
+from tsmlib.robot import Robot as Robot
+from tsmlib.robot import TrajectoryError as TrajectoryError
+from tsmlib.segments import Episodes as Episodes
+from tsmlib.segments import Segment as Segment
+from tsmlib.segments import Window as Window
+from tsmlib.segments import batches as batches
+from tsmlib.segments import initial_past as initial_past
+from tsmlib.segments import real_steps as real_steps
+from tsmlib.segments import states_before as states_before
+from tsmlib.segments import window_at as window_at
+from tsmlib.segments import window_counts
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Trajectories:
+class Trajectories(FromLogs):
     """Episodes of one robot: cast and checked once, and kept without padding.
 
     ``states`` (N, T + 1, dx) and ``actions`` (N, T, du) are there where all episodes have one
@@ -212,11 +93,11 @@ class Trajectories:
         *,
         unwrap: bool = False,
     ) -> None:
-        x, u = _episodes("states", states), _episodes("actions", actions)
+        x, u = casting.episodes("states", states), casting.episodes("actions", actions)
         if len(x) != len(u):
             raise TrajectoryError(f"{len(x)} episodes of states, but {len(u)} of actions")
         if lengths is not None:
-            ends = _one_each("lengths", lengths, len(u), np.integer)
+            ends = casting.one_each("lengths", lengths, len(u), np.integer)
             if any(not 1 <= n <= len(part) for n, part in zip(ends, u, strict=True)):
                 raise TrajectoryError(
                     f"lengths is {lengths!r:.80}; expected at least 1, and no more than the "
@@ -240,16 +121,17 @@ class Trajectories:
                 f"{robot.names!r:.200}; expected one per state dimension"
             )
         if unwrap:
-            x = [_unwrapped(part, robot.angles) for part in x]
+            x = [casting.unwrapped(part, robot.angles) for part in x]
         ended = [False] * len(u) if terminated is None else terminated
         self._fill(
             robot,
-            _float32("states", x, robot.names),
-            _float32("actions", u, tuple(f"action {k}" for k in range(du))),
+            casting.float32("states", x, robot.names),
+            casting.float32("actions", u, tuple(f"action {k}" for k in range(du))),
             tuple(map(len, u)),
-            tuple(map(bool, _one_each("terminated", ended, len(u), np.bool_))),
+            tuple(map(bool, casting.one_each("terminated", ended, len(u), np.bool_))),
         )
-        self._require_bounds()
+        casting.require_bounds(self.flat_actions, env)
+        casting.require_no_jumps(self.increments(), self.steps, robot)
 
     @classmethod
     def from_rows(
@@ -269,7 +151,7 @@ class Trajectories:
             robot: what the numbers mean.
             terminated: whether the environment ended each episode.
         """
-        steps = np.asarray(_one_each("lengths", lengths, len(lengths), np.integer))
+        steps = np.asarray(casting.one_each("lengths", lengths, len(lengths), np.integer))
         ends = np.cumsum(steps)
         x = np.split(states, ends[:-1] + np.arange(1, len(ends)))
         u = np.split(actions, ends[:-1])
@@ -427,7 +309,7 @@ class Trajectories:
         return states, np.where((at[:-1] < ends)[..., None], actions, np.float32(0))
 
     def segment(self, past_len: int = 0) -> Segment:
-        """All episodes, of one length, as one segment (N, L + T, .), at rest for ``past_len`` steps.
+        """All episodes, of one length, as one segment (N, L + T, .) that begins at rest.
 
         Column past_len + t holds u_t and x_{t+1}.
         """
@@ -468,7 +350,7 @@ class Trajectories:
 
     def window_counts(self, future_len: int, what: str) -> np.ndarray:
         """Windows of ``future_len`` steps in each episode (N,); a warning counts those left out."""
-        return _window_counts(
+        return window_counts(
             torch.from_numpy(self.steps), future_len, f"{what} of {self.env}"
         ).numpy()
 
@@ -480,201 +362,3 @@ class Trajectories:
                 f"{min(self.lengths)} to {self.horizon} steps. data.cut(steps) takes the beginning "
                 "of those that are long enough, data.episode(i) gives one, data.padded() pads them"
             )
-
-    def _require_bounds(self) -> None:
-        """Actions within [-1, 1], and angles that do not jump."""
-        beyond = np.abs(self.flat_actions) > 1 + 1e-6
-        if beyond.any():
-            most = np.abs(self.flat_actions).max()
-            raise TrajectoryError(
-                f"actions of {self.env} go up to {most:g}; expected them within [-1, 1]. "
-                "Scale them by their bounds: 2 * (u - low) / (high - low) - 1"
-            )
-        jumps = np.abs(self.increments()[:, list(self.angles)]) > math.pi
-        if jumps.any():
-            row, column = np.argwhere(jumps)[0]
-            ends = np.cumsum(self.steps)
-            episode = int(np.searchsorted(ends, row, side="right"))
-            step = row - ends[episode] + self.lengths[episode]
-            raise TrajectoryError(
-                f"the angle '{self.names[self.angles[column]]}' jumps by more than pi at "
-                f"{jumps.sum()} step(s), the first in episode {episode} after step {step}; "
-                "expected an angle that goes on. unwrap=True takes the jumps out of a wrapped one"
-            )
-
-
-def initial_past(states: Tensor, past_len: int, action_dim: int) -> Segment:
-    """The past of an episode that starts in ``states`` (B, dx): x_0 repeated, zero actions."""
-    return Segment(
-        states[:, None].expand(-1, past_len, -1),
-        states.new_zeros(len(states), past_len, action_dim),
-    )
-
-
-def states_before(window: Window) -> Tensor:
-    """x_t .. x_{t+K-1}, the states in which the future's actions are taken: (B, K, dx)."""
-    return torch.cat([window.past.states[:, -1:], window.future.states[:, :-1]], dim=1)
-
-
-def real_steps(lengths: Sequence[int], horizon: int) -> Tensor:
-    """(N, T) bool: the steps of episodes of these lengths, as opposed to their padding."""
-    return torch.arange(horizon) < torch.tensor(lengths)[:, None]
-
-
-def window_at(index: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Episode and start of the windows ``index`` (B,), of which episodes have ``counts`` (N,)."""
-    ends = counts.cumsum(0)
-    episodes = torch.searchsorted(ends, index, right=True)
-    return episodes, index - (ends - counts)[episodes]
-
-
-def batches(
-    data: Episodes,
-    *,
-    past_len: int,
-    future_len: int,
-    batch_size: int,
-    generator: torch.Generator,
-) -> Iterator[Window]:
-    """Endless random windows, uniform over all that lie within an episode.
-
-    Args:
-        data: the episodes, ``Trajectories.tensors()``, on the device where windows are wanted.
-        past_len: L, steps of the past.
-        future_len: K, steps of the future.
-        batch_size: B, windows in a batch.
-        generator: of random numbers, on the CPU.
-
-    Returns:
-        An iterator over windows (B, L, .) and (B, K, .).
-
-    Raises:
-        TrajectoryError: no episode has ``future_len`` steps. A warning counts those that have not.
-    """
-    counts = _window_counts(data.lengths, future_len, "training")
-    even = bool((counts == counts[0]).all())
-    while True:
-        if even:
-            episodes = torch.randint(len(counts), (batch_size,), generator=generator)
-            starts = torch.randint(int(counts[0]), (batch_size,), generator=generator)
-        else:
-            index = torch.randint(int(counts.sum()), (batch_size,), generator=generator)
-            episodes, starts = window_at(index, counts)
-        yield data.window(episodes, starts, past_len, future_len)
-
-
-def _window_counts(lengths: Tensor, future_len: int, what: str) -> Tensor:
-    counts = (lengths - future_len + 1).clamp_min(0)
-    short = int((counts == 0).sum())
-    if short == len(counts):
-        raise TrajectoryError(
-            f"{what}: {short} episodes of at most {int(lengths.max())} steps hold no window of "
-            f"{future_len} future steps; expected episodes of at least {future_len} steps"
-        )
-    if short:
-        warnings.warn(
-            f"{what}: {short} of {len(counts)} episodes are shorter than {future_len} steps and "
-            "are not used",
-            stacklevel=3,
-        )
-    return counts
-
-
-def _words(field: str, words: object) -> tuple[str, ...]:
-    listed = tuple(words) if isinstance(words, Sequence | np.ndarray) else ()
-    if isinstance(words, str) or not all(isinstance(word, str) for word in listed) or not listed:
-        raise TrajectoryError(f"{field} is {words!r:.80}; expected a text per state dimension")
-    return tuple(map(str, listed))
-
-
-def _columns(angles: object, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Angles, each an index or a name, as sorted indices."""
-    listed = [] if isinstance(angles, str) else list(np.asarray(angles, object).ravel())
-    known = {name: d for d, name in enumerate(names)} | {d: d for d in range(len(names))}
-    found = [known.get(a) for a in listed if not isinstance(a, bool | float)]
-    if isinstance(angles, str) or None in found or len(set(found)) < len(listed):
-        raise TrajectoryError(
-            f"angles are {angles!r:.80}; expected a tuple of some of 0 to {len(names) - 1}, or of "
-            f"{', '.join(names):.200}"
-        )
-    return tuple(sorted(column for column in found if column is not None))
-
-
-def _episodes(name: str, values: Arrays) -> list[np.ndarray]:
-    """Each episode as an array (T, d) of numbers, d the same in all."""
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
-    episodes = [_numbers(f"{name} of episode {i}", part) for i, part in enumerate(values)]
-    if not episodes:
-        raise TrajectoryError(f"there are no {name}; expected at least one episode")
-    for i, part in enumerate(episodes):
-        if part.ndim != 2 or part.shape[1] != episodes[0].shape[-1] or not part.shape[1]:
-            raise TrajectoryError(
-                f"{name} of episode {i} have shape {part.shape}, those of episode 0 "
-                f"{episodes[0].shape}; expected (N, T, d), or a list of (T, d) with the same d. "
-                f"A single episode goes in a list: [{name}]"
-            )
-    return episodes
-
-
-def _numbers(what: str, values: object) -> np.ndarray:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise TrajectoryError(f"{what} are uneven: {error}") from error
-    if array.dtype.kind not in "fiub":
-        raise TrajectoryError(f"{what} are of type {array.dtype}; expected real numbers")
-    if isinstance(values, np.ma.MaskedArray):
-        return np.ma.filled(values.astype(np.float64), np.nan)
-    return array
-
-
-def _one_each(field: str, values: Sequence[object], n: int, kind: type) -> list:
-    array = np.asarray(values)
-    if array.shape != (n,) or not np.issubdtype(array.dtype, kind):
-        raise TrajectoryError(
-            f"{field} is {values!r:.80}; expected {n} values of type {kind.__name__}, one each"
-        )
-    return array.tolist()
-
-
-def _unwrapped(states: np.ndarray, angles: tuple[int, ...]) -> np.ndarray:
-    states = states.astype(np.float64)
-    states[:, list(angles)] = np.unwrap(states[:, list(angles)], axis=0)
-    return states
-
-
-def _float32(name: str, episodes: list[np.ndarray], columns: tuple[str, ...]) -> np.ndarray:
-    """All rows in float32, finite, and apart from each other where they are in ``episodes``."""
-    exact = np.concatenate(episodes)
-    with np.errstate(over="ignore"):
-        flat = np.array(exact, np.float32, order="C")
-    lengths = np.array([len(part) for part in episodes])
-    begins = np.cumsum(lengths) - lengths
-    bad = np.argwhere(~np.isfinite(flat))
-    if len(bad):
-        row, column = bad[0]
-        episode = int(np.searchsorted(begins, row, side="right")) - 1
-        raise TrajectoryError(
-            f"{len(bad)} value(s) in {name} are not finite, the first in episode {episode}, "
-            f"step {row - begins[episode]}, field '{columns[column]}': {exact[row, column]}. "
-            "Expected finite numbers: mend or leave out what holds them"
-        )
-    if exact.dtype.itemsize > 4:
-        exact = exact.astype(np.float64)
-        means = np.add.reduceat(exact, begins) / lengths[:, None]
-        spread = np.sqrt(np.square(exact - np.repeat(means, lengths, axis=0)).mean(0))
-        size = np.abs(exact).max(0)
-        lost = (np.square(exact - flat).mean(0) > np.square(1e-3 * spread)) & (
-            spread > 1e-12 * size
-        )
-        for column in np.flatnonzero(lost)[:1]:
-            kept = np.spacing(np.float32(size[column]))
-            raise TrajectoryError(
-                f"'{columns[column]}' goes up to {size[column]:g}, and within an episode it varies "
-                f"by {spread[column]:g}: float32 keeps steps of {kept:g} there. "
-                f"Take an offset off it: {name} - {name}.mean()"
-            )
-    return flat

@@ -1,0 +1,117 @@
+"""Whatever holds numbers, as arrays of episodes in float32: cast and checked once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+
+from tsmlib.robot import Robot, TrajectoryError
+
+Arrays = np.ndarray | Tensor | Sequence[np.ndarray] | Sequence[Tensor]
+
+
+def episodes(name: str, values: Arrays) -> list[np.ndarray]:
+    """Each episode as an array (T, d) of numbers, d the same in all."""
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy()
+    parts = [_numbers(f"{name} of episode {i}", part) for i, part in enumerate(values)]
+    if not parts:
+        raise TrajectoryError(f"there are no {name}; expected at least one episode")
+    for i, part in enumerate(parts):
+        if part.ndim != 2 or part.shape[1] != parts[0].shape[-1] or not part.shape[1]:
+            raise TrajectoryError(
+                f"{name} of episode {i} have shape {part.shape}, those of episode 0 "
+                f"{parts[0].shape}; expected (N, T, d), or a list of (T, d) with the same d. "
+                f"A single episode goes in a list: [{name}]"
+            )
+    return parts
+
+
+def _numbers(what: str, values: object) -> np.ndarray:
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy()
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise TrajectoryError(f"{what} are uneven: {error}") from error
+    if array.dtype.kind not in "fiub":
+        raise TrajectoryError(f"{what} are of type {array.dtype}; expected real numbers")
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    return array
+
+
+def one_each(field: str, values: Sequence[object], n: int, kind: type) -> list:
+    array = np.asarray(values)
+    if array.shape != (n,) or not np.issubdtype(array.dtype, kind):
+        raise TrajectoryError(
+            f"{field} is {values!r:.80}; expected {n} values of type {kind.__name__}, one each"
+        )
+    return array.tolist()
+
+
+def unwrapped(states: np.ndarray, angles: tuple[int, ...]) -> np.ndarray:
+    states = states.astype(np.float64)
+    states[:, list(angles)] = np.unwrap(states[:, list(angles)], axis=0)
+    return states
+
+
+def float32(name: str, episodes: list[np.ndarray], columns: tuple[str, ...]) -> np.ndarray:
+    """All rows in float32, finite, and apart from each other where they are in ``episodes``."""
+    exact = np.concatenate(episodes)
+    with np.errstate(over="ignore"):
+        flat = np.array(exact, np.float32, order="C")
+    lengths = np.array([len(part) for part in episodes])
+    begins = np.cumsum(lengths) - lengths
+    bad = np.argwhere(~np.isfinite(flat))
+    if len(bad):
+        row, column = bad[0]
+        episode = int(np.searchsorted(begins, row, side="right")) - 1
+        raise TrajectoryError(
+            f"{len(bad)} value(s) in {name} are not finite, the first in episode {episode}, "
+            f"step {row - begins[episode]}, field '{columns[column]}': {exact[row, column]}. "
+            "Expected finite numbers: mend or leave out what holds them"
+        )
+    if exact.dtype.itemsize > 4:
+        exact = exact.astype(np.float64)
+        means = np.add.reduceat(exact, begins) / lengths[:, None]
+        spread = np.sqrt(np.square(exact - np.repeat(means, lengths, axis=0)).mean(0))
+        size = np.abs(exact).max(0)
+        lost = (np.square(exact - flat).mean(0) > np.square(1e-3 * spread)) & (
+            spread > 1e-12 * size
+        )
+        for column in np.flatnonzero(lost)[:1]:
+            kept = np.spacing(np.float32(size[column]))
+            raise TrajectoryError(
+                f"'{columns[column]}' goes up to {size[column]:g}, and within an episode it varies "
+                f"by {spread[column]:g}: float32 keeps steps of {kept:g} there. "
+                f"Take an offset off it: {name} - {name}.mean()"
+            )
+    return flat
+
+
+def require_bounds(actions: np.ndarray, env: str) -> None:
+    """TrajectoryError where actions leave [-1, 1]."""
+    most = np.abs(actions).max()
+    if most > 1 + 1e-6:
+        raise TrajectoryError(
+            f"actions of {env} go up to {most:g}; expected them within [-1, 1]. Scale them by "
+            "their bounds: 2 * (u - low) / (high - low) - 1, or bounds=(low, high) of from_table"
+        )
+
+
+def require_no_jumps(increments: np.ndarray, steps: np.ndarray, robot: Robot) -> None:
+    """TrajectoryError where an angle changes by more than pi in a step."""
+    jumps = np.abs(increments[:, list(robot.angles)]) > math.pi
+    for row, column in np.argwhere(jumps)[:1]:
+        ends = np.cumsum(steps)
+        episode = int(np.searchsorted(ends, row, side="right"))
+        raise TrajectoryError(
+            f"the angle '{robot.names[robot.angles[column]]}' jumps by more than pi at "
+            f"{jumps.sum()} step(s), the first in episode {episode} after step "
+            f"{row - ends[episode] + steps[episode]}; expected an angle that goes on. unwrap=True "
+            "takes the jumps out of one that was wrapped"
+        )
