@@ -8,53 +8,18 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-from tsmlib.checks import require_choice, require_count
-from tsmlib.pretrained import INSTALLED, ROOT
+from reproduction.runs import Run
+from tsmlib.pretrained import ROOT
 
 NOTEBOOKS = ROOT / "notebooks"
-SCALES = ("smoke", "laptop", "paper")
 TOOLS = ("papermill", "ipykernel", "pandas", "ipywidgets", "imageio_ffmpeg")  # extra "notebooks"
-HELD_OUT = range(1_000_000, 1_000_100)  # seeds of validation and test episodes and targets
 Value = bool | int | float | str
 
 
 class RunError(RuntimeError):
     """A notebook that cannot be run, or did not come to its end."""
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """What every notebook takes.
-
-    Args:
-        scale: "smoke" (a test), "laptop" (minutes, shipped models) or "paper" (all is made).
-        seed: of data, weights, starts and planners.
-    """
-
-    scale: str = "laptop"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        require_choice("scale", self.scale, SCALES)
-        require_count("seed", self.seed, least=0)
-        if self.seed in HELD_OUT:
-            raise ValueError(
-                f"seed is {self.seed}, expected one outside {HELD_OUT.start} to "
-                f"{HELD_OUT.stop - 1}, which draw the held-out episodes and targets."
-            )
-
-    @property
-    def folder(self) -> Path:
-        """Where a run with these parameters writes."""
-        return home() / "runs" / self.scale / f"seed{self.seed}"
-
-
-def home() -> Path:
-    """The folder that ``runs`` lies in: the repository; of an installed package, where you are."""
-    return Path.cwd() if INSTALLED else ROOT
 
 
 def notebooks() -> dict[str, Path]:
@@ -120,7 +85,7 @@ def typed(notebook: Path, texts: Mapping[str, str]) -> dict[str, Value]:
 
 def execute(
     notebook: Path,
-    parameters: Parameters,
+    run: Run,
     more: Mapping[str, Value] | None = None,
     *,
     progress: bool = True,
@@ -129,12 +94,12 @@ def execute(
 
     Args:
         notebook: its path.
-        parameters: scale and seed.
+        run: scale and seed.
         more: values of the notebook's other parameters.
         progress: whether a bar is shown.
 
     Returns:
-        The executed copy, in ``parameters.folder``, which is the kernel's working directory.
+        The executed copy, in ``run.folder``, which is the kernel's working directory.
 
     Raises:
         RunError: a cell failed or the kernel died. The copy then holds what was done until there.
@@ -144,10 +109,10 @@ def execute(
     from nbclient.exceptions import DeadKernelError
     from traitlets.config import Config
 
-    values = {"scale": parameters.scale, "seed": parameters.seed, **(more or {})}
+    values = {"scale": run.scale, "seed": run.seed, **(more or {})}
     known = defaults(notebook)
-    parameters.folder.mkdir(parents=True, exist_ok=True)
-    output = parameters.folder / notebook.name
+    run.folder.mkdir(parents=True, exist_ok=True)
+    output = run.folder / notebook.name
     unfinished = output.with_name(f".{notebook.stem}.{os.getpid()}.ipynb")
     failure = ""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # shuts the kernel down
@@ -158,7 +123,7 @@ def execute(
             {name: value for name, value in values.items() if name in known},
             kernel_name="python3",
             language="python",
-            cwd=str(parameters.folder),
+            cwd=str(run.folder),
             progress_bar={"desc": notebook.stem} if progress else False,
             stdout_file=sys.stdout if progress else None,
             config=Config({"KernelManager": {"transport_encryption": "auto"}}),  # no warning of it
