@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from reproduction import explorer, runner
+from reproduction.runs import SCALES, Run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "notebook", help=f"{', '.join(runner.notebooks())}, all, or the path of a copy"
     )
-    run.add_argument("--scale", default="laptop", help=f"{', '.join(runner.SCALES)}")
+    run.add_argument("--scale", default="laptop", help=f"{', '.join(SCALES)}")
     run.add_argument("--seed", type=int, default=0)
     run.add_argument(
         "-p",
@@ -51,6 +52,17 @@ def _parser() -> argparse.ArgumentParser:
         help="another parameter of the notebook",
     )
     run.set_defaults(do=_run)
+    make = commands.add_parser("make", help="make targets, and what they are made from")
+    make.add_argument("targets", nargs="+", help="such as models/Reacher/tsm, tables/03_predict")
+    make.add_argument("--scale", default="laptop", help=", ".join(SCALES))
+    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--again", action="store_true", help="although they are there")
+    make.set_defaults(do=_make)
+    pool = commands.add_parser("pool", help="join a table of several seeds")
+    pool.add_argument("table", help="such as 03_predict")
+    pool.add_argument("--scale", default="paper", help=", ".join(SCALES))
+    pool.add_argument("--seeds", nargs="+", type=int, required=True)
+    pool.set_defaults(do=_pool)
     explore = commands.add_parser("explore", help="serve the explorer, a page, on 127.0.0.1")
     explore.add_argument("--port", type=int, default=explorer.PORT, help="0 is any that is free")
     explore.add_argument("--open", action="store_true", help="open it in a browser")
@@ -65,12 +77,28 @@ def _run(arguments: argparse.Namespace) -> int:
         if not equals or name in ("scale", "seed"):
             raise ValueError(f"-p {item!r:.80}: expected NAME=VALUE; --scale and --seed for these")
         texts[name] = text
-    parameters = runner.Parameters(arguments.scale, arguments.seed)
+    run = Run(arguments.scale, arguments.seed)
     runner.require_tools()
     word = arguments.notebook
     paths = list(runner.notebooks().values()) if word == "all" else [runner.find(word)]
     for path, values in [(path, runner.typed(path, texts)) for path in paths]:
-        print(runner.execute(path, parameters, values))
+        print(runner.execute(path, run, values))
+    return 0
+
+
+def _make(arguments: argparse.Namespace) -> int:
+    from reproduction import targets  # heavy
+
+    run = Run(arguments.scale, arguments.seed)
+    for name in arguments.targets:
+        print(targets.make(run, name, again=arguments.again))
+    return 0
+
+
+def _pool(arguments: argparse.Namespace) -> int:
+    from reproduction import targets
+
+    print(targets.pool(arguments.scale, arguments.table, arguments.seeds))
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -27,8 +28,6 @@ from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
 from tsmlib.statistics import spearman
 
-FINITE = math.isfinite
-
 
 def code_rows(run: Run, name: str, word: str) -> list[Row]:
     """KL, active dimensions, spread and error of codes; where an arm pushes, also contacts and
@@ -48,9 +47,10 @@ def code_rows(run: Run, name: str, word: str) -> list[Row]:
     rows = [about | {"execution": SEGMENTS, "n": len(after)} | row for row in found]
     if pushes:
         rows += [about | {"execution": OPEN} | row for row in _contacts(seen)]
-        swings = windows_before_contact(net, test, samples=samples, seed=run.seed)
-        rows += [about | {"execution": OPEN} | row for row in _deflections(deflections(swings))]
-    return [row for row in rows if FINITE(row["value"])]
+        with suppress(ValueError):  # no episode of few has a first touch
+            swings, _ = windows_before_contact(net, test, samples=samples, seed=run.seed)
+            rows += [about | {"execution": OPEN} | row for row in _deflections(deflections(swings))]
+    return [row for row in rows if math.isfinite(row["value"])]
 
 
 def _encoded(

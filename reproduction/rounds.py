@@ -245,9 +245,8 @@ def adapted_rows(run: Run, name: str, way_name: str) -> list[Row]:
     judge = expected_predictor if net.stochastic else model_predictor
     predict = judge(net, past, seed=1000 + run.seed)
     candidates = run.pick(8, 96, 96)
-    plan = tsmlib.cem(
-        predict, task.reward, space, len(task), candidates=candidates, iterations=5, seed=run.seed
-    )
+    search = {"candidates": candidates, "elites": max(2, candidates // 10), "iterations": 5}
+    plan = tsmlib.cem(predict, task.reward, space, len(task), seed=run.seed, **search)
     fresh = fresh_predictor(net, past, seed=1000 + run.seed)
     trial = tsmlib.execute(task, tsmlib.reevaluate(plan, fresh, task.reward))
     about |= {"planner": "cem", "search_space": "latent", "task": task.name, "n": len(task)}
