@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from reproduction import explorer, runner
-from reproduction.runs import SCALES, Run
+from reproduction.runs import SCALES, Run, home
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,6 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     pool.add_argument("--scale", default="paper", help=", ".join(SCALES))
     pool.add_argument("--seeds", nargs="+", type=int, required=True)
     pool.set_defaults(do=_pool)
+    claims = commands.add_parser("claims", help="judge the claims, write docs/claims.md")
+    claims.set_defaults(do=_claims)
     explore = commands.add_parser("explore", help="serve the explorer, a page, on 127.0.0.1")
     explore.add_argument("--port", type=int, default=explorer.PORT, help="0 is any that is free")
     explore.add_argument("--open", action="store_true", help="open it in a browser")
@@ -99,6 +101,13 @@ def _pool(arguments: argparse.Namespace) -> int:
     from reproduction import targets
 
     print(targets.pool(arguments.scale, arguments.table, arguments.seeds))
+    return 0
+
+
+def _claims(arguments: argparse.Namespace) -> int:
+    from reproduction.claims import ledger
+
+    print(*ledger.write(home() / "docs"), sep="\n")
     return 0
 
 

@@ -16,8 +16,9 @@ TYPES = {".wasm": "application/wasm", ".js": "text/javascript", ".f32": "applica
 HEADERS = {
     "Cache-Control": "no-cache",  # a page that was built again is not mixed with the one before
     "X-Content-Type-Options": "nosniff",
+    # MuJoCo's bindings are made at run time, hence unsafe-eval
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-eval'; "
-    "style-src 'self' 'unsafe-inline'; img-src 'self' data:",  # MuJoCo's bindings are made at run time, hence unsafe-eval
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data:",
 }
 
 

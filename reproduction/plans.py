@@ -20,13 +20,17 @@ from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.planners import iterations_to, sampled_starts
 from tsmlib.planning.predictors import JUDGING, expected_predictor, fresh_predictor
-from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.planning.tasks import Task, random_torques
 from tsmlib.statistics import two_sample_auc
 from tsmlib.storage import artifacts
 
 KEPT = 4  # samples of the predicted states that a file holds
 SCREENED = 0.25  # of the candidates, which all samples judge
-TORQUES: dict[str, Callable[[Task], torch.Tensor]] = {"random": random_torques, "zero": zero_torques}
+TORQUES: dict[str, Callable[[Task], torch.Tensor]] = {
+    "random": random_torques,
+    "zero": Task.idle_actions,
+}
+RMS = 0.1  # of the data's torques
 OPEN, CLOSED = "open loop", "closed loop"
 
 
@@ -37,7 +41,8 @@ class How:
     Args:
         model: a word of the zoo, "oracle" (the simulator), "random" or "zero".
         space: "latent" (Eq. 3) or "direct" (Eq. 2).
-        planner: "cem", "mppi", "adam" (from zero), "adam+starts" (from sampled candidates).
+        planner: "cem" (noise as smooth as the data, as iCEM), "cem+white", "mppi", "adam" (from
+            zero) or "adam+starts" (from sampled candidates).
         every: steps until the arm plans again; 0 executes the plan open loop, as the paper.
         iterations: of the planner; 0 is the scale's own number.
     """
@@ -82,8 +87,10 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
     task = the_task(run, name, how)
     prior = load_prior(run, name) if how.space == "latent" else None
     net = None if how.model == "oracle" else load_model(run, name, how.model)
-    space = tsmlib.LatentActions(prior, task.horizon) if prior else _direct(task)
-    planner, judge = _planner(run, how), expected_predictor if how.planner == "cem" else None
+    white = how.planner == "cem+white"
+    space = tsmlib.LatentActions(prior, task.horizon) if prior else _direct(task, white=white)
+    planner = _planner(run, how)
+    judge = expected_predictor if how.planner.startswith("cem") else None
     if how.every:
         first = load_plan(run, name, f"{how.model}-{how.space}-{how.planner}")
         keep = {"plan": first, "every": how.every, "seed": run.seed, "progress": f"{name} {plan}"}
@@ -94,7 +101,7 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
     began = time.perf_counter()
     start: int | torch.Tensor = len(task)
     if net is None:
-        predict = tsmlib.simulator_predictor(task.env, task.start)
+        predict = tsmlib.simulator_predictor(task)
     elif judge is not None and net.stochastic:
         predict = judge(net, task.past(net.past_len), samples=JUDGING, seed=run.seed)
     else:
@@ -237,5 +244,6 @@ def _planner(run: Run, how: How) -> Callable[..., Plan]:
     return partial(tsmlib.cem, elites=max(2, n // 10), screened=SCREENED, **budget)
 
 
-def _direct(task: Task) -> tsmlib.DirectActions:
-    return tsmlib.DirectActions(task.horizon, task.action_dim)
+def _direct(task: Task, *, white: bool = False) -> tsmlib.DirectActions:
+    smooth = {"smoothness": 0.0} if white else {}
+    return tsmlib.DirectActions(task.horizon, task.action_dim, rms=RMS, **smooth)

@@ -37,7 +37,11 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
     Its learning curve is in the file's header. Learning that was killed goes on.
     """
     word, space = policy_name.split("-")
-    net, data, task = load_model(run, name, word), load_data(run, name, "train"), the_task(run, name)
+    net, data, task = (
+        load_model(run, name, word),
+        load_data(run, name, "train"),
+        the_task(run, name),
+    )
     copies, seed = run.pick(1, 1, 3), 1000 * run.seed
     dx, du = data.states.shape[2], data.actions.shape[2]
     how = {"angles": data.angles, "copies": copies, "seed": seed}

@@ -12,7 +12,7 @@ import tsmlib
 from reproduction.runs import Run
 from reproduction.tables import Row
 from tsmlib import rewards, zoo
-from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.planning.tasks import Task, random_torques
 from tsmlib.trajectory import Trajectories
 
 MODELS = {"rtsm": {"hidden": 96}, "onestep": {}, "lstm": {"hidden": 96}, "ensemble+mse": {}}
@@ -90,7 +90,7 @@ def robot_rows(run: Run, env: str, word: str) -> list[Row]:
     trials = {
         (word, "cem"): tsmlib.mpc(task, net, space, planner, every=5),
         ("oracle", "cem"): tsmlib.mpc(few, None, space, planner, every=5),
-        ("none", "zero"): tsmlib.execute(task, zero_torques(task)),
+        ("none", "zero"): tsmlib.execute(task, task.idle_actions()),
         ("none", "random"): tsmlib.execute(task, random_torques(task, seed=run.seed)),
     }
     for (model, how), trial in trials.items():

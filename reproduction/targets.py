@@ -39,7 +39,9 @@ FILTERED = ("tsm", "rtsm", *BASELINES, "none", "filter", "exponential")
 
 
 def _scores(run: Run) -> list[str]:
-    pairs = product(ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), zoo.words("dynamics")))
+    pairs = product(
+        ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), zoo.words("dynamics"))
+    )
     return [f"scores/{arm}/{word}" for arm, word in pairs]
 
 
@@ -54,12 +56,17 @@ def _ablation(run: Run) -> list[str]:
 
 def plans_of(run: Run, arm: str) -> list[str]:
     """The plans of table 05, by name."""
-    words = run.pick(("tsm", "onestep"), ("rtsm", "onestep"), tuple(word for word, spec in zoo.ZOO.items() if spec.planned))
+    words = run.pick(
+        ("tsm", "onestep"),
+        ("rtsm", "onestep"),
+        tuple(word for word, spec in zoo.ZOO.items() if spec.planned),
+    )
     names = [f"{word}-{space}-cem" for word in words for space in ("latent", "direct")]
     if run.scale == "paper":
         names += [f"tsm-{space}-{planner}" for space, planner in product(
             ("latent", "direct"), ("adam", "adam+starts"))]  # fmt: skip
         names.append("tsm-latent-adam-iterations500")
+        names += [f"{word}-direct-cem+white" for word in words]
     if arm == "ReacherPush" and run.scale != "laptop":
         names += [f"{word}-latent-cem-every10" for word in (*words, "oracle")]
     return [*names, "oracle-latent-cem", "zero", "random"]
@@ -101,7 +108,9 @@ def _torques(run: Run) -> list[str]:
 
 
 def _robots(run: Run) -> list[str]:
-    robots = run.pick(("Pendulum-v1",), ("Pendulum-v1",), ("Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"))
+    robots = run.pick(
+        ("Pendulum-v1",), ("Pendulum-v1",), ("Pendulum-v1", "Hopper-v5", "HalfCheetah-v5")
+    )
     words = run.pick(("rtsm",), ("rtsm",), ("rtsm", "onestep", "lstm", "ensemble+mse"))
     return [f"robots/{env}/{word}" for env, word in product(robots, words)]
 
@@ -155,7 +164,9 @@ def _model_inputs(run: Run, words: list[str]) -> list[str]:
 
 
 def _prior_of(arm: str) -> str:
-    return f"models/{'ReacherObstacle' if EnvSpec.parse(env_id(arm)).has_block else 'Reacher'}/prior"
+    return (
+        f"models/{'ReacherObstacle' if EnvSpec.parse(env_id(arm)).has_block else 'Reacher'}/prior"
+    )
 
 
 def _score_inputs(run: Run, words: list[str]) -> list[str]:

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import pandas as pd
 
-from reproduction.tables import published, select
+from reproduction.tables import select
 
 # The smallest effects that matter ---------------------------------------------------------------
 
@@ -26,6 +25,7 @@ COSTS = ("return_true", "return_predicted", "gap")
 LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged")
 LOWER += ("moves_untouched", "penetrates", "violations_worst", "error_prior", "error_posterior")
 SIZES = ("exploitation_gap",)  # taken without their sign
+RATIOS = ("gradient_snr", "samples_to_90")  # compared by their logarithms
 LOWER += SIZES
 PLACES = {"Reacher": "tsm/Reacher-v0", "ReacherObstacle": "tsm/ReacherObstacle-v0"}
 PLACES |= {"ReacherPush": "tsm/ReacherPush-v1"}
@@ -96,12 +96,12 @@ class Finding:
         return self.word in accepted.get(self.comparison.expect, (self.comparison.expect,))
 
 
-def compare(one: Comparison, tables: Tables = cache(published)) -> Finding:
+def compare(one: Comparison, tables: Tables) -> Finding:
     """Judge one comparison by the rows of its table.
 
     Args:
         one: what is compared.
-        tables: name of a table -> its rows; by default those of data/results.
+        tables: name of a table -> its rows.
 
     Returns:
         What was found.
@@ -116,6 +116,8 @@ def compare(one: Comparison, tables: Tables = cache(published)) -> Finding:
             a, b = _paired(a, one.times * b)
         else:
             b = 0 * a + one.times * one.b
+        if one.measure in RATIOS:
+            a, b = np.log(a), np.log(b)
     except KeyError:
         return Finding(one, *[np.nan] * 5, 0, 0, "missing")
     sign = -1 if one.measure in LOWER else 1
@@ -137,10 +139,9 @@ def interval(difference: np.ndarray, draws: int = DRAWS) -> tuple[float, float]:
     if seeds * units == 1:
         return np.nan, np.nan
     draw = np.random.default_rng(0)
-    means = np.empty(draws)
-    for i in range(draws):
-        rows, columns = draw.integers(seeds, size=seeds), draw.integers(units, size=units)
-        means[i] = difference[rows].mean(0)[columns].mean()
+    of_seeds = draw.multinomial(seeds, np.full(seeds, 1 / seeds), draws) / seeds
+    of_units = draw.multinomial(units, np.full(units, 1 / units), draws) / units
+    means = ((of_seeds @ difference) * of_units).sum(1)
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 
@@ -154,7 +155,7 @@ def smallest(one: Comparison, of_b: float, tables: Tables) -> float:
         found = select(found, env=PLACES[one.on.partition("-")[0]], metric="return_true")
         found = select(found, execution="open loop")
         return OF_COST * abs(float(found["value"].mean()))
-    return OF_SCORE * abs(of_b)
+    return OF_SCORE if one.measure in RATIOS else OF_SCORE * abs(of_b)
 
 
 def _word(mean: float, low: float, high: float, effect: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -13,12 +14,12 @@ import jinja2
 import pandas as pd
 
 from reproduction.claims.judge import Comparison, Finding, Tables, compare
-from reproduction.tables import RESULTS, published
+from reproduction.tables import RESULTS, TEXTS, published
 
 LEDGER = Path(__file__).with_name("ledger.toml")
 TEMPLATE = Path(__file__).with_name("claims.md.j2")
 ARMS = {"Reacher": "reaching", "ReacherObstacle": "the obstacle", "ReacherPush": "pushing"}
-IMPERFECT = {"noise0.25": "noise", "delay5": "delay"}
+IMPERFECT = {"noise0.25": "noisy sensors", "delay5": "delayed actions"}
 
 
 @dataclass(frozen=True)
@@ -85,15 +86,24 @@ class Verdict:
             "not on": [k for k, held in places.items() if not any(held) and False in held],
             "open on": [k for k, held in places.items() if set(held) == {None}],
         }
-        parts = [f"{word} {' and '.join(names)}" for word, names in groups.items() if names]
+        parts = [f"{word} {_listed(names)}" for word, names in groups.items() if names]
         said = f"{', '.join(parts)} ({hold} of {len(self.findings)})."
         return f"{said[0].upper()}{said[1:]} {self.claim.note}".strip()
 
 
-def claims(path: Path = LEDGER) -> list[Claim]:
-    """The claims in the order of the paper; those that rest on others have their comparisons."""
+def claims(path: Path = LEDGER, *, subject: str = "tsm") -> list[Claim]:
+    """The claims in the order of the paper; those that rest on others have their comparisons.
+
+    Args:
+        path: of the ledger.
+        subject: the model in place of the paper's own, such as "rtsm".
+
+    Returns:
+        The claims.
+    """
     found: dict[str, Claim] = {}
-    entries = tomllib.loads(path.read_text())
+    text = re.sub(r'"tsm(?=["-])', f'"{subject}', path.read_text())
+    entries = tomllib.loads(text)
     for name, entry in entries.items():
         written = list(entry.pop("compare", []))
         for other in entry.pop("rests_on", []):
@@ -104,9 +114,15 @@ def claims(path: Path = LEDGER) -> list[Claim]:
     return list(found.values())
 
 
-def judge(claim: Claim, tables: Tables | None = None) -> Verdict:
+@cache
+def results(name: str) -> pd.DataFrame:
+    """A table of data/results, in a form that is fast to select from."""
+    table = published(name)
+    return table.astype({column: "category" for column in TEXTS if column in table})
+
+
+def judge(claim: Claim, tables: Tables = results) -> Verdict:
     """What the comparisons of a claim find in tables, by default those of data/results."""
-    tables = tables or cache(published)
     findings = [compare(one, tables) for one in claim.comparisons]
     return Verdict(claim, findings, [compare(one, tables) for one in claim.control])
 
@@ -141,11 +157,10 @@ def page(verdicts: Sequence[Verdict]) -> str:
     return template.render(verdicts=verdicts, counts=counts)
 
 
-def write(docs: Path, results: Path = RESULTS) -> list[Path]:
+def write(docs: Path) -> list[Path]:
     """Judge all claims and write ``08_claims.csv`` and ``docs/claims.md``."""
-    tables = cache(published)
-    verdicts = [judge(claim, tables) for claim in claims()]
-    table, text = results / "08_claims.csv", docs / "claims.md"
+    verdicts = [judge(claim) for claim in claims()]
+    table, text = RESULTS / "08_claims.csv", docs / "claims.md"
     as_table(verdicts).to_csv(table, index=False, lineterminator="\n")
     text.write_text(page(verdicts))
     return [table, text]
@@ -169,7 +184,12 @@ def _expanded(written: Sequence[Mapping[str, object]]) -> tuple[Comparison, ...]
 def _told(on: str) -> str:
     """An arm as a reader knows it."""
     arm, _, imperfect = on.partition("-")
-    return f"{ARMS[arm]} with {IMPERFECT[imperfect]}" if imperfect else ARMS[arm]
+    return IMPERFECT.get(imperfect, ARMS[arm])
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names with commas, and "and" before the last."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _spelled(where: Sequence[tuple[str, object]]) -> str:
