@@ -65,10 +65,9 @@ def make_model(run: Run, name: str, word: str, path: Path) -> torch.nn.Module:
         if run.scale == "smoke":
             options = replace(options, batch_size=32, validate_every=10)
         checkpoints.append(path.with_name(f"{word}-{key}.checkpoint"))
-        tsmlib.fit(
-            net, getattr(net, stage.loss), train, held_out, options, seed=run.seed,
-            checkpoint=checkpoints[-1], progress=f"{name} {word}: {key}",
-        )  # fmt: skip
+        loss, title = getattr(net, stage.loss), f"{name} {word}: {key}"
+        kept = {"checkpoint": checkpoints[-1], "progress": title}
+        tsmlib.fit(net, train, held_out, options, loss, seed=run.seed, **kept)
     header = {"fingerprint": fingerprint(env), "model": word, "seed": run.seed, "scale": run.scale}
     artifacts.save_model(path, net, header)
     for checkpoint in checkpoints:

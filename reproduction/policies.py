@@ -49,7 +49,7 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
         policy: Policy = tsmlib.SegmentPolicy(dx, load_prior(run, name), **how)
     else:
         policy = tsmlib.OneStepPolicy(dx, du, **how)
-    policy.features.fit(torch.from_numpy(data.states), data.lengths)
+    policy.features.fit(data)
     n = run.pick(4, 300, 2200)
     options = tsmlib.LearningOptions(
         horizon=task.horizon,

@@ -63,7 +63,7 @@ def robot_rows(run: Run, env: str, word: str) -> list[Row]:
     options = tsmlib.TrainingOptions(
         net.past_len, 10, updates, batch_size=128, lr=4e-3, muon=0.02, warmup=20
     )
-    tsmlib.fit(net, net.loss, train, held_out, options, seed=run.seed, progress=f"{env} {word}")
+    tsmlib.fit(net, train, held_out, options, seed=run.seed, progress=f"{env} {word}")
     scores = tsmlib.score(
         net, net.features, test, held_out, samples=32, horizon=max(AHEAD), starts=(10,)
     )

@@ -220,10 +220,11 @@ def adapted_rows(run: Run, name: str, way_name: str) -> list[Row]:
         spec = zoo.find(word)
         arguments = spec.arguments(EnvSpec.parse(env))
         net = spec.load().for_data(train, seed=run.seed, **arguments)
-        tsmlib.fit(net, net.loss, train, held_out, _training(net.past_len, 20, scratch, 0.02))
+        options = _training(net.past_len, 20, scratch, 0.02)
+        tsmlib.fit(net, train, held_out, options, seed=run.seed)
     elif way != "zero":
         options = _training(net.past_len, 20, tuned, lr=RATES[way])
-        tsmlib.fine_tune(net, net.loss, train, held_out, options, part=way, seed=run.seed)
+        tsmlib.fine_tune(net, train, held_out, options, part=way, seed=run.seed)
     n = run.pick(4, 50, 100)
     tests = [random_data(env, n, seed=HELD_OUT[split]) for split in ("test", "validation")]
     units = tsmlib.load_pretrained("lstm", env=env_id(standard)).features
@@ -291,7 +292,7 @@ def _fitted(
     muon = 0.01 if world and world.augmented else 0.0
     options = _training(net.past_len, future_len, steps, muon)
     kept = folder / f"{type(net).__name__}.checkpoint"
-    tsmlib.fit(net, net.loss, data, held_out, options, seed=seed, checkpoint=kept)
+    tsmlib.fit(net, data, held_out, options, seed=seed, checkpoint=kept)
 
 
 def _seed(run: Run, k: int) -> int:
