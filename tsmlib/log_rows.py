@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -177,10 +177,8 @@ def names_of(field_: str, names: Sequence[str]) -> tuple[str, ...]:
 
 def _column(table: Table, name: str) -> np.ndarray:
     """A column of any table as an array (M,) of whatever it holds."""
-    names = getattr(table, "columns", None)
-    known = [
-        str(n) for n in (table if names is None and isinstance(table, Mapping) else names or ())
-    ]
+    names = getattr(table, "column_names", getattr(table, "columns", table))
+    known = [str(n) for n in names] if isinstance(names, Iterable) else []
     if known and name not in known:
         near = get_close_matches(name, known, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
@@ -275,18 +273,15 @@ def scaled(
     notes = []
     if isinstance(bounds, str):
         require_choice("bounds", bounds, ("data",))
-        edges = [
-            X
-        ]
+        known = [u[np.isfinite(u)] for u in actions.T]
+        edges = [(u.min(initial=np.inf), u.max(initial=-np.inf)) for u in known]
         pairs: Mapping[str, tuple[float, float]] = dict(zip(names, edges, strict=True))
         said = ", ".join(f"'{name}' {low:g} to {high:g}" for name, (low, high) in pairs.items())
         notes.append(f"actions are scaled by their range in the data: {said}")
     else:
         pairs = bounds if isinstance(bounds, Mapping) else dict.fromkeys(names, bounds)
     if set(pairs) != set(names):
-        raise TrajectoryError(
-            f"bounds are of {sorted(pairs)}; expected one pair for each of {names}"
-        )
+        raise TrajectoryError(f"bounds are of {list(pairs)}; expected one pair for each of {names}")
     inside = np.empty_like(actions, np.float64)
     for column, name in enumerate(names):
         pair = np.asarray(pairs[name])
