@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.checks import as_tensor, require_count, require_seed
+from tsmlib.checks import LARGEST, as_tensor, require_count, require_seed
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, NoNoise, by_generator
 from tsmlib.storage.files import Json
@@ -254,7 +254,7 @@ def predict(
     if samples is None:
         states = rollout(model, seen, moves).to(home)
     else:
-        copies = require_count("samples", samples)
+        copies = require_count("samples", samples, most=LARGEST)
         repeated = Segment(*(part.repeat(copies, 1, 1) for part in seen))
         draw = torch.Generator().manual_seed(require_seed("seed", seed))
         states = rollout(model, repeated, moves.repeat(copies, 1, 1), generator=draw).to(home)

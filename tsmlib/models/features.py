@@ -63,6 +63,11 @@ class Features(nn.Module):
             These features.
         """
         if isinstance(data, Trajectories):
+            if data.robot.state_dim != len(self.step_std):
+                raise ValueError(
+                    f"data has {data.robot.state_dim} state dimensions; expected "
+                    f"{len(self.step_std)}"
+                )
             rows, lengths = torch.from_numpy(data.flat_states), data.steps + 1
         else:
             rows = as_tensor("data", data, ("N", "T + 1", len(self.step_std))).detach().cpu()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.checks import require_count, require_counts, require_flag
+from tsmlib.checks import LARGEST, require_count, require_counts, require_flag
 from tsmlib.sampling import Noise, standard_normal
 
 BLOCK = 1024  # rows that are decoded at once on a CPU
@@ -132,8 +132,8 @@ class CausalDecoder(nn.Module):
     ) -> None:
         super().__init__()
         require_counts(channels=channels)
-        require_count("head_channels", head_channels, least=0)
-        require_count("state_skip", state_skip, least=0)
+        require_count("head_channels", head_channels, least=0, most=LARGEST)
+        require_count("state_skip", state_skip, least=0, most=LARGEST)
         require_flag("plain", plain)
         if isinstance(dilations, str) or not isinstance(dilations, Sequence) or not dilations:
             raise TypeError(f"dilations is {dilations!r:.80}; expected a tuple such as (1, 2, 4)")

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from tsmlib.checks import require_type
 from tsmlib.storage import files
 from tsmlib.storage.files import PathLike, StoreError
 
@@ -51,6 +52,7 @@ class CsvCallback:
     """
 
     def __init__(self, path: PathLike) -> None:
+        require_type("path", path, (str, Path), "the path of a CSV file")
         self.path = Path(path)
 
     def __call__(self, progress: Progress) -> None:
@@ -85,6 +87,7 @@ class TensorBoardCallback:
     """
 
     def __init__(self, folder: PathLike) -> None:
+        require_type("folder", folder, (str, Path), "the path of a folder")
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError as error:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -96,6 +97,9 @@ def fit(
     if callback is not None:
         require_callable("callback", callback, "a function of a Progress")
     require_seed("seed", seed)
+    require_type("progress", progress, (bool, str), "True, False or the title of a bar")
+    if checkpoint is not None:
+        require_type("checkpoint", checkpoint, (str, Path), "the path of a folder")
     if hasattr(model, "take_robot"):
         model.take_robot(train)
     lengths = {"past_len": o.past_len, "future_len": o.future_len}
@@ -207,6 +211,11 @@ def _update(
     _require_finite(state, "training loss", value.item(), step)
     state.model.zero_grad(set_to_none=True)
     value.backward()
+    if all(weight.grad is None for weight in state.model.parameters()):
+        raise ValueError(
+            f"loss has no gradient for any weight of this {type(state.model).__name__}; expected "
+            "a function of the weights of the model that is trained, such as loss=model.loss"
+        )
     norm = nn.utils.clip_grad_norm_(state.model.parameters(), o.clip)
     _require_finite(state, "gradient", norm.item(), step)  # before it reaches the weights
     for optimizer in state.optimizers.values():

@@ -51,14 +51,14 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         for name in ("past_len", "future_len", "steps", "batch_size", "validate_every"):
-            if (value := getattr(self, name)) is not None or name in ("steps", "batch_size"):
+            if (value := getattr(self, name)) is not None or not name.endswith("_len"):
                 require_count(name, value)
         for name in ("warmup", "patience"):
             require_count(name, getattr(self, name), least=0)
         for name in ("lr_final", "muon", "weight_decay"):
             require_number(name, getattr(self, name), 0)
         require_number("lr", self.lr, 0, above=True)
-        if self.clip != math.inf:
+        if not isinstance(self.clip, float) or self.clip != math.inf:
             require_number("clip", self.clip, 0, above=True)
         if not isinstance(self.span, tuple | list) or len(self.span) != 2:
             raise TypeError(f"span is {self.span!r:.80}; expected two numbers, as in (0.0, 1.0)")
