@@ -7,41 +7,33 @@ READY := $(VENV)/.ready
 PIP := $(PY) -m pip --disable-pip-version-check install --progress-bar on
 TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
-.PHONY: help quickstart collect train predict latent control robustness action_prior claims your_own explore test reliability bench explorer docs lint clean
+NOTEBOOKS := quickstart collect train predict latent control robustness action_prior claims your_own explore pusht
+
+.PHONY: help $(NOTEBOOKS) test reliability bench explorer docs lint clean
 
 help:
-	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb into runs/"
-	@echo "make quickstart   the whole method in a minute (notebooks/00_quickstart.ipynb)"
-	@echo "make collect   collect data      (notebooks/01_collect.ipynb)"
-	@echo "make train     train the models  (notebooks/02_train.ipynb)"
-	@echo "make predict   score predictions (notebooks/03_predict.ipynb)"
-	@echo "make latent    use and meaning of latent codes (notebooks/04_latent.ipynb)"
-	@echo "make robustness   noisy sensors and delayed actions (notebooks/06_robustness.ipynb)"
-	@echo "make action_prior   plans with and without the action prior (notebooks/07_action_prior.ipynb)"
-	@echo "make claims    verdicts on the paper's claims from the results that ship (notebooks/08_claims.ipynb)"
-	@echo "make your_own  Gymnasium's robots, from id to film (notebooks/09_your_own.ipynb)"
-	@echo "make explore   rounds of planning and learning, a model adapted to a changed arm (notebooks/10_explore.ipynb)"
+	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb"
+	@echo "make quickstart, collect, train, predict, latent, robustness, action_prior, claims, your_own, explore, pusht"
+	@echo "               the other notebooks, into runs/laptop/seed0/"
 	@echo "make test      all tests, among them every notebook, cut down"
-	@echo "make reliability   the reliability checks at full length, and docs/reliability.md (an hour of one CPU)"
-	@echo "make bench     speed of everything against references, and docs/speed.md"
-	@echo "make explorer  the page for the browser, into explorer/dist (needs node and npm); python -m tsmlib explore serves it"
+	@echo "make reliability   kills and damaged files, at full length"
+	@echo "make bench     speed against references, and docs/speed.md"
+	@echo "make explorer  the page for the browser, into explorer/dist (needs node and npm)"
 	@echo "make docs      the documentation, into docs/_build/html"
 	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
-quickstart collect train predict latent control robustness action_prior claims your_own explore: $(READY)
+$(NOTEBOOKS): $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)
 	$(TEST) tests
-	$(TEST) --nbval-lax notebooks/00_quickstart.ipynb notebooks/08_claims.ipynb
 
 reliability: $(READY)
 	$(PY) tests/reliability $(PARTS)
 
 bench: $(READY)
-	$(PY) -m tsmlib bench
-	$(PY) -m tsmlib bench table
+	$(PY) benchmarks/speed.py
 
 explorer: $(READY)
 	@command -v npm >/dev/null || { echo "the explorer is built with node and npm, of which npm is missing: install node 20 or newer" >&2; exit 1; }

@@ -14,7 +14,7 @@ from reproduction.runs import Run
 from tsmlib.pretrained import ROOT
 
 NOTEBOOKS = ROOT / "notebooks"
-TOOLS = ("papermill", "ipykernel", "pandas", "ipywidgets", "imageio_ffmpeg")  # extra "notebooks"
+TOOLS = ("papermill", "ipykernel", "pandas", "ipywidgets", "imageio_ffmpeg")  # extra "study"
 Value = bool | int | float | str
 
 
@@ -146,7 +146,7 @@ def require_tools() -> None:
     if missing := [name for name in TOOLS if importlib.util.find_spec(name) is None]:
         raise RunError(
             f"notebooks need {', '.join(missing)}, missing here; type: "
-            f"{sys.executable} -m pip install 'tsmlib[notebooks]'"
+            f"{sys.executable} -m pip install 'tsmlib[study]'"
         )
 
 

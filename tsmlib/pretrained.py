@@ -46,7 +46,11 @@ def load_pretrained(model: str, *, env: str) -> DynamicsModel:
     if not (path := folder / f"{model}.safetensors").exists():
         there = [path.stem for path in sorted(folder.glob("*.safetensors")) if path.stem in zoo.ZOO]
         known = f"there are {', '.join(there)}" if there else "there are none"
-        raise ValueError(f"no pretrained {model} of {env} in {folder}: {known}.")
+        name = f"models/{EnvSpec.parse(trained_on).name}/{model}"
+        raise ValueError(
+            f"no pretrained {model} of {env} in {folder}: {known}. To train one, type: "
+            f"python -m tsmlib make {name} --scale paper"
+        )
     expect = tsmlib.envs.fingerprint(trained_on)
     cls = zoo.find(model).load()
     return cast("DynamicsModel", artifacts.load_model(path, cls, expect=expect))

@@ -94,8 +94,8 @@ def unpacked(path: Path, data: bytes) -> bytes:
 
 def remedy(path: Path) -> str:
     """Advice about a damaged file."""
-    if any((folder / MANIFEST).is_file() for folder in path.absolute().parents):
-        return "Restore it: git checkout -- data in a clone; where tsmlib is installed, install it again."
+    if "data" in path.absolute().parts:
+        return "Restore it: git checkout -- data in a clone; else install tsmlib again."
     return "Delete it and make it again."
 
 
