@@ -1,0 +1,131 @@
+"""A one-step model that sees everything from one of the bodies. Not in the paper.
+
+    s = [places, velocities and action as seen from body b, and where b itself is]
+    x_{t+1} = x_t + R(b) D (A s + f(s))             R: from the body's frame back to the world's
+
+What happens when a thing is pushed does not depend on where in the world it lies, so a network that sees it from there
+learns a contact once. Only the walls need to know where that is. It is a segment model with H = 1.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from tsmlib.models.base import Step, rollout
+from tsmlib.models.config import Configured
+from tsmlib.models.features import Featured
+from tsmlib.models.features import Features
+from tsmlib.sampling import Noise
+from tsmlib.storage.files import Json
+from tsmlib.trajectory import Segment, Trajectories, Window
+
+
+class Egocentric(Featured, Configured):
+    """A fully connected network in the frame of a body that moves in the plane.
+
+    Args:
+        state_dim: dx.
+        action_dim: du = 2, a vector in the plane.
+        angles: state dimensions in radians.
+        body: columns x, y and angle of the body.
+        places: pairs of columns that are places of other things.
+        vectors: pairs of columns that are vectors, velocities for example.
+        hidden: width of the network.
+        layers: hidden layers.
+    """
+
+    segment_len, past_len, stochastic = 1, 1, False
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        angles: tuple[int, ...] = (4,),
+        body: tuple[int, int, int] = (2, 3, 4),
+        places: tuple[tuple[int, int], ...] = ((0, 1),),
+        vectors: tuple[tuple[int, int], ...] = ((5, 6),),
+        hidden: int = 256,
+        layers: int = 3,
+    ) -> None:
+        super().__init__()
+        self.features = Features(state_dim, tuple(angles))
+        x, y, self.angle = body
+        self.pairs = [[x, y], *map(list, places), *map(list, vectors)]
+        self.n_places, dim = len(places), 2 * (len(places) + len(vectors)) + action_dim + 4
+        widths = [dim, *[hidden] * layers]
+        inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
+        self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
+        self.linear = nn.Linear(dim, state_dim)
+        self.output_layers = (f"net.{len(inner)}", "linear")
+        self.register_buffer("seen_mean", torch.zeros(dim))
+        self.register_buffer("seen_std", torch.ones(dim))
+        self.register_buffer("step_std", torch.ones(state_dim))  # in the body's frame
+
+    @classmethod
+    def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
+        """The model of ``data`` as training starts, with its statistics."""
+        model = super().for_data(data, seed=seed, **options)
+        x, u = torch.from_numpy(data.states), torch.from_numpy(data.actions)
+        before, after, u = (part.flatten(0, 1)[::7] for part in (x[:, :-1], x[:, 1:], u))
+        seen, step = model._seen(before, u), model._increments(before, after)
+        model.seen_mean.copy_(seen.mean(0))
+        model.seen_std.copy_(seen.std(0).clamp(min=1e-6))
+        model.step_std.copy_(step.std(0))
+        return model
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        """(..., dx), (..., du) -> (..., dx)."""
+        s = (self._seen(x, u) - self.seen_mean) / self.seen_std
+        d = (self.net(s) + self.linear(s)) * self.step_std
+        cosine, sine = x[..., self.angle, None].cos(), x[..., self.angle, None].sin()
+        moved = x.new_zeros(x.shape)
+        turned = _turned(d[..., :-1].unflatten(-1, (-1, 2)), cosine, sine).flatten(-2)
+        moved = torch.cat([turned, d[..., -1:]], dim=-1)
+        return x + moved[..., self._order()]
+
+    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
+        """Go on from the last state, for any number of steps. There is nothing to draw."""
+        x = past.states[:, -1]
+
+        def step(u: Tensor) -> Tensor:
+            nonlocal x
+            x = self.step(x, u)
+            return x
+
+        return step
+
+    def loss(self, window: Window, generator: Noise) -> Tensor:
+        """Mean distance of the states that it reaches on its own predictions, in the size of steps."""
+        predicted = rollout(self, window.past, window.future.actions)
+        apart = self.features.increments(predicted, window.future.states)
+        return (apart.square().sum(-1) + 1e-4).sqrt().mean()
+
+    def _order(self) -> list[int]:
+        """Where each state dimension stands among the pairs, and the angle at the end."""
+        columns = [c for pair in self.pairs for c in pair] + [self.angle]
+        return [columns.index(c) for c in range(len(columns))]
+
+    def _seen(self, x: Tensor, u: Tensor) -> Tensor:
+        cosine, sine = x[..., self.angle, None].cos(), x[..., self.angle, None].sin()
+        own, *others = (x[..., pair] for pair in self.pairs)
+        others = [p - own if i < self.n_places else p for i, p in enumerate(others)]
+        turned = _turned(torch.stack([*others, u], dim=-2), cosine, -sine).flatten(-2)
+        return torch.cat([turned, own, cosine, sine], dim=-1)
+
+    def _increments(self, before: Tensor, after: Tensor) -> Tensor:
+        """What a step changes, in the body's frame: pairs, then the angle."""
+        cosine, sine = before[..., self.angle, None].cos(), before[..., self.angle, None].sin()
+        change = torch.stack([(after - before)[..., pair] for pair in self.pairs], dim=-2)
+        turned = _turned(change, cosine, -sine).flatten(-2)
+        return torch.cat([turned, (after - before)[..., [self.angle]]], dim=-1)
+
+
+def _turned(pairs: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Vectors (..., n, 2) turned by an angle whose cosine and sine are (..., 1)."""
+    x, y = pairs.unbind(-1)
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
