@@ -1,11 +1,14 @@
 """PushT: its physics, its starts and goals, and the three measures of success."""
 
+import dataclasses
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 
-import tsmlib  # noqa: F401 - registers the environments
+import tsmlib
 from tsmlib.collection import collect
 from tsmlib.envs.pusht import PushT, weak_policy
 from tsmlib.envs.pusht_field import (
@@ -19,7 +22,16 @@ from tsmlib.envs.pusht_field import (
     symmetric_copies,
 )
 from tsmlib.envs.stepping import make_simulation
-from tsmlib.planning.pusht import coverage, solved_b, solved_c, success_a, success_b, success_c
+from tsmlib.models.egocentric import Egocentric
+from tsmlib.planning.pusht import (
+    coverage,
+    pusht_task,
+    solved_b,
+    solved_c,
+    success_a,
+    success_b,
+    success_c,
+)
 
 
 def play(n=12, horizon=30, env_id="tsm/PushT-v0", seed=0):
@@ -187,3 +199,93 @@ def test_a_picture_shows_pusher_t_and_goal():
     for x, y, colour in ((400, 400, "#4169E1"), (150, 165, "#778899"), (256, 290, "#90EE90")):
         rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert np.abs(picture[y // 4, x // 4].astype(int) - rgb).max() < 12
+
+
+def pairs(n=3, horizon=25):
+    """States of random play and those 25 steps later, with the actions in between."""
+    seen = play(60, horizon, seed=7)
+    start, goal = seen.states[:, 0], seen.states[:, -1]
+    moved = np.linalg.norm(goal[:, 2:4] - start[:, 2:4], axis=-1) > 30
+    chosen = np.flatnonzero(in_field(goal) & moved)[:n]
+    return start[chosen], goal[chosen], torch.from_numpy(seen.actions[chosen])
+
+
+def test_actions_that_led_to_a_goal_are_a_success_in_every_protocol():
+    start, goal, actions = pairs()
+    still = torch.cat([actions, torch.zeros(len(goal), 3, 2)], dim=1)
+    for protocol in "ABC":
+        task = dataclasses.replace(pusht_task(start, goal, protocol), horizon=28)
+        assert tsmlib.execute(task, still).success.all() or protocol == "C"
+        assert not tsmlib.execute(task, torch.zeros_like(still)).success.any()
+
+
+def test_the_reward_is_best_for_the_actions_that_led_to_the_goal():
+    start, goal, actions = pairs()
+    task = pusht_task(start, goal, "B")
+    predict = tsmlib.simulator_predictor(task)
+    other = torch.stack([actions, 0.8 * actions, torch.zeros_like(actions)])
+    returns = task.reward(predict(other)[0], other).sum(-1)
+    assert (returns.argmax(0) == 0).all()
+
+
+def test_pairs_are_judged_by_their_own_goal_when_some_are_taken():
+    start, goal, actions = pairs()
+    task = dataclasses.replace(pusht_task(start, goal), horizon=25).take([2, 0])
+    assert tsmlib.execute(task, actions[[2, 0]]).success.all()
+    assert not tsmlib.execute(task, actions[[0, 2]]).success.any()
+
+
+def test_the_simulator_predicts_what_follows_in_the_middle_of_an_episode():
+    start, goal, actions = pairs()
+    task = pusht_task(start, goal)
+    whole = tsmlib.simulator_predictor(task)(actions[None])
+    rest = tsmlib.simulator_predictor(task, done=actions[:, :10])(actions[None, :, 10:])
+    assert torch.equal(rest, whole[:, :, :, 10:])
+
+
+def test_plans_of_a_lookahead_follow_each_other_to_the_end_of_the_episode():
+    start, goal, _ = pairs(2)
+    task = dataclasses.replace(pusht_task(start, goal), horizon=12)
+    space = tsmlib.DirectActions(5, rms=0.6, smoothness=0)
+    planner = partial(tsmlib.cem, candidates=4, elites=2, iterations=1)
+    trial = tsmlib.mpc(task, None, space, planner, every=3, lookahead=5)
+    assert trial.actions.shape == (2, 12, 2)
+    assert trial.gap.shape == (2,)
+    with pytest.raises(ValueError, match="lookahead is 2"):
+        tsmlib.mpc(task, None, space, planner, every=3, lookahead=2)
+
+
+def test_bad_pairs_are_named():
+    start, goal, _ = pairs(1)
+    with pytest.raises(ValueError, match="pair 0 is solved at the start by protocol B"):
+        pusht_task(start, start)
+    with pytest.raises(ValueError, match="goal 0 is outside the field"):
+        pusht_task(start, goal + np.array([0, 0, 400, 0, 0, 0, 0]))
+    with pytest.raises(ValueError, match="protocol is 'D'"):
+        pusht_task(start, goal, "D")
+
+
+@pytest.fixture(scope="module")
+def model(data):
+    return Egocentric.for_data(data, hidden=16)
+
+
+def test_what_is_seen_from_the_t_does_not_depend_on_where_it_lies(model, data):
+    x, u = torch.from_numpy(data.states[:, 3]), torch.from_numpy(data.actions[:, 3])
+    turned, actions = symmetric_copies(data.states[:, 3:5], data.actions[:, 3:4])
+    x2, u2 = torch.from_numpy(turned[len(x) :, 0]), torch.from_numpy(actions[len(x) :, 0])
+    seen, other = model._seen(x, u), model._seen(x2, u2)[: len(x)]  # a quarter turn later
+    assert torch.allclose(seen[:, :6], other[:, :6], atol=1e-3)  # all but where the T itself is
+
+
+def test_increments_in_the_frame_of_the_t_are_put_back_into_the_world(model, data):
+    before, after = torch.from_numpy(data.states[:, 3]), torch.from_numpy(data.states[:, 4])
+    change = model._increments(before, after)
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.zero_()
+        expected = []
+        for row, x in zip(change, before, strict=True):
+            model.linear.bias.copy_(row / model.step_std)
+            expected.append(model.step(x, torch.zeros(2)))
+    assert torch.allclose(torch.stack(expected), after, atol=1e-3)

@@ -3,8 +3,9 @@
     s = [places, velocities and action as seen from body b, and where b itself is]
     x_{t+1} = x_t + R(b) D (A s + f(s))             R: from the body's frame back to the world's
 
-What happens when a thing is pushed does not depend on where in the world it lies, so a network that sees it from there
-learns a contact once. Only the walls need to know where that is. It is a segment model with H = 1.
+What happens when a thing is pushed does not depend on where in the world it lies, so a network that
+sees it from there learns a contact once. Only the walls need to know where that is. It is a segment
+model with H = 1.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tsmlib.models.base import Step, rollout
 from tsmlib.models.config import Configured
-from tsmlib.models.features import Featured
-from tsmlib.models.features import Features
+from tsmlib.models.features import Featured, Features
 from tsmlib.sampling import Noise
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Trajectories, Window
@@ -39,6 +40,9 @@ class Egocentric(Featured, Configured):
     """
 
     segment_len, past_len, stochastic = 1, 1, False
+    seen_mean: Tensor
+    seen_std: Tensor
+    step_std: Tensor
 
     def __init__(
         self,
@@ -70,8 +74,10 @@ class Egocentric(Featured, Configured):
     def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
         """The model of ``data`` as training starts, with its statistics."""
         model = super().for_data(data, seed=seed, **options)
-        x, u = torch.from_numpy(data.states), torch.from_numpy(data.actions)
-        before, after, u = (part.flatten(0, 1)[::7] for part in (x[:, :-1], x[:, 1:], u))
+        at = np.arange(len(data.flat_actions)) + np.repeat(np.arange(len(data)), data.lengths)
+        at, x = at[:: 1 + len(at) // 100_000], torch.from_numpy(data.flat_states)
+        before, after = x[at], x[at + 1]
+        u = torch.from_numpy(data.flat_actions)[:: 1 + len(data.flat_actions) // 100_000]
         seen, step = model._seen(before, u), model._increments(before, after)
         model.seen_mean.copy_(seen.mean(0))
         model.seen_std.copy_(seen.std(0).clamp(min=1e-6))
@@ -100,7 +106,7 @@ class Egocentric(Featured, Configured):
         return step
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Mean distance of the states that it reaches on its own predictions, in the size of steps."""
+        """Mean distance, in the size of steps, of the states it reaches on its own predictions."""
         predicted = rollout(self, window.past, window.future.actions)
         apart = self.features.increments(predicted, window.future.states)
         return (apart.square().sum(-1) + 1e-4).sqrt().mean()

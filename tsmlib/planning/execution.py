@@ -206,6 +206,7 @@ def mpc(
     planner: Planner,
     *,
     every: int = 10,
+    lookahead: int | None = None,
     plan: Plan | None = None,
     judge: Judge = model_predictor,
     seed: int = 0,
@@ -213,16 +214,19 @@ def mpc(
 ) -> Trial:
     """Closed loop: plan to the end of the episode, execute some steps, observe, repeat.
 
-    The horizon shrinks: T, T - every, T - 2 every, ... steps. Each plan starts from what is left of
+    The horizon shrinks: T, T - every, T - 2 every, ... steps; with ``lookahead`` only where less
+    is left. Each plan starts from what is left of
     the one before it (``SearchSpace.after``), and is never worse than that by its own prediction.
     Its predicted return comes from samples that had no part in choosing it (``fresh_predictor``).
 
     Args:
         task: whose starts and reward are meant.
         model: what plans are made through, from the observed past; None is the true simulator.
-        space: of the whole episode.
+        space: of the whole episode, or of ``lookahead`` steps.
         planner: with the budget of each plan, such as ``partial(cem, candidates=96)``.
         every: steps executed before the next plan.
+        lookahead: steps of each plan, where it is not to reach to the end of the episode; of
+            ``DirectActions``, whose new steps begin at zero.
         plan: the first one, if there is one already, so that closed and open loop begin alike.
         judge: makes what candidates are judged by, by default the model's mode.
         seed: of what judges and fresh samples draw, 0 or above.
@@ -240,6 +244,9 @@ def mpc(
     """
     _require_task(task)
     every = require_count("every", every)
+    ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead)
+    if ahead < every:
+        raise ValueError(f"lookahead is {ahead}; expected at least the {every} steps of every")
     seed = require_count("seed", seed, least=0)
     require_callable("planner", planner, "a function, such as tsmlib.cem")
     require_callable("judge", judge, "a function, such as tsmlib.model_predictor")
@@ -249,7 +256,7 @@ def mpc(
     began, horizon = time.perf_counter(), task.horizon
     past_len = 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(
-        task, model, planner, every, judge, seed, space, start=len(task), plan=plan
+        task, model, planner, every, ahead, judge, seed, space, start=len(task), plan=plan
     )
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
@@ -276,12 +283,13 @@ def mpc(
 
 @dataclass
 class _Replanning:
-    """The controller that plans to the end of the episode each time, and keeps predictions."""
+    """The controller that plans each time it is asked, and keeps predictions."""
 
     task: Task
     model: Model | None
     planner: Planner
     every: int
+    ahead: int  # steps of a plan, where as many are left
     judge: Judge
     seed: int
     space: SearchSpace  # of the rest of the episode, as are start and plan
@@ -304,18 +312,23 @@ class _Replanning:
         steps = min(self.every, self.task.horizon - self.done)
         self.done += steps
         if self.done < self.task.horizon:
-            self.space, left = self.space.after(plan.parameters, steps)
+            rest, left = self.space.after(plan.parameters, steps)
+            if self.ahead < self.task.horizon:  # as long a plan as before, or as far as the end
+                needed = min(self.ahead, self.task.horizon - self.done)
+                left = F.pad(left, (0, 0, 0, needed - left.shape[1]))
+                rest, _ = self.space.after(plan.parameters, plan.actions.shape[1] - needed)
+            self.space = rest
             self.start = left[None]
         return plan.actions[:, :steps]
 
     def _require_whole(self, plan: Plan) -> None:
         require_type("what the planner gave", plan, Plan, "a Plan, as of tsmlib.cem")
         left = self.task.horizon - self.done
-        if plan.actions.shape[1] != left:
+        if plan.actions.shape[1] != min(self.ahead, left):
             raise ValueError(
                 f"space gives plans of {plan.actions.shape[1]} steps, but {left} of the "
                 f"{self.task.horizon} steps of task {self.task.name!r} are left; give a space of "
-                "the whole episode, task.horizon steps"
+                "the whole episode, task.horizon steps, or of lookahead steps"
             )
 
     def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:

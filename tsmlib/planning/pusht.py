@@ -7,11 +7,23 @@ Protocols are never mixed; ``docs/explanation/pusht.md`` says where each comes f
 from __future__ import annotations
 
 import math
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.envs.pusht_field import SHAPES
+from tsmlib.checks import require_choice
+from tsmlib.envs.pusht_field import (
+    ENV_ID,
+    SHAPES,
+    PushTPhysics,
+    pusht_physics,
+    require_in_field,
+    require_states,
+)
+from tsmlib.planning.tasks import Task
+from tsmlib.rewards import Reward
 
 COVERED = 0.95  # A: share of the goal's area
 NEAR, TURNED = 20.0, math.pi / 9  # B: px of (pusher, T) as one vector of four, rad
@@ -62,6 +74,85 @@ def solved_c(states: Tensor, goal: Tensor) -> Tensor:
 def success_c(states: Tensor, goal: Tensor) -> Tensor:
     """Protocol C, CLEAR-LeWM Strict: solved in three states in a row. (..., T, 7) -> (...) bool."""
     return solved_c(states, goal[..., None, :]).unfold(-1, HELD, 1).all(-1).any(-1)
+
+
+def closest(
+    goal: Tensor, *, pusher: bool, held: int = 1, shape: str = "T", scale: float = 30.0
+) -> Reward:
+    """Reward of coming close to a goal once: minus the least distance in an episode, in px.
+
+    The distance of a state is the mean over the corners of the T, with ``pusher`` together with the
+    pusher's by Pythagoras. What counts is the best of all moments, since the first hit is a
+    success; a tenth of the mean over time is added, so that plans that get there sooner are better.
+
+    Args:
+        goal: (B, 7).
+        pusher: whether the pusher has a goal too.
+        held: steps in a row of which the worst counts.
+        shape, scale: of what is pushed.
+
+    Returns:
+        A reward of states (..., B, T, 7), given in the last step, but for the mean.
+    """
+    corners = torch.tensor(PushTPhysics(scale=scale, shape=shape).boxes, dtype=torch.float32)
+    corners = corners.flatten(0, 1)
+    wanted = _placed(corners, goal)[:, None]
+
+    def reward(states: Tensor, actions: Tensor) -> Tensor:
+        away = (_placed(corners, states) - wanted).norm(dim=-1).mean(-1)  # (..., B, T)
+        if pusher:
+            away = (away.square() + (states[..., :2] - goal[:, None, :2]).square().sum(-1)).sqrt()
+        steps = away.shape[-1]
+        best = away.unfold(-1, min(held, steps), 1).amax(-1).amin(-1)
+        last = torch.arange(steps) == steps - 1
+        return -torch.where(last, best[..., None], 0.0) - 0.1 * away / steps
+
+    return reward
+
+
+PROTOCOLS = {  # success, steps, whether the pusher has a goal, and steps to hold
+    "A": (success_a, 300, False, 1),
+    "B": (success_b, 50, True, 1),
+    "C": (success_c, 50, False, HELD),
+}
+
+
+def pusht_task(
+    start: np.ndarray, goal: np.ndarray, protocol: str = "B", *, env: str = ENV_ID
+) -> Task:
+    """Pairs (start, goal) as a task under one of the protocols.
+
+    Args:
+        start: (B, 7), px and rad.
+        goal: (B, 7); the pusher's part means something in protocol B alone.
+        protocol: "A", "B" or "C".
+        env: id of the field.
+
+    Raises:
+        ValueError: a goal outside the field, or a pair that is solved at the start; it is named.
+    """
+    success, horizon, pusher, held = PROTOCOLS[require_choice("protocol", protocol, PROTOCOLS)]
+    physics = pusht_physics(env)
+    start = require_states("start", start, len(start)).astype(np.float32)
+    goal = require_states("goal", goal, len(start)).astype(np.float32)
+    require_in_field("goal", goal, physics)
+    target = torch.from_numpy(goal)
+    solved = success(torch.from_numpy(start)[:, None].expand(-1, HELD, -1), target)
+    if solved.any():
+        i = int(solved.nonzero()[0])
+        raise ValueError(
+            f"pair {i} is solved at the start by protocol {protocol}: T at {start[i, 2:4]}, goal "
+            f"at {goal[i, 2:4]}; expected pairs in which something is left to do"
+        )
+    return Task(
+        f"pusht {protocol}",
+        env,
+        start,
+        target,
+        partial(closest, pusher=pusher, held=held, shape=physics.shape, scale=physics.scale),
+        horizon=horizon,
+        success_for=lambda goal: partial(success, goal=goal),
+    )
 
 
 def _inside(points: Tensor) -> Tensor:

@@ -57,6 +57,7 @@ class Task:
         tolerance: distance within which a trial is a success.
         seeds: (B,), of the resets that ``start`` was seen after; none where states can be set.
         success: of executed states (B, T + 1, dx) whether, or how far from, success: (B,).
+        success_for: targets (B, dg) -> success, where it depends on them.
         action_dim: du.
         idle: (du,), the action in [-1, 1] that does nothing; zeros without.
 
@@ -79,6 +80,7 @@ class Task:
     success: Success | None = None
     action_dim: int = 2
     idle: Tensor | None = None
+    success_for: Callable[[Tensor], Success] | None = None
 
     def __repr__(self) -> str:
         return f"Task({self.name!r}, {self.env!r}, {len(self.start)} starts, {self.horizon} steps)"
@@ -285,13 +287,14 @@ class Task:
         Raises:
             ValueError: the task's ``success`` gives something else, or NaN.
         """
-        if self.success is None and self.position is not None:
+        judge = self.success_for(self.target) if self.success_for else self.success
+        if judge is None and self.position is not None:
             distance = rewards.final_distance(states, self.target, self.position)
             return distance, distance <= self.tolerance
         nothing = states.new_full((len(self),), torch.nan)
-        if self.success is None:
+        if judge is None:
             return nothing, None
-        success = self.success(states)
+        success = judge(states)
         if not isinstance(success, Tensor) or success.shape != (len(self),):
             raise ValueError(
                 f"success of task {self.name!r} is {described(success)} for states "
