@@ -297,18 +297,19 @@ def simulator_predictor(
         raise ValueError(
             f"candidates in {name} have no common start; give start (B, dx), or a task"
         )
-    begin = as_tensor("start", start, ("B", "dx"))
+    begin = np.asarray(start)  # in full precision
+    checked = as_tensor("start", begin, ("B", "dx"))
     if pusht and task is not None and done is not None:
-        return SimulatorPredictor(begin, partial(_replayed, task, done))
+        return SimulatorPredictor(checked, partial(_replayed, task, done))
     make = cache(partial(make_simulation, name))
 
     def outcomes(actions: Tensor) -> Tensor:
         n, n_targets, horizon, _ = actions.shape
-        states, torques = np.tile(begin.numpy(), (n, 1)), open_loop(actions.flatten(0, 1))
+        states, torques = np.tile(begin, (n, 1)), open_loop(actions.flatten(0, 1))
         seen = collect(make(n * n_targets), torques, horizon=horizon, states=states)
         return torch.from_numpy(seen.states[:, 1:]).unflatten(0, (n, n_targets))
 
-    return SimulatorPredictor(begin, outcomes)
+    return SimulatorPredictor(checked, outcomes)
 
 
 def _replayed(task: Task, done: Tensor, actions: Tensor) -> Tensor:
