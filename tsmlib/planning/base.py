@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tsmlib.models.base import Model
 from tsmlib.rewards import Reward
-from tsmlib.trajectory import Segment
+from tsmlib.trajectory import Robot, Segment
 
 Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
 Risk = Callable[[Tensor], Tensor]  # returns of the samples (S, C, B) -> of candidates (C, B)
@@ -73,6 +73,7 @@ class Plan:
             they were not kept.
         start: (B, dx), the states that the plan begins in; None where the predictor did not say.
             ``execute`` refuses the plan for other starts.
+        robot: that the predictor is of; None where it did not say.
     """
 
     actions: Tensor
@@ -83,6 +84,7 @@ class Plan:
     seconds: float
     trace: Tensor | None = None
     start: Tensor | None = None
+    robot: Robot | None = None
 
     def __repr__(self) -> str:
         n, steps = self.actions.shape[:2]

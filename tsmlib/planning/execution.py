@@ -128,8 +128,10 @@ def _require_task(task: object) -> None:
 
 def _open_loop_actions(task: Task, plan: object) -> Tensor:
     """The actions (B, T, du) of a plan, or given as they are, checked against the task."""
-    if isinstance(plan, Plan) and plan.start is not None:
-        task.require_start(plan.start, "the plan")
+    if isinstance(plan, Plan):
+        task.require_robot(plan.robot, "the plan and the task")
+        if plan.start is not None:
+            task.require_start(plan.start, "the plan")
     name, given = ("plan.actions", plan.actions) if isinstance(plan, Plan) else ("actions", plan)
     sizes = (len(task), task.horizon, task.action_dim)
     actions = as_tensor(name, given, sizes)
@@ -194,8 +196,8 @@ def _run(
             run, controller, horizon=horizon, past_len=past_len, seed=seed, states=states
         )
     if task.begins_by_seed:
-        starts = [torch.from_numpy(seen.episode(i)[0][0]) for i in range(len(seen))]
-        task.require_start(torch.stack(starts), "the executed episode")
+        begun = torch.from_numpy(seen.flat_states[seen.offsets])
+        task.require_start(begun, "the executed episode")
     return seen, run
 
 
@@ -253,6 +255,7 @@ def mpc(
     if plan is not None:
         _open_loop_actions(task, plan)
         plan = replace(plan, start=None)  # sensors may say another
+    task.require_robot(getattr(model, "robot", None), "the model and the task")
     began, horizon = time.perf_counter(), task.horizon
     past_len = 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(
@@ -277,6 +280,7 @@ def mpc(
         curve=returns,
         seconds=time.perf_counter() - began,
         start=torch.from_numpy(task.start),
+        robot=getattr(model, "robot", None),
     )
     return _measured(task, run, seen, actions, made)
 

@@ -25,7 +25,7 @@ from tsmlib.models.mixture import Mixture
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise
-from tsmlib.trajectory import Segment
+from tsmlib.trajectory import Robot, Segment
 
 FRESH = 32  # samples behind a predicted return that is reported
 JUDGING = 8  # samples beside the mode by which a candidate is judged
@@ -51,6 +51,11 @@ class ModelPredictor:
     def start(self) -> Tensor:
         """The states (B, dx) that predictions begin in."""
         return self.past.states[:, -1]
+
+    @property
+    def robot(self) -> Robot | None:
+        """That the model is of, where it knows."""
+        return getattr(self.model, "robot", None)
 
     def __repr__(self) -> str:
         what = f"{self.draws} rollouts" if self.noise else "the mode"
@@ -90,6 +95,11 @@ class EnsemblePredictor:
     def start(self) -> Tensor | None:
         """The states (B, dx) that predictions begin in, where they are known."""
         return getattr(self.each[0], "start", None)
+
+    @property
+    def robot(self) -> Robot | None:
+        """That the models are of, where they know."""
+        return getattr(self.each[0], "robot", None)
 
     def __repr__(self) -> str:
         return f"EnsemblePredictor({', '.join(map(repr, self.each))})"

@@ -175,6 +175,7 @@ class Search:
             seconds=time.perf_counter() - self.began,
             trace=torch.stack(self.trace),
             start=getattr(self.predict, "start", None),
+            robot=getattr(self.predict, "robot", None),
         )
 
 

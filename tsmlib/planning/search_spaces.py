@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, described, require_count, require_number
+from tsmlib.checks import as_tensor, require_count, require_number, require_type
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.layers import on_device_of
@@ -70,10 +70,9 @@ class DirectActions:
         Raises:
             ValueError: the data hold no action but zero.
         """
-        if not isinstance(data, Trajectories):
-            raise TypeError(f"data is {described(data)}; expected Trajectories")
+        require_type("data", data, Trajectories, "Trajectories, as collect_random gives")
         rms, smoothness = _like_data(data)
-        return cls(horizon, data.actions.shape[2], rms=rms, smoothness=smoothness)
+        return cls(horizon, data.robot.action_dim, rms=rms, smoothness=smoothness)
 
     def __repr__(self) -> str:
         steps, du = self.shape
@@ -114,7 +113,7 @@ def _like_data(data: Trajectories) -> tuple[float, float]:
 
     Noise through two poles e^(-1 / tau) has the autocorrelation 2 k / (1 + k^2), k = e^(-1 / tau).
     """
-    episodes = [data.actions[i, :n].astype(np.float64) for i, n in enumerate(data.steps)]
+    episodes = [data.episode(i)[1].astype(np.float64) for i in range(len(data))]
     square = float(np.mean(np.concatenate(episodes) ** 2))
     if not square > 0:
         raise ValueError(
@@ -154,11 +153,8 @@ class LatentActions:
         past: Tensor | None = None,
         whole: bool = True,
     ) -> None:
-        if not isinstance(prior, ActionPrior):
-            raise TypeError(
-                f"prior is {described(prior)}; expected an ActionPrior, such as "
-                'tsmlib.load_pretrained("prior", env=env)'
-            )
+        hint = 'an ActionPrior, such as tsmlib.load_pretrained("prior", env=env)'
+        require_type("prior", prior, ActionPrior, hint)
         horizon = require_count("horizon", horizon)
         n_segments = -(-horizon // prior.segment_len)
         if whole and n_segments * prior.segment_len != horizon:

@@ -5,9 +5,11 @@ Letters in shapes: B starts, T horizon, dx, du, dg size of state, action and tar
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import cache
 
 import gymnasium
 import numpy as np
@@ -29,7 +31,7 @@ from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
 from tsmlib.rewards import Reward, require_reward, rewarded
 from tsmlib.sampling import generator_of
-from tsmlib.trajectory import Segment, initial_past
+from tsmlib.trajectory import Robot, Segment, initial_past
 
 HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
@@ -132,8 +134,8 @@ class Task:
             start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
         _require_repeated(env, begun.names, start, again)
         task = cls(
-            name=name or env,
-            env=env,
+            name=name or begun.id,
+            env=env if isinstance(begun, Arms) else begun.id,
             start=start,
             target=torch.zeros(n, 0),
             reward_for=lambda _: reward,
@@ -234,6 +236,11 @@ class Task:
     def reward(self) -> Reward:
         """The task's reward, one target per instance."""
         return self.reward_for(self.target)
+
+    @property
+    def robot(self) -> Robot:
+        """What the numbers of states and actions mean."""
+        return _robot(self.env)
 
     @property
     def begins_by_seed(self) -> bool:
@@ -347,6 +354,21 @@ class Task:
         seeds = tuple(self.seeds[i] for i in indices) if self.seeds else ()
         return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
 
+    def require_robot(self, robot: Robot | None, what: str) -> None:
+        """TrajectoryError unless ``robot`` is this task's, where it is known; a warning names ids.
+
+        A model of the standard arm may plan for a variant: the id alone is no error.
+        """
+        if robot is None or robot == self.robot:
+            return
+        robot.require_same(self.robot, what, but=("env",))
+        if robot.env != self.robot.env:
+            warnings.warn(
+                f"{what} are of two environments, {robot.env} and {self.robot.env}, whose states "
+                "have the same names; predictions hold as far as the two are alike",
+                stacklevel=4,
+            )
+
     def require_start(self, states: Tensor, what: str) -> None:
         """ValueError unless ``states`` (B, dx) are this task's starts, up to rounding."""
         start = torch.from_numpy(self.start)
@@ -364,6 +386,13 @@ class Task:
                 f"task {self.name!r} of {self.env} with {float(start[i, d]):.6g}; expected the "
                 "same starts"
             )
+
+
+@cache
+def _robot(env: str) -> Robot:
+    with closing(make_simulation(env, 1)) as run:
+        run.reset(seed=0)  # before it, dt is what the environment says
+        return Robot(run.id, run.dt, run.names, run.units, run.angles, run.action_dim)
 
 
 def _require_repeated(env: str, names: Sequence[str], start: np.ndarray, again: np.ndarray) -> None:
