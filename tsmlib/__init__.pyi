@@ -31,7 +31,7 @@ from .planning.predictors import simulator_predictor as simulator_predictor
 from .planning.search_spaces import DirectActions as DirectActions
 from .planning.search_spaces import LatentActions as LatentActions
 from .planning.tasks import Task as Task
-from .policies.learning import LearningOptions as LearningOptions
+from .policies.options import LearningOptions as LearningOptions
 from .policies.learning import learn_policy as learn_policy
 from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy

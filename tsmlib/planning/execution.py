@@ -19,7 +19,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm.auto import tqdm
 
-from tsmlib.checks import as_tensor, described, require_callable, require_count, require_type
+from tsmlib.checks import (
+    as_tensor,
+    described,
+    require_callable,
+    require_count,
+    require_seed,
+    require_type,
+)
 from tsmlib.collection import Controller, collect, open_loop
 from tsmlib.envs.stepping import Arms, Simulation, make_simulation
 from tsmlib.envs.unstable import SimulationUnstable
@@ -249,7 +256,7 @@ def mpc(
     ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead)
     if ahead < every:
         raise ValueError(f"lookahead is {ahead}; expected at least the {every} steps of every")
-    seed = require_count("seed", seed, least=0)
+    seed = require_seed("seed", seed)
     require_callable("planner", planner, "a function, such as tsmlib.cem")
     require_callable("judge", judge, "a function, such as tsmlib.model_predictor")
     if plan is not None:

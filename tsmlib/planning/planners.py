@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib.checks import require_count, require_number, require_type
+from tsmlib.checks import require_count, require_number, require_seed, require_type
 from tsmlib.planning.base import Plan, Predictor, Risk, SearchSpace, mean
 from tsmlib.planning.search import (
     Search,
@@ -212,7 +212,7 @@ def _sample(
 ) -> Plan:
     """Sample candidates around a centre and move centre and deviation by ``refit``."""
     iterations = require_count("iterations", iterations)
-    generator = torch.Generator().manual_seed(require_count("seed", seed, least=0))
+    generator = torch.Generator().manual_seed(require_seed("seed", seed))
     # Candidates may do what the start cannot.
     search.update(search.start, search.returns_of(search.start), needed=False)
     centre = search.parameters
@@ -283,7 +283,7 @@ def sampled_starts(
     if require_count("keep", keep) > candidates:
         raise ValueError(f"keep is {keep}; expected at most the {candidates} candidates")
     search = Search(predict, reward, space, require_count("n_targets", n_targets))
-    generator = torch.Generator().manual_seed(require_count("seed", seed, least=0))
+    generator = torch.Generator().manual_seed(require_seed("seed", seed))
     parameters = space.scale * space.noise(candidates, n_targets, generator)
     returns = search.returns_of(parameters)
     return best_of(parameters, returns.where(torch.isfinite(returns), -torch.inf), keep)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, described, require_count
+from tsmlib.checks import as_tensor, described, require_count, require_seed
 from tsmlib.collection import collect, open_loop
 from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec
@@ -162,7 +162,7 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     dynamics = as_dynamics(model)
     past = _checked_past(model, past)
     samples = require_count("samples", samples, least=0)
-    seed = require_count("seed", seed, least=0)
+    seed = require_seed("seed", seed)
     if samples and not dynamics.stochastic:
         raise ValueError(
             f"samples is {samples}, but {type(model).__name__} is deterministic: its one rollout "
@@ -214,7 +214,7 @@ def expected_predictor(
         raise ValueError(
             "samples is 0; expected at least 1. The mode alone is model_predictor(model, past)"
         )
-    seed = require_count("seed", seed, least=0)
+    seed = require_seed("seed", seed)
     mode = model_predictor(model, past)
     if not as_dynamics(model).stochastic or not isinstance(mode, ModelPredictor):
         return mode

@@ -23,6 +23,7 @@ from tsmlib.checks import (
     require_callable,
     require_count,
     require_number,
+    require_seed,
     require_type,
 )
 from tsmlib.collection import smooth_torques
@@ -125,7 +126,7 @@ class Task:
             ValueError: ``success`` is a distance and there is no ``tolerance``.
         """
         require_type("env", env, str, "an id, such as 'Pendulum-v1'")
-        n, seed = require_count("n", n), require_count("seed", seed, least=0)
+        n, seed = require_count("n", n), require_seed("seed", seed)
         require_reward(reward)
         if tolerance is not None:
             tolerance = require_number("tolerance", tolerance, 0)
@@ -201,7 +202,7 @@ class Task:
             "target": as_tensor("target", self.target, (len(start), "dg")),
             "horizon": require_count("horizon", self.horizon),
             "tolerance": require_number("tolerance", self.tolerance, 0),
-            "seeds": tuple(require_count("a seed", seed, least=0) for seed in self.seeds),
+            "seeds": tuple(require_seed("a seed", seed) for seed in self.seeds),
             "idle": idle,
         }
         for field, value in checked.items():

@@ -1,9 +1,12 @@
-"""Policies: a one-step network and a segment policy that acts through the action prior (section 4.3).
+"""Policies: a one-step network and a segment policy that acts through the prior (section 4.3).
 
-Letters in shapes: M policies side by side, B episodes of each, R = M B rows laid out policy by policy, L past length,
-dx, du, dz, dg size of state, action, code, target.
+Letters in shapes: M copies of a policy, B episodes of each, R = M B rows laid out copy by copy, L
+past length, dx, du, dz, dg size of state, action, code, target.
 """
 
+from __future__ import annotations
+
+import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -13,24 +16,44 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tsmlib.checks import (
+    as_tensor,
+    require_count,
+    require_counts,
+    require_number,
+    require_seed,
+    require_type,
+)
 from tsmlib.collection import Controller
 from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import Model
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Features
 from tsmlib.models.layers import BatchedLinear, GatedLayer, advance, on_device_of
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment
 
-# The latest state x_t (R, dx), the action u_{t-1} (R, du) that led to it, noise (R, output_dim) -> u_t (R, du)
+# x_t (R, dx), the action u_{t-1} (R, du) that led to it, noise (R, output_dim) -> u_t (R, du)
 Act = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 class Policy(Configured):
     """M copies of pi(. | past, target), asked one step at a time: the base of all policies.
 
-    state_dim, target_dim: dx, dg. angles: state dimensions in radians. target_std: metres, what a target counts in.
-    past_len: steps of past that it reads. output_dim: size of what is noisy, the action or the code of a segment.
-    ``features`` standardise its states once they have statistics, by ``fit`` or from the model that it learns in.
+    ``features`` standardise its states once they have statistics, by ``fit`` or from the model that
+    it learns in.
+
+    Args:
+        state_dim: dx.
+        target_dim: dg.
+        angles: state dimensions in radians.
+        target_std: metres, what a target counts in.
+        copies: M.
+
+    Attributes:
+        past_len: L, steps of past that it reads.
+        action_dim: du.
+        output_dim: size of what is noisy, the action or the code of a segment.
     """
 
     past_len: int
@@ -46,45 +69,50 @@ class Policy(Configured):
         target_std: float,
         copies: int,
     ) -> None:
-        if copies < 1:
-            raise ValueError(f"copies is {copies}, expected at least 1")
         super().__init__()
-        self.state_dim, self.target_dim, self.target_std, self.copies = (
-            state_dim,
-            target_dim,
-            target_std,
-            copies,
-        )
+        self.state_dim = require_count("state_dim", state_dim)
+        self.target_dim = require_count("target_dim", target_dim)
+        self.target_std = require_number("target_std", target_std, 0, above=True)
+        self.copies = require_count("copies", copies)
         self.features = Features(state_dim, tuple(angles))
 
     def begin(self, past: Segment, target: Tensor) -> Act:
-        """Get ready to act after ``past`` (R, L, .), whose last step is the first that the result is given."""
+        """Get ready to act after ``past`` (R, L, .); the result is given its last step first."""
         raise NotImplementedError
 
     def goals(self, past: Segment, target: Tensor) -> Tensor:
-        """Targets (R, dg) as the network sees them, (M, B, dg). ValueError where they or ``past`` do not fit."""
-        (rows, steps, dim), name, needed, dg = (
-            past.states.shape,
-            type(self).__name__,
-            self.past_len,
-            self.target_dim,
-        )
+        """Targets (R, dg) as the network sees them, (M, B, dg); ValueError where they do not fit."""
+        (rows, steps, dim), name = past.states.shape, type(self).__name__
         if dim != self.state_dim:
-            wrong = f"states have {dim} dimensions, this {name} was made for {self.state_dim}: it belongs to another "
-            raise ValueError(wrong + "environment")
-        if steps < needed:
             raise ValueError(
-                f"the past holds {steps} steps, {name} needs {needed}; collect with past_len={needed}"
+                f"states have {dim} dimensions, this {name} was made for {self.state_dim}; "
+                "expected a policy of this environment"
+            )
+        if steps < self.past_len:
+            raise ValueError(
+                f"the past holds {steps} steps, {name} needs {self.past_len}; collect or execute "
+                f"with past_len={self.past_len}"
             )
         if rows % self.copies:
-            raise ValueError(
-                f"{rows} episodes do not divide among {self.copies} copies of the policy"
-            )
-        if target.shape != (rows, dg):
-            raise ValueError(
-                f"targets are {tuple(target.shape)}, expected one per episode, ({rows}, {dg})"
-            )
+            raise ValueError(f"{rows} episodes do not divide among {self.copies} copies of {name}")
+        target = as_tensor("target", target, (rows, self.target_dim), dtype=past.states.dtype)
         return self.by_copy(target / self.target_std)
+
+    def take_statistics(self, model: Model) -> None:
+        """Those of the model's features, where the policy has none of its own."""
+        own, known = self.features, getattr(model, "features", None)
+        sizes = isinstance(known, Features) and own.step_std.shape == known.step_std.shape
+        if own.fitted or not isinstance(known, Features) or not sizes:
+            return
+        if own.angles == known.angles:
+            own.load_state_dict(known.state_dict())
+        else:
+            warnings.warn(
+                f"the policy has the angles {own.angles}, the model {known.angles}, so that it "
+                f"learns on states in raw units. Make it with angles={tuple(known.angles)}, or "
+                "call policy.features.fit(data)",
+                stacklevel=3,
+            )
 
     def by_copy(self, rows: Tensor) -> Tensor:
         """(R, k) -> (M, B, k)."""
@@ -92,9 +120,20 @@ class Policy(Configured):
 
 
 class OneStepPolicy(Policy):
-    """pi(u_t | x_t, g): a fully connected network of the present state and target (A.3: 2 x 64, ReLU).
+    """pi(u_t | x_t, g): a fully connected network of the present state and target (A.3).
 
     Its output is squashed to the action bounds by tanh and starts near no torque.
+
+    Args:
+        state_dim: dx.
+        action_dim: du.
+        target_dim: dg.
+        angles: state dimensions in radians.
+        hidden: units of a layer.
+        layers: hidden ones, ReLU.
+        target_std: what a target counts in, metres; of a coordinate in the disc of 0.2 m.
+        copies: M, side by side.
+        seed: of the weights of copy 0; copy m has seed + m.
     """
 
     past_len = 1
@@ -108,12 +147,13 @@ class OneStepPolicy(Policy):
         angles: tuple[int, ...] = (),
         hidden: int = 64,
         layers: int = 2,
-        target_std: float = 0.1,  # of a coordinate, uniform in the disc of radius 0.2 m
+        target_std: float = 0.1,
         copies: int = 1,
         seed: int = 0,
     ) -> None:
         super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
-        self.action_dim = self.output_dim = action_dim
+        self.action_dim = self.output_dim = require_count("action_dim", action_dim)
+        require_counts(hidden=hidden, layers=layers)
         generators = _generators(copies, seed)
         widths = [self.features.dim + target_dim, *[hidden] * layers, action_dim]
         self.net = nn.ModuleList(BatchedLinear(i, o, generators) for i, o in pairwise(widths))
@@ -135,14 +175,25 @@ class OneStepPolicy(Policy):
 
 
 class SegmentPolicy(Policy):
-    """pi(Z | X-, U-, g) acting through an action prior, with the gated causal layers of the decoders (Eq. 1, A.3).
+    """pi(Z | X-, U-, g) acting through an action prior, with gated causal layers (Eq. 1, A.3).
 
         h = tanh(W_f * s + V_f g) . sigmoid(W_g * s + V_g g)
 
-    The target takes the place of the code. Positions are steps of the past, (x_t, u_{t-1}) each; the output at the
-    last one is the mean of Z, of whose segment only the first action is executed (A31).
+    The target takes the place of the code. Positions are steps of the past, (x_t, u_{t-1}) each;
+    the output at the last one is the mean of Z, of whose segment only the first action is executed
+    (A31).
 
-    prior: a trained ActionPrior, copied into the policy and never trained by it; or its configuration.
+    Args:
+        state_dim: dx.
+        prior: a trained ActionPrior, copied into the policy and never trained by it; or its
+            configuration.
+        target_dim: dg.
+        angles: state dimensions in radians.
+        channels: of every layer.
+        dilations: of the layers; their sum and one is the receptive field, H by default.
+        target_std: what a target counts in, metres.
+        copies: M, side by side.
+        seed: of the weights of copy 0; copy m has seed + m.
     """
 
     def __init__(
@@ -153,12 +204,14 @@ class SegmentPolicy(Policy):
         *,
         angles: tuple[int, ...] = (),
         channels: int = 32,
-        dilations: Sequence[int] = (1, 2, 4, 2),  # receptive field 10 = H
+        dilations: Sequence[int] = (1, 2, 4, 2),
         target_std: float = 0.1,
         copies: int = 1,
         seed: int = 0,
     ) -> None:
         super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
+        hint = 'an ActionPrior, such as tsmlib.load_pretrained("prior", env=env)'
+        require_type("prior", prior, (ActionPrior, Mapping), hint)
         self.prior = deepcopy(prior) if isinstance(prior, ActionPrior) else ActionPrior(**prior)  # type: ignore[arg-type]
         self.prior.requires_grad_(False)
         self.action_dim, self.output_dim = len(self.prior.std), self.prior.latent_dim
@@ -180,7 +233,7 @@ class SegmentPolicy(Policy):
         self.head = BatchedLinear(channels, self.output_dim, generators)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
-        """Read the past but for its last step; the layers' inputs are then carried from step to step."""
+        """Read the past but for its last step; inputs of layers are carried from step to step."""
         codes = self.codes(self.goals(past, target))
         past = past.last(self.past_len)
         zeros = codes.new_zeros(*codes.shape[:2], self.inlet.bias.shape[-1])
@@ -205,7 +258,17 @@ class SegmentPolicy(Policy):
 
 
 def controller(policy: Policy, target: Tensor) -> Controller:
-    """The policy at work in an environment, for ``collect``: one action, then asked again. target (R, dg)."""
+    """The policy at work in an environment: one action, then asked again.
+
+    Args:
+        policy: that acts, without noise.
+        target: (R, dg), one for each episode.
+
+    Returns:
+        The controller, for ``execute`` and ``collect``.
+    """
+    require_type("policy", policy, Policy, "tsmlib.OneStepPolicy(...) or SegmentPolicy(...)")
+    target = as_tensor("target", target, ("R", policy.target_dim))
 
     @torch.no_grad()
     def control(past: Segment) -> Tensor:
@@ -217,4 +280,5 @@ def controller(policy: Policy, target: Tensor) -> Controller:
 
 
 def _generators(copies: int, seed: int) -> list[torch.Generator]:
+    seed = require_seed("seed", seed)
     return [torch.Generator().manual_seed(seed + m) for m in range(copies)]
