@@ -254,7 +254,7 @@ def mpc(
     _require_task(task)
     every = require_count("every", every)
     ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead)
-    if ahead < every:
+    if lookahead is not None and ahead < every:
         raise ValueError(f"lookahead is {ahead}; expected at least the {every} steps of every")
     seed = require_seed("seed", seed)
     require_callable("planner", planner, "a function, such as tsmlib.cem")

@@ -81,7 +81,7 @@ class Policy(Configured):
         raise NotImplementedError
 
     def goals(self, past: Segment, target: Tensor) -> Tensor:
-        """Targets (R, dg) as the network sees them, (M, B, dg); ValueError where they do not fit."""
+        """Targets (R, dg) as the network sees them (M, B, dg); ValueError where they do not fit."""
         (rows, steps, dim), name = past.states.shape, type(self).__name__
         if dim != self.state_dim:
             raise ValueError(
