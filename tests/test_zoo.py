@@ -21,7 +21,7 @@ from tsmlib import zoo
 SHIPPED = [
     p
     for p in sorted((runs.ROOT / "data/pretrained").glob("*/*.safetensors"))
-    if not p.stem.startswith("policy")
+    if not p.stem.startswith("policy") and p.parent.name != "PushT"
 ]
 
 

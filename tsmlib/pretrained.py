@@ -15,6 +15,7 @@ import tsmlib.envs
 from tsmlib import zoo
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
+from tsmlib.planning.pusht import pusht_task
 from tsmlib.planning.tasks import Task
 from tsmlib.storage import artifacts
 
@@ -41,6 +42,8 @@ def load_pretrained(model: str, *, env: str) -> DynamicsModel:
     Raises:
         ValueError: no such model ships for this environment; the message names those that do.
     """
+    if env.startswith("tsm/PushT-"):
+        return _pusht_model(model)
     trained_on = zoo.trained_on(env, model)
     folder = PRETRAINED / EnvSpec.parse(trained_on).name
     if not (path := folder / f"{model}.safetensors").exists():
@@ -68,6 +71,8 @@ def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:
     Returns:
         The task.
     """
+    if env.startswith("tsm/PushT-"):
+        return load_pusht(split, env=env)
     spec = EnvSpec.parse(env)
     shape = Physics(
         link_lengths=spec.physics.link_lengths, object_radius=spec.physics.object_radius
@@ -81,6 +86,39 @@ def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:
         artifacts.require_fit(path, header, {"env": env})
         return Task.standard(env, tensors["start"].numpy(), tensors["target"])
     return draw_task(env, seed=TASK_SEED[split])
+
+
+def load_pusht(
+    split: Literal["validation", "test"] = "test", protocol: str = "B", *, env: str = "tsm/PushT-v0"
+) -> Task:
+    """The pairs (start, goal) of PushT: 500 frozen ones for tests, 200 to make choices on.
+
+    A goal is what random play came to 25 steps after the start. No pair is solved at the start, in
+    each the T moves by at least 10 px, and goals lie in the field.
+
+    Args:
+        split: "test", which no choice was made on, or "validation".
+        protocol: "A", "B" or "C", see ``planning.pusht``.
+        env: id of the field.
+
+    Returns:
+        The task.
+    """
+    tensors, _ = artifacts.load(TASKS / "PushT.safetensors", kind="task")
+    word = "validation_" if split == "validation" else ""
+    pairs = (tensors[f"{word}{part}"].numpy() for part in ("start", "target"))
+    return pusht_task(*pairs, protocol, env=env)
+
+
+def _pusht_model(word: str) -> DynamicsModel:
+    from tsmlib.models.egocentric import Egocentric  # heavy
+    from tsmlib.models.recurrent import RecurrentTSM
+
+    classes = {"egocentric": Egocentric, "rtsm": RecurrentTSM}
+    if word not in classes:
+        raise ValueError(f"no pretrained {word} of PushT: there are {', '.join(classes)}")
+    path = PRETRAINED / "PushT" / f"{word}.safetensors"
+    return cast("DynamicsModel", artifacts.load_model(path, classes[word]))
 
 
 def draw_task(env: str, *, seed: int, n: int = 100) -> Task:

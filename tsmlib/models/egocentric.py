@@ -10,22 +10,21 @@ model with H = 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tsmlib.checks import require_counts
 from tsmlib.models.base import Step, rollout
-from tsmlib.models.config import Configured
-from tsmlib.models.features import Featured, Features
+from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
-from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 
-class Egocentric(Featured, Configured):
+class Egocentric(StateModel):
     """A fully connected network in the frame of a body that moves in the plane.
 
     Args:
@@ -49,15 +48,15 @@ class Egocentric(Featured, Configured):
         state_dim: int,
         action_dim: int,
         *,
-        angles: tuple[int, ...] = (4,),
-        body: tuple[int, int, int] = (2, 3, 4),
-        places: tuple[tuple[int, int], ...] = ((0, 1),),
-        vectors: tuple[tuple[int, int], ...] = ((5, 6),),
+        angles: Sequence[int] = (4,),
+        body: Sequence[int] = (2, 3, 4),
+        places: Sequence[Sequence[int]] = ((0, 1),),
+        vectors: Sequence[Sequence[int]] = ((5, 6),),
         hidden: int = 256,
         layers: int = 3,
     ) -> None:
-        super().__init__()
-        self.features = Features(state_dim, tuple(angles))
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(hidden=hidden, layers=layers)
         x, y, self.angle = body
         self.pairs = [[x, y], *map(list, places), *map(list, vectors)]
         self.n_places, dim = len(places), 2 * (len(places) + len(vectors)) + action_dim + 4
@@ -70,19 +69,20 @@ class Egocentric(Featured, Configured):
         self.register_buffer("seen_std", torch.ones(dim))
         self.register_buffer("step_std", torch.ones(state_dim))  # in the body's frame
 
-    @classmethod
-    def for_data(cls, data: Trajectories, *, seed: int = 0, **options: Json) -> Self:
-        """The model of ``data`` as training starts, with its statistics."""
-        model = super().for_data(data, seed=seed, **options)
+    def take_robot(self, data: Trajectories) -> None:
+        """Take the robot of training data and, where there are none yet, their statistics."""
+        fitted = self.features.fitted
+        super().take_robot(data)
+        if fitted:
+            return
         at = np.arange(len(data.flat_actions)) + np.repeat(np.arange(len(data)), data.lengths)
         at, x = at[:: 1 + len(at) // 100_000], torch.from_numpy(data.flat_states)
         before, after = x[at], x[at + 1]
         u = torch.from_numpy(data.flat_actions)[:: 1 + len(data.flat_actions) // 100_000]
-        seen, step = model._seen(before, u), model._increments(before, after)
-        model.seen_mean.copy_(seen.mean(0))
-        model.seen_std.copy_(seen.std(0).clamp(min=1e-6))
-        model.step_std.copy_(step.std(0))
-        return model
+        seen, step = self._seen(before, u), self._increments(before, after)
+        self.seen_mean.copy_(seen.mean(0))
+        self.seen_std.copy_(seen.std(0).clamp(min=1e-6))
+        self.step_std.copy_(step.std(0))
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """(..., dx), (..., du) -> (..., dx)."""
