@@ -1,7 +1,7 @@
 """What holds for every dynamics model and for the action prior, whatever their weights are.
 
-A new model joins by one entry in MODELS. All of it runs in float64 unless a test says otherwise, so that a disagreement
-is a mistake and not rounding. Letters in shapes: as in tsmlib.trajectory.
+A new model joins by one entry in MODELS. All of it runs in float64 unless a test says otherwise, so
+that a disagreement is a mistake and not rounding. Letters in shapes: as in tsmlib.trajectory.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ B = 5
 class Case:
     """An implementation under test.
 
-    build: state size -> model with new weights; constant: state dimensions that never change within an episode;
-    losses: its loss methods, each with the parts of the model (prefixes of parameter names) that it leaves alone;
-    stochastic: whether a generator makes a difference; recall: (model, window) -> its best account of a seen future.
+    build: state size -> model with new weights. constant: state dimensions that never change.
+    losses: its loss methods, each with the prefixes of the parameters that it leaves alone.
+    stochastic: whether a generator makes a difference. recall: (model, window) -> its best account
+    of a future that it has seen.
     """
 
     build: Callable[[int], Any]
@@ -114,7 +115,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 
 def motion(case: Case, n: int, steps: int, *, seed: int = 0) -> Segment:
-    """A made-up world (n, steps, .): every dimension follows the actions with some inertia, in no particular units."""
+    """A made-up world (n, steps, .): every dimension follows the actions with inertia."""
     draw = torch.Generator().manual_seed(seed)
     actions = (
         torch.randn(n, -(-steps // 5), DU, generator=draw)
@@ -151,7 +152,7 @@ def rows(segment: Segment, index: Any) -> Segment:
     return Segment(*(part[index] for part in segment))
 
 
-# Shape ---------------------------------------------------------------------------------------------------------------
+# Shape ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps", [1, 7, 10])
@@ -190,7 +191,7 @@ def test_only_the_last_steps_of_a_long_past_count(case: Case) -> None:
     )
 
 
-# Causality -----------------------------------------------------------------------------------------------------------
+# Causality --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", [0, 4, 9, 10, 16, 22])
@@ -220,7 +221,7 @@ def test_a_decoder_output_sees_the_present_and_the_receptive_field_only() -> Non
     assert torch.equal(seen, (offset >= 0) & (offset <= sum(dilations)))
 
 
-# Composition ---------------------------------------------------------------------------------------------------------
+# Composition ------------------------------------------------------------------------------------
 
 
 def test_a_rollout_is_segments_chained_by_hand(case: Case) -> None:
@@ -248,7 +249,7 @@ def test_a_plan_of_the_prior_is_segments_chained_by_hand(prior: ActionPrior) -> 
     assert torch.equal(prior.plan(past, z), torch.cat([first, second, third], 1))
 
 
-# Two decoding paths --------------------------------------------------------------------------------------------------
+# Two decoding paths -----------------------------------------------------------------------------
 
 CODED = [
     name
@@ -317,13 +318,13 @@ def test_a_cache_may_begin_with_nothing_known() -> None:
         torch.testing.assert_close(decoder(inputs, z, n), outputs[:, -n:], rtol=1e-10, atol=1e-10)
 
 
-# Differentiability ---------------------------------------------------------------------------------------------------
+# Differentiability ------------------------------------------------------------------------------
 
 
 def assert_gradient(
     value: Callable[[], Tensor], variables: Sequence[Tensor], *, tolerance: float = 1e-5
 ) -> None:
-    """Each variable's gradient agrees with a central difference along the gradient plus a random direction."""
+    """Each gradient agrees with a central difference along it plus a random direction."""
     assert max(gradients.relative_errors(value, variables)) <= tolerance
 
 
@@ -390,7 +391,7 @@ def test_the_prior_is_differentiable_in_codes_and_every_parameter(prior: ActionP
     assert_gradient(lambda: prior.loss(Window(past, future), generator()), list(prior.parameters()))
 
 
-# Batches -------------------------------------------------------------------------------------------------------------
+# Batches ----------------------------------------------------------------------------------------
 
 
 def test_a_row_does_not_depend_on_its_batch(case: Case) -> None:
@@ -453,7 +454,7 @@ def test_candidates_with_shared_noise_meet_the_same_futures(case: Case) -> None:
         ).abs().max() > 1e-3  # but different targets meet different ones
 
 
-# Determinism ---------------------------------------------------------------------------------------------------------
+# Determinism ------------------------------------------------------------------------------------
 
 
 def test_the_same_seed_gives_the_same_bits_and_no_generator_the_mode(case: Case) -> None:
@@ -498,7 +499,7 @@ def test_what_never_moves_stays_exactly_where_it_is(case: Case) -> None:
     assert model.features.scored.sum() == model.features.dim - len(case.constant)
 
 
-# Learning ------------------------------------------------------------------------------------------------------------
+# Learning ---------------------------------------------------------------------------------------
 
 
 def test_one_window_is_learned_by_heart(case: Case) -> None:
@@ -531,7 +532,7 @@ def overfit(
         optimizer.step()
 
 
-# The prior -----------------------------------------------------------------------------------------------------------
+# The prior --------------------------------------------------------------------------------------
 
 
 def actions_window(steps: int = 10) -> Window:

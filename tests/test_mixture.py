@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from untrained import in_units
 
-import tsmlib as tsm
+import tsmlib
 from tsmlib.models.base import predict_segment, stepper
 from tsmlib.planning.predictors import EnsemblePredictor
 from tsmlib.sampling import Noise, SeparateNoise, SharedNoise
@@ -24,14 +24,14 @@ def drawn(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def one_step(seed: int) -> tsm.OneStep:
+def one_step(seed: int) -> tsmlib.OneStep:
     torch.manual_seed(seed)
-    return in_units(tsm.OneStep(DX, DU, angles=(0, 1), hidden=16, layers=2)).double().eval()
+    return in_units(tsmlib.OneStep(DX, DU, angles=(0, 1), hidden=16, layers=2)).double().eval()
 
 
-def recurrent(seed: int) -> tsm.RecurrentTSM:
+def recurrent(seed: int) -> tsmlib.RecurrentTSM:
     torch.manual_seed(seed)
-    net = tsm.RecurrentTSM(DX, DU, angles=(0, 1), hidden=16)
+    net = tsmlib.RecurrentTSM(DX, DU, angles=(0, 1), hidden=16)
     net.decoder.codes.weight.data.mul_(20)  # so that a code says much
     return in_units(net).double().eval()
 
@@ -47,16 +47,16 @@ def given(n: int = B, steps: int = T) -> tuple[Segment, Tensor]:
 
 def test_the_mode_is_the_mean_of_the_models_modes() -> None:
     models, (past, actions) = [one_step(0), recurrent(1)], given()
-    found = tsm.rollout(tsm.Mixture(models), past, actions)
+    found = tsmlib.rollout(tsmlib.Mixture(models), past, actions)
     assert torch.allclose(
-        found, torch.stack([tsm.rollout(model, past, actions) for model in models]).mean(0)
+        found, torch.stack([tsmlib.rollout(model, past, actions) for model in models]).mean(0)
     )
 
 
 def test_a_sample_is_a_rollout_of_one_of_the_models_to_its_end() -> None:
     models, (past, actions) = [one_step(0), one_step(1), one_step(2)], given(60)
-    found = tsm.rollout(tsm.Mixture(models), past, actions, generator=drawn(3))
-    each = torch.stack([tsm.rollout(model, past, actions) for model in models])
+    found = tsmlib.rollout(tsmlib.Mixture(models), past, actions, generator=drawn(3))
+    each = torch.stack([tsmlib.rollout(model, past, actions) for model in models])
     of = (found - each).abs().amax((2, 3))  # (models, rows)
     assert torch.allclose(of.amin(0), torch.zeros(60).double(), atol=1e-12)
     assert of.argmin(0).bincount(minlength=3).min() > 8
@@ -65,11 +65,11 @@ def test_a_sample_is_a_rollout_of_one_of_the_models_to_its_end() -> None:
 def test_planners_are_shown_the_mode_of_each_model() -> None:
     models, (past, actions) = [one_step(0), recurrent(1), recurrent(2)], given()
     candidates = torch.stack([actions, -actions])  # (C, B, T, du)
-    judge = tsm.model_predictor(tsm.Mixture(models), past)
+    judge = tsmlib.model_predictor(tsmlib.Mixture(models), past)
     assert isinstance(judge, EnsemblePredictor)
     assert judge(candidates).shape == (3, 2, B, T, DX)
     for one, found, model in zip(judge.each, judge(candidates), models, strict=True):
-        alone = tsm.model_predictor(model, past)(candidates)
+        alone = tsmlib.model_predictor(model, past)(candidates)
         assert torch.allclose(found, alone[0])
         assert torch.allclose(one(candidates), alone)
 
@@ -87,15 +87,17 @@ def test_planners_are_shown_the_mode_of_each_model() -> None:
 def test_a_step_at_a_time_gives_the_states_of_the_rollout(
     noise: Callable[[], Noise | None],
 ) -> None:
-    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given(6)
+    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1), one_step(2)]), given(6)
     step = stepper(mixture, past, generator=noise())
     found = torch.stack([step(u) for u in actions.unbind(1)], dim=1)
-    assert torch.allclose(found, tsm.rollout(mixture, past, actions, generator=noise()))
+    assert torch.allclose(found, tsmlib.rollout(mixture, past, actions, generator=noise()))
 
 
 def test_candidates_are_compared_in_the_same_futures() -> None:
-    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
-    states = tsm.model_predictor(mixture, past, samples=6, seed=2)(actions[None].repeat(3, 1, 1, 1))
+    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1)]), given()
+    states = tsmlib.model_predictor(mixture, past, samples=6, seed=2)(
+        actions[None].repeat(3, 1, 1, 1)
+    )
     torch.testing.assert_close(
         states[:, 0], states[:, 1], rtol=0, atol=1e-12
     )  # some processors round rows differently
@@ -104,7 +106,7 @@ def test_candidates_are_compared_in_the_same_futures() -> None:
 
 
 def test_rows_that_share_noise_share_the_model_and_what_it_draws() -> None:
-    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1), one_step(2)]), given()
+    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1), one_step(2)]), given()
     twice = Segment(*(part.repeat(2, 1, 1) for part in past))
     found = predict_segment(
         mixture, twice, actions.repeat(2, 1, 1), generator=SharedNoise(drawn(1), B)
@@ -113,7 +115,7 @@ def test_rows_that_share_noise_share_the_model_and_what_it_draws() -> None:
 
 
 def test_copies_draw_as_each_alone() -> None:
-    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
+    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1)]), given()
     twice = Segment(*(part.repeat(2, 1, 1) for part in past))
     both = predict_segment(
         mixture, twice, actions.repeat(2, 1, 1), generator=SeparateNoise((drawn(1), drawn(2)))
@@ -123,7 +125,7 @@ def test_copies_draw_as_each_alone() -> None:
 
 
 def test_copies_with_generators_of_their_own_within_shared_noise_are_refused() -> None:
-    mixture, (past, actions) = tsm.Mixture([recurrent(0), recurrent(1)]), given()
+    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1)]), given()
     with pytest.raises(TypeError, match="several generators in SharedNoise; a Mixture takes one"):
         predict_segment(
             mixture, past, actions, generator=SharedNoise(SeparateNoise((drawn(1),)), B)
@@ -131,21 +133,24 @@ def test_copies_with_generators_of_their_own_within_shared_noise_are_refused() -
 
 
 def test_gradients_reach_the_actions() -> None:
-    mixture, (past, actions) = tsm.Mixture([one_step(0), recurrent(1)]), given()
+    mixture, (past, actions) = tsmlib.Mixture([one_step(0), recurrent(1)]), given()
     actions.requires_grad_()
-    tsm.rollout(mixture, past, actions, generator=drawn(0))[:, -1].sum().backward()
+    tsmlib.rollout(mixture, past, actions, generator=drawn(0))[:, -1].sum().backward()
     assert (actions.grad[:, 0] != 0).any(dim=1).all()
 
 
 def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     env = "tsm/Reacher-v0"
-    mixture = tsm.Mixture(
-        [tsm.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "ensemble+mse")]
+    mixture = tsmlib.Mixture(
+        [
+            tsmlib.load_pretrained(word, env=env)
+            for word in ("rtsm", "onestep", "tsm", "ensemble+mse")
+        ]
     )
-    task, prior = tsm.load_task(env).take(2), tsm.load_pretrained("prior", env=env)
-    past, space = task.past(mixture.past_len), tsm.LatentActions(prior, task.horizon)
-    plan = tsm.cem(
-        tsm.model_predictor(mixture, past),
+    task, prior = tsmlib.load_task(env).take(2), tsmlib.load_pretrained("prior", env=env)
+    past, space = task.past(mixture.past_len), tsmlib.LatentActions(prior, task.horizon)
+    plan = tsmlib.cem(
+        tsmlib.model_predictor(mixture, past),
         task.reward,
         space,
         len(task),
@@ -153,45 +158,45 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
         elites=2,
         iterations=2,
     )
-    plan = tsm.reevaluate(plan, tsm.fresh_predictor(mixture, past, seed=1), task.reward)
-    trial = tsm.execute(task, plan)
+    plan = tsmlib.reevaluate(plan, tsmlib.fresh_predictor(mixture, past, seed=1), task.reward)
+    trial = tsmlib.execute(task, plan)
     assert torch.isfinite(trial.executed_return).all()
     assert plan.states.shape == (32, 2, task.horizon, 6)
 
 
 def test_each_member_of_each_model_judges_a_candidate() -> None:
     (past, actions), alone = given(), [recurrent(0), one_step(1), one_step(2)]
-    judge = tsm.model_predictor(tsm.Mixture([alone[0], tsm.Mixture(alone[1:])]), past)
+    judge = tsmlib.model_predictor(tsmlib.Mixture([alone[0], tsmlib.Mixture(alone[1:])]), past)
     assert isinstance(judge, EnsemblePredictor)
     for found, model in zip(judge(actions[None]), alone, strict=True):
-        assert torch.allclose(found[0], tsm.rollout(model, past, actions))
+        assert torch.allclose(found[0], tsmlib.rollout(model, past, actions))
 
 
 def test_what_is_no_models_of_one_environment_is_refused() -> None:
-    with pytest.raises(ValueError, match="a mixture of no models"):
-        tsm.Mixture([])
+    with pytest.raises(ValueError, match="models is empty"):
+        tsmlib.Mixture([])
     with pytest.raises(
         TypeError,
-        match=r"a mixture of a OneStep; expected a list of models, as in Mixture\(\[one, ",
+        match=r"models is a OneStep; expected a list of models, as in Mixture\(\[one, ",
     ):
-        tsm.Mixture(one_step(0))  # type: ignore[arg-type]
-    other = in_units(tsm.OneStep(10, DU, angles=(0, 1), hidden=16, layers=2))
+        tsmlib.Mixture(one_step(0))  # type: ignore[arg-type]
+    other = in_units(tsmlib.OneStep(10, DU, angles=(0, 1), hidden=16, layers=2))
     with pytest.raises(
         ValueError,
-        match=r"6 dimensions with angles \[0, 1\] and 10 dim.*expected models of one env",
+        match=r"10 dimensions with angles \[0, 1\] and 6 dim.*expected one robot",
     ):
-        tsm.Mixture([one_step(0), other])
+        tsmlib.Mixture([one_step(0), other])
 
 
 def test_a_mixture_is_neither_stored_nor_trained(tmp_path: Path) -> None:
-    mixture = tsm.Mixture([one_step(0), one_step(1)])
+    mixture = tsmlib.Mixture([one_step(0), one_step(1)])
     with pytest.raises(TypeError, match="a Mixture is not stored; save each of its models"):
-        tsm.save_model(tmp_path / "m.safetensors", mixture, {})
+        tsmlib.save_model(tmp_path / "m.safetensors", mixture, {})
     with pytest.raises(TypeError, match="a Mixture is not trained"):
         mixture.loss(None, None)
 
 
 def test_mixtures_are_told_apart_by_their_weights() -> None:
-    assert digest(tsm.Mixture([one_step(0), one_step(1)]).state_dict()) != digest(
-        tsm.Mixture([one_step(0), one_step(2)]).state_dict()
+    assert digest(tsmlib.Mixture([one_step(0), one_step(1)]).state_dict()) != digest(
+        tsmlib.Mixture([one_step(0), one_step(2)]).state_dict()
     )

@@ -1,4 +1,4 @@
-"""The recurrence with a backward pass of its own is what autograd makes of the same equations, written plainly."""
+"""The recurrence and its backward pass are those of the same equations, written plainly."""
 
 from __future__ import annotations
 
@@ -131,47 +131,10 @@ def test_a_past_of_one_step_says_nothing_of_what_was_before(name: str) -> None:
     )
 
 
-def with_gradients(name: str, dtype: torch.dtype, *, forward: bool, backward: bool) -> list[Tensor]:
-    """States, and gradients of all they depend on, each pass under autocast to bfloat16 or not."""
-    net, past, actions, z = setting(name, (0, 1), dtype)
-    whole = [part.requires_grad_() for part in (*past, actions, z)] + list(net.parameters())
-    with torch.autocast("cpu", torch.bfloat16, enabled=forward):
-        states = fast(net, past, actions, z)
-    with torch.autocast("cpu", torch.bfloat16, enabled=backward):
-        gradients = torch.autograd.grad(states.sin().sum(), whole, allow_unused=True)
-    return [states, *(d for d in gradients if d is not None)]
-
-
-def test_autocast_rounds_products_of_a_cell_with_a_head_layer() -> None:
-    exact = with_gradients("rtsm", torch.float32, forward=False, backward=False)
-    rounded = with_gradients("rtsm", torch.float32, forward=True, backward=False)
-    for one, other in zip(exact, rounded, strict=True):
-        assert other.dtype == torch.float32
-        assert 0 < (other - one).norm() < 0.03 * one.norm()
-
-
-@pytest.mark.parametrize(
-    ("name", "dtype"), [("lstm", torch.float32), ("lstm", torch.float64), ("rtsm", torch.float64)]
-)
-def test_autocast_leaves_float64_and_the_lstm_alone(name: str, dtype: torch.dtype) -> None:
-    exact = with_gradients(name, dtype, forward=False, backward=False)
-    under = with_gradients(name, dtype, forward=True, backward=False)
-    assert all(torch.equal(*pair) for pair in zip(exact, under, strict=True))
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_autocast_around_the_backward_pass_changes_nothing(name: str) -> None:
-    outside, inside = (
-        with_gradients(name, torch.float32, forward=True, backward=inner) for inner in (False, True)
-    )
-    assert all(torch.equal(*pair) for pair in zip(outside, inside, strict=True))
-
-
 @pytest.mark.parametrize("batch", [4, 33, 48])
 def test_nothing_depends_on_memory_that_was_never_written(
     batch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Products in bfloat16 on AMX read beside the columns that they are given; elsewhere this proves nothing.
     net, *_ = setting("rtsm", (0, 1), torch.float32)
     past, actions = (
         Segment(torch.randn(batch, L, DX), torch.randn(batch, L, DU)),
@@ -184,7 +147,6 @@ def test_nothing_depends_on_memory_that_was_never_written(
 
     monkeypatch.setattr(torch.Tensor, "new_empty", spoiled(empty))
     monkeypatch.setattr(torch, "empty_like", spoiled(empty_like))
-    with torch.autocast("cpu", torch.bfloat16):
-        states = net.decode(past, actions, torch.randn(batch, 2, 3))
+    states = net.decode(past, actions, torch.randn(batch, 2, 3))
     gradients = torch.autograd.grad(states.square().sum(), net.decoder.parameters())
     assert all(torch.isfinite(part).all() for part in (states, *gradients))

@@ -1,4 +1,4 @@
-"""RecurrentTSM: codes in the gates, a hidden state that is carried, and the energy score that it is trained by."""
+"""RecurrentTSM: codes in the gates, a hidden state that is carried, and the energy score."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from torch import Tensor
 from tsmlib.models.base import rollout, stepper
 from tsmlib.models.energy import energy_score
 from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib import zoo
 from tsmlib.training.fit import keep_freed_memory
 from tsmlib.trajectory import Segment, Window
 
@@ -120,11 +119,6 @@ def test_the_loss_is_the_energy_score_of_two_rollouts_and_the_distance_of_the_mo
         for m, x in zip(features(net, mode), features(net, future.states), strict=True)
     ]
     assert float(net.point_loss(seen, rng())) == pytest.approx(float(sum(points)) / 2, rel=1e-6)
-
-
-def test_stages_of_the_same_loss_have_words_of_their_own() -> None:
-    assert zoo.keys(zoo.find("rtsm").stages) == ["point_loss", "loss", "loss-2"]
-    assert zoo.keys(zoo.find("tsm").stages) == ["teacher_forced_loss", "loss"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc")

@@ -1,4 +1,4 @@
-"""fit(): what training guarantees, whatever is trained. Small models on a made-up world that takes milliseconds."""
+"""fit(): what training guarantees, whatever is trained. Small models on a made-up world."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def test_a_model_its_data_and_held_out_data_are_of_one_robot(field: str) -> None
     assert same(weights(model), before)
 
 
-# What comes out ------------------------------------------------------------------------------------------------------
+# What comes out ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("new", [new_tsm, new_prior])
@@ -353,7 +353,7 @@ def test_muon_lowers_the_loss_and_leaves_adam_what_is_not_its_own() -> None:
     assert curve.validation[-1] < 0.7 * curve.validation[0]
 
 
-# Stopped and resumed -------------------------------------------------------------------------------------------------
+# Stopped and resumed ----------------------------------------------------------------------------
 
 
 class Interrupted(Exception):
@@ -403,7 +403,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert same(weights(again), weights(whole))
 
 
-# Callbacks -----------------------------------------------------------------------------------------------------------
+# Callbacks --------------------------------------------------------------------------------------
 
 
 def lines(path: Path) -> list[dict[str, float]]:
@@ -547,7 +547,7 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-# What goes wrong -----------------------------------------------------------------------------------------------------
+# What goes wrong --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -564,7 +564,10 @@ def test_the_first_loss_that_is_not_finite_stops_training_and_keeps_the_best_wei
         name.removeprefix("best."): t for name, t in tensors.items() if name.startswith("best.")
     }
     faulty, kept_step = Faulty(model, 14, lambda loss: loss * value), header["best_step"]
-    message = rf"training loss became {value} at step 13 of 20; the weights of step {kept_step} are kept.*smaller lr"
+    message = (
+        rf"training loss became {value} at step 13 of 20; the weights of step {kept_step} are "
+        "kept.*smaller lr"
+    )
     with pytest.raises(TrainingStopped, match=message):
         train(model, faulty)
     assert faulty.calls == 14
