@@ -15,9 +15,9 @@ from typing import Any
 import growth
 from _rounds import EXTRA, Row, figure, folder, load, text
 
+from reproduction import runs
 from tsmlib import plots
 from tsmlib.storage import files
-from reproduction import runs
 
 ORDER = (
     *(

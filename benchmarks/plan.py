@@ -23,8 +23,10 @@ import numpy as np
 import torch
 from _plain import PlainPrior, PlainTSM
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
+from reproduction.models import load_pretrained
 from torch import Tensor
 
+from reproduction import runs
 from tsmlib import study
 from tsmlib.collection import collect, open_loop
 from tsmlib.envs.spec import EnvSpec
@@ -33,8 +35,6 @@ from tsmlib.models.tsm import TSM
 from tsmlib.planning.planners import adam, cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from reproduction import runs
-from reproduction.models import load_pretrained
 
 ENV = "tsm/ReacherPush-v1"
 

@@ -17,11 +17,11 @@ import torch
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from plan import models
 
+from reproduction import runs
 from tsmlib import study
 from tsmlib.models.base import rollout
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy
-from reproduction import runs
 from tsmlib.trajectory import initial_past
 
 SCHEDULE = 2200  # updates until the rate has decayed to its end, A25

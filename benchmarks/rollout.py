@@ -16,9 +16,8 @@ import torch
 from _rounds import SGEMM, Products, Row, interleaved, parsed, parser, peak_bytes, save
 from _simulator import ENV, raw
 
-from tsmlib import study
+from tsmlib import study, zoo
 from tsmlib.models.base import rollout
-from tsmlib import zoo
 from tsmlib.trajectory import initial_past
 
 

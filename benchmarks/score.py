@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from _rounds import Row, bandwidth, interleaved, parsed, parser, peak_bytes, save
 
+from reproduction import runs
 from tsmlib import study
 from tsmlib.evaluation import prediction
 from tsmlib.models.base import rollout
-from reproduction import runs
 from tsmlib.trajectory import Segment, Trajectories
 
 ENV, BYTES = "tsm/ReacherPush-v1", 2**28

@@ -22,14 +22,13 @@ from unittest import mock
 import numpy as np
 from _plain import PlainTSM
 from _rounds import SGEMM, Products, Row, interleaved, on_the_cpu, parsed, parser, peak_bytes, save
-
-from tsmlib import study
-from tsmlib.models.tsm import TSM
-from tsmlib import zoo
-from tsmlib.zoo import OURS, Updates
-from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.training.precision import native_bf16
+
+from tsmlib import study, zoo
+from tsmlib.models.tsm import TSM
+from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
+from tsmlib.zoo import OURS, Updates
 
 ENV = "tsm/ReacherPush-v1"
 BEFORE = "tsm+energy+direct"  # what rtsm took the place of

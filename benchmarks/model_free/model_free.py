@@ -26,21 +26,21 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
+from reproduction.results import exploration
+from reproduction.results.exploration import PENDULUM
 from torch import Tensor
 from tqdm.auto import tqdm
 
 import tsmlib.envs  # noqa: F401 - registers the environments
+from reproduction import pendulum, worlds
+from reproduction.runs import ROOT
 from tsmlib import study
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import within_bounds
 from tsmlib.planning.execution import execute
 from tsmlib.planning.tasks import HORIZON, Task
-from tsmlib.storage import tables
-from reproduction import pendulum, worlds
-from reproduction.results import exploration
-from reproduction.results.exploration import PENDULUM
-from reproduction.runs import ROOT
 from tsmlib.trajectory import Segment
 
 ENVS = ("tsm/Reacher-v0", "tsm/ReacherPush-v1")
@@ -96,7 +96,6 @@ UNITS = {
     "seconds": "s",
     "cpu_seconds": "s",
 }
-EXTRA = ("configuration",)  # a column beside the usual ones
 
 Predictor = Callable[[np.ndarray], np.ndarray]  # observations (n, k) -> actions (n, du)
 
@@ -373,7 +372,7 @@ class Table:
     """The rows of all finished runs, in a file. A run is known by environment, algorithm, subset, setting, seed."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.rows = path, tables.records(tables.load(path)) if path.exists() else []
+        self.path, self.rows = path, (pd.read_csv(path).to_dict("records") if path.exists() else [])
 
     def kept(self, key: Mapping[str, Any], steps: int) -> list[dict[str, Any]]:
         """The rows of a run, if it took at least ``steps``."""
@@ -410,7 +409,7 @@ class Table:
             row for row in self.rows if any(row[name] != value for name, value in key.items())
         ]
         self.rows = [*others, *new]
-        tables.save(self.path, self.rows, extra=EXTRA)
+        pd.DataFrame(self.rows).to_csv(self.path, index=False)
         return new
 
 

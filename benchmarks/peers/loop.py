@@ -19,17 +19,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
-from torch import Tensor
-
-from tsmlib.envs.stepping import make_simulation
-from tsmlib.planning.tasks import Task
-from tsmlib.rewards import rewarded
-from tsmlib.storage import tables
-from reproduction import runs, worlds
 from reproduction.results import exploration as results
 from reproduction.results.exploration import HORIZON, PENDULUM, PUSH
 from reproduction.worlds import Sizes
+from torch import Tensor
+
+from reproduction import runs, worlds
+from tsmlib.envs.stepping import make_simulation
+from tsmlib.planning.tasks import Task
+from tsmlib.rewards import rewarded
 from tsmlib.trajectory import Trajectories
 
 SETTINGS = {  # bound: of the actions, random ones included; every: steps between plans; trained: episodes between fits,
@@ -268,7 +268,7 @@ def main(given: list[str] | None = None) -> None:
     )
     path = arguments.out or run.metrics / f"peers_loop-{env.rpartition('/')[2]}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    tables.save(path, rows)
+    pd.DataFrame(rows).to_csv(path, index=False)
     print(f"{env}, seed {run.seed}: {record}\n{path}")
 
 

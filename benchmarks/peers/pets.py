@@ -21,19 +21,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
+from reproduction.results import prediction as prediction_results
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from reproduction import parameters, runs
 from tsmlib import study
+from tsmlib.contrib.mbrl_lib import transition_batch
+from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
-from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
-from tsmlib.contrib.mbrl_lib import transition_batch
-from tsmlib.storage import tables
-from reproduction import parameters, runs
-from reproduction.results import prediction as prediction_results
 from tsmlib.trajectory import Trajectories
 
 MODELS = {"gaussian": "pets", "mse": "pets+mse"}  # --form -> word in the column "model"
@@ -252,10 +252,9 @@ def table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write ``rows`` to ``path``, in place of those of the same model, environment and seed that it holds."""
     key = ("env", "model", "seed")
     new = {tuple(row[name] for name in key) for row in rows}
-    kept = tables.records(tables.load(path)) if path.exists() else []
-    tables.save(
-        path, [*(row for row in kept if tuple(row[name] for name in key) not in new), *rows]
-    )
+    kept = pd.read_csv(path).to_dict("records") if path.exists() else []
+    others = [row for row in kept if tuple(row[name] for name in key) not in new]
+    pd.DataFrame([*others, *rows]).to_csv(path, index=False)
 
 
 def run_of(folder: Path) -> runs.Run:

@@ -22,12 +22,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pets
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
+from tsmlib.training.precision import native_bf16
 
-from tsmlib import study
+from tsmlib import study, zoo
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.features import Features
 from tsmlib.planning.base import SearchSpace
@@ -37,10 +39,8 @@ from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
 from tsmlib.statistics import interval
-from tsmlib.storage import artifacts, tables
-from tsmlib import zoo
+from tsmlib.storage import artifacts
 from tsmlib.training.fit import TrainingOptions, fit
-from tsmlib.training.precision import native_bf16
 from tsmlib.trajectory import Trajectories
 
 ENV = "tsm/ReacherPush-v1"
@@ -624,7 +624,7 @@ def main() -> None:
     rows += planning(found, task)
     verdicts(found)
     path = run.dir.parents[1] / "bench" / "peers.csv"
-    tables.save(path, [dict(row, seed=0) for row in rows])
+    pd.DataFrame([dict(row, seed=0) for row in rows]).to_csv(path, index=False)
     print(path)
 
 

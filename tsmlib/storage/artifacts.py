@@ -1,16 +1,17 @@
-"""Artefacts on disk: named arrays with a header, trajectories and models, one safetensors file each.
+"""Named arrays with a header, trajectories and models: one safetensors file each.
 
-The metadata of the file holds one entry, ``tsmlib``: a JSON text whose first field is the SHA-256 of the whole file,
-taken with that field filled with zeros. So a single rename publishes data, header and checksum together, any
-safetensors reader opens the file, and a flipped bit, a cut or an appended byte is found when it is loaded. Nothing is
-pickled, and nothing found in a file is executed.
+The metadata of a file hold one entry, ``tsmlib``: a JSON text whose first field is the SHA-256 of
+the whole file, taken with that field filled with zeros. So one rename publishes data, header and
+checksum together, any safetensors reader opens the file, and a flipped bit, a cut or an appended
+byte is found when it is loaded. Nothing is pickled, and nothing in a file is executed.
 """
 
+from __future__ import annotations
+
 import hashlib
-import itertools
 import json
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -19,8 +20,8 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
-from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from tsmlib.robot import Robot
 from tsmlib.storage.files import (
     Json,
     PathLike,
@@ -28,25 +29,20 @@ from tsmlib.storage.files import (
     dumps,
     loads,
     read_bytes,
-    remedy,
     write_bytes,
 )
 from tsmlib.storage.provenance import provenance
-from tsmlib.trajectory import Robot, Trajectories, TrajectoryError
+from tsmlib.trajectory import Trajectories
 
-SCHEMA = 2  # 1, still read: no provenance, and of the fingerprint only env, dt and names
-LARGEST = (
-    10_000  # size among a model's arguments, length of a list of them, and parameters of a model
-)
-
-ROBOT = ("env", "dt", "names", "units", "angles")  # fields of a model's fingerprint
+SCHEMA = 2  # 1, of some shipped files: a fingerprint of fewer fields
 _ZEROS = "0" * 64
-_MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands in the file's header; cannot occur anywhere else
-_OTHER = "Name another file, or delete it and make one that fits."
+_MARK = rb'"tsmlib":"{\"sha256\":\"'  # where the checksum stands; cannot occur anywhere else
+_AGAIN = "Make it again; a file of the repository is restored by: git checkout -- FILE."
+_OTHER = "Name another file, or make one that fits."
 
 
 class Model(Protocol):
-    """The constructor's keyword arguments as plain JSON values, and the weights."""
+    """The constructor's arguments as JSON, and the weights."""
 
     def config(self) -> Mapping[str, Json]: ...
 
@@ -57,14 +53,11 @@ M = TypeVar("M", bound=torch.nn.Module)
 
 
 class Misfit(StoreError):
-    """A sound file of something else than was asked for. found: what it is of, such as ``found["env"]``."""
+    """A sound file of something else than expected; ``found`` holds what it is of."""
 
     def __init__(self, message: str, found: Mapping[str, Json]) -> None:
         super().__init__(message)
         self.found = found
-
-
-# Arrays with a header ------------------------------------------------------------------------------------------------
 
 
 def save(
@@ -74,308 +67,259 @@ def save(
     kind: str,
     header: Mapping[str, Json],
 ) -> None:
-    """Write named arrays and a JSON ``header`` to ``path`` (``*.safetensors``), replacing what was there in one step.
+    """Write named arrays, replacing what was there in one step.
 
-    kind: one word that ``load`` must ask for. header: plain JSON values; ``{"inputs": {path: sha256}}`` in it, paths
-    relative to this file, names the files that this one was made from, for ``verify``. Provenance is added.
-    Raises StoreError before writing anything if a value is not finite or the header is not JSON.
+    Args:
+        path: ends in .safetensors.
+        tensors: arrays by name, of finite numbers.
+        kind: one word that ``load`` must be given again.
+        header: JSON values.
+
+    Raises:
+        StoreError: a number that is not finite, a header that is no JSON, or no room.
     """
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise StoreError(
-            f"cannot write {path}: expected a name that ends in .safetensors, found '{path.suffix}'."
-        )
-    arrays = {name: _owned(value) for name, value in tensors.items()}
-    _require_finite(path, arrays, "Nothing was written: check what computed them.")
-    about = dumps(
-        path,
-        {
-            "sha256": _ZEROS,
-            "schema": SCHEMA,
-            "kind": kind,
-            "header": dict(header),
-            "provenance": provenance(),
-        },
-    )
-    data = safetensors.torch.save(arrays, metadata={"tsmlib": about})
+        raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors.")
+    try:
+        arrays = {
+            name: torch.as_tensor(value).detach().cpu().contiguous().clone()
+            for name, value in tensors.items()
+        }
+        _require_finite(path, arrays)
+        about: dict[str, Json] = {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind}
+        about |= {"header": dict(header), "provenance": provenance()}
+        data = safetensors.torch.save(arrays, metadata={"tsmlib": dumps(path, about)})
+    except (TypeError, safetensors.SafetensorError) as error:
+        raise StoreError(f"cannot write {path}: {error}. Expected arrays of numbers.") from error
     at = data.index(_MARK) + len(_MARK)
     digest = hashlib.sha256(data).hexdigest().encode()
     write_bytes(path, data[:at] + digest + data[at + len(digest) :])
 
 
 def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Json]]:
-    """Arrays and header as ``save`` wrote them. Every byte is checked first.
+    """Read what ``save`` wrote.
 
-    Raises StoreError if the file is missing, damaged, of another kind, or holds a value that is not finite.
+    Args:
+        path: of the file.
+        kind: the word that it was saved with.
+
+    Returns:
+        The arrays by name, and the header.
+
+    Raises:
+        StoreError: the file is missing, damaged, or of another kind.
     """
     tensors, about = _load(Path(path), kind)
-    _require_finite(Path(path), tensors, remedy(Path(path)))
     return tensors, about["header"]
 
 
-def read_header(path: PathLike) -> dict[str, Json]:
-    """The header alone, of an artefact of any kind. The whole file is checked all the same."""
-    return _read_checked(Path(path))[1]["header"]
-
-
-def code(path: PathLike) -> str:
-    """The version of the code that wrote an artefact, as it says itself; '' where it says none. Nothing is checked."""
-    provenance = _stated(path).get("provenance")
-    return str(provenance.get("code", "")) if isinstance(provenance, dict) else ""
-
-
-def checksum(path: PathLike) -> str:
-    """The SHA-256 of an artefact, as it says itself; '' where it says none. Nothing is checked."""
-    return str(_stated(path).get("sha256", ""))
-
-
-def unchecked_header(path: PathLike) -> dict[str, Json]:
-    """The header alone, of a file that was just loaded. Nothing is checked."""
-    header = _stated(path).get("header")
-    return header if isinstance(header, dict) else {}
-
-
-def _stated(path: PathLike) -> dict[str, Any]:
-    """What the ``tsmlib`` entry of a file says, if it has one; the rest of the file is not read."""
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            found = json.loads(file.metadata()["tsmlib"])
-    except (OSError, safetensors.SafetensorError, ValueError, KeyError, TypeError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
 def _load(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Arrays, not yet known to be finite, and everything that the ``tsmlib`` entry says."""
-    data, about = _read_checked(path, kind)
+    data, about = _read(path, kind)
     try:
-        return dict(sorted(safetensors.torch.load(data).items())), about  # they come in any order
+        tensors = dict(sorted(safetensors.torch.load(data).items()))
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(
-            f"{path} is not a valid safetensors file: {error}. {remedy(path)}"
-        ) from error
+        raise StoreError(f"{path} is no valid safetensors file: {error}. {_AGAIN}") from error
+    _require_finite(path, tensors)
+    return tensors, about
 
 
-def _read_checked(path: Path, kind: str | None = None) -> tuple[bytes, dict[str, Any]]:
-    """The bytes of an artefact whose checksum holds, and what its ``tsmlib`` entry says."""
+def read_header(path: PathLike) -> dict[str, Json]:
+    """The header of a file of any kind; the whole file is checked."""
+    header: dict[str, Json] = _read(Path(path), None)[1]["header"]
+    return header
+
+
+def _read(path: Path, kind: str | None) -> tuple[bytes, dict[str, Any]]:
+    """The bytes of a file whose checksum holds, and its ``tsmlib`` entry."""
     data = read_bytes(path)
-    header_end = 8 + int.from_bytes(data[:8], "little")
-    at = data.find(_MARK, 8, header_end) + len(_MARK)
-    if len(data) < 8 or header_end > len(data) or at < len(_MARK):
+    end = 8 + int.from_bytes(data[:8], "little")
+    at = data.find(_MARK, 8, min(end, len(data))) + len(_MARK)
+    if at < len(_MARK):
         raise StoreError(
-            f"{path} is damaged, or was not written by tsmlib: {len(data)} bytes found, and no tsmlib checksum in the "
-            f"header. {remedy(path)}"
+            f"{path} is damaged, or no file of tsmlib: its {len(data)} bytes have no checksum in "
+            f"their header. {_AGAIN}"
         )
-    stated = data[at : at + len(_ZEROS)].decode("latin-1")
-    found = hashlib.sha256(data[:at] + _ZEROS.encode() + data[at + len(_ZEROS) :]).hexdigest()
+    stated = data[at : at + 64].decode("latin-1")
+    found = hashlib.sha256(data[:at] + _ZEROS.encode() + data[at + 64 :]).hexdigest()
     if found != stated:
         raise StoreError(
-            f"{path} is damaged: its {len(data)} bytes have SHA-256 {found[:12]}..., expected {stated[:12]!a}.... "
-            f"{remedy(path)}"
+            f"{path} is damaged: its {len(data)} bytes have SHA-256 {found[:12]}..., expected "
+            f"{stated[:12]!a}.... {_AGAIN}"
         )
     try:
-        entry: Any = loads(data[8:header_end])
+        entry: Any = loads(data[8:end])
         about: Any = loads(entry["__metadata__"]["tsmlib"])
         schema, holds, _ = about["schema"], about["kind"], {**about["header"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreError(
-            f"{path} has a header that tsmlib cannot read ({error!r}). {remedy(path)}"
-        ) from error
-    if type(schema) is not int or not 1 <= schema <= SCHEMA:
-        raise StoreError(
-            f"{path} is written in format {schema!r:.80}, expected 1 to {SCHEMA}. Update tsmlib, or make it again."
-        )
+        raise StoreError(f"{path} has no readable header ({error!r:.200}). {_AGAIN}") from error
+    if schema not in (1, SCHEMA):
+        raise StoreError(f"{path} has format {schema!r:.80}, expected {SCHEMA}. {_AGAIN}")
     if kind is not None and holds != kind:
-        raise StoreError(f"{path} holds {holds!r:.80}, expected '{kind}'. {_OTHER}")
+        raise StoreError(f"{path} holds a {holds!r:.80}, expected a '{kind}'. {_OTHER}")
     return data, about
 
 
-def _owned(value: Tensor | np.ndarray) -> Tensor:
-    """A contiguous copy on the CPU that shares memory with nothing, as safetensors needs."""
-    if isinstance(value, np.ndarray):
-        return torch.from_numpy(np.array(value, order="C"))
-    return value.detach().cpu().clone(memory_format=torch.contiguous_format)
-
-
-def _require_finite(path: Path, tensors: Mapping[str, Tensor], advice: str) -> None:
+def _require_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            bad = torch.nonzero(~torch.isfinite(tensor))
+        bad = torch.nonzero(~torch.isfinite(tensor))
+        if len(bad):
             index = tuple(bad[0].tolist())
             raise StoreError(
-                f"{len(bad)} value(s) of '{name}' for {path} are not finite, the first at index {index}: "
-                f"{tensor[index].item()}. {advice}"
+                f"{len(bad)} value(s) of '{name}' in {path} are not finite, the first at {index}: "
+                f"{tensor[index].item()}. Expected finite numbers: check what computed them."
             )
-
-
-# Trajectories --------------------------------------------------------------------------------------------------------
 
 
 def save_trajectories(
     path: PathLike, trajectories: Trajectories, header: Mapping[str, Json] | None = None
 ) -> None:
-    """Write ``trajectories`` as float32. ``header``: where they come from (seed, controller, fingerprint, ...)."""
+    """Write trajectories; ``header`` says where they come from (seed, controller, ...)."""
     t = trajectories
-    fields: dict[str, Json] = {
-        "env": t.env,
-        "dt": t.dt,
-        "names": t.names,
-        "units": t.units,
-        "angles": t.angles,
-    }
-    same = len(set(t.lengths)) == 1
-    fields |= {} if same else {"lengths": t.lengths}
-    fields |= {"terminated": t.terminated} if any(t.terminated) else {}
-    arrays = {
-        "states": t.states if same else t.flat_states,
-        "actions": t.actions if same else t.flat_actions,
-    }
-    save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": fields})
+    about = {field.name: getattr(t, field.name) for field in fields(Robot)[:-1]}
+    if any(t.terminated):
+        about["terminated"] = t.terminated
+    arrays = {"states": t.flat_states, "actions": t.flat_actions}
+    if len(set(t.lengths)) > 1:
+        about["lengths"] = t.lengths
+    else:
+        arrays = {"states": t.states, "actions": t.actions}
+    save(path, arrays, kind="trajectories", header={**(header or {}), "trajectories": about})
 
 
 def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = None) -> Trajectories:
-    """Trajectories as ``save_trajectories`` wrote them, of ``expect``, a fingerprint, where that is given.
+    """Read what ``save_trajectories`` wrote.
 
-    Raises StoreError naming episode, step and field of a value that is not finite, or both sides of what differs.
+    Args:
+        path: of the file.
+        expect: fields of the robot, or of the header's ``fingerprint``, that must agree.
+
+    Raises:
+        StoreError: the file is missing, damaged or of something else.
     """
     path = Path(path)
-    tensors, about = _load(path, "trajectories")
+    tensors, entry = _load(path, "trajectories")
     try:
-        fields = about["header"]["trajectories"]
-        kinds = {name: str(tensor.dtype) for name, tensor in tensors.items()}
-        if kinds != dict.fromkeys(("states", "actions"), "torch.float32"):
-            raise TypeError(f"found {kinds}, expected 'states' and 'actions' in torch.float32")
-        words = [fields["env"], *fields["names"], *fields["units"]]
-        size = tensors["states"].shape[-1]
-        if not all(isinstance(word, str) for word in words) or not 0 < fields["dt"] < math.inf:
-            raise TypeError(
-                f"expected texts as env, names and units and a dt above 0, found {fields!r:.200}"
+        header = entry["header"]
+        about: Any = header["trajectories"]
+        states, actions = tensors["states"].numpy(), tensors["actions"].numpy()
+        ends = {name: about.get(name) for name in ("lengths", "terminated")}
+        known = {field.name: about[field.name] for field in fields(Robot)[:-1]}
+        robot = Robot(**known, action_dim=actions.shape[-1])
+        if states.ndim == 2:
+            trajectories = Trajectories.from_rows(
+                states, actions, ends["lengths"], robot, ends["terminated"]
             )
-        if not all(type(index) is int and 0 <= index < size for index in fields["angles"]):
-            raise TypeError(
-                f"angles are {fields['angles']!r:.80}, expected some of the {size} state dimensions"
-            )
-        arrays = (tensors["states"].numpy(), tensors["actions"].numpy())
-        meaning = (tuple(fields["names"]), tuple(fields["units"]), tuple(fields["angles"]))
-        lengths, ended = fields.get("lengths"), fields.get("terminated")
-        if arrays[0].ndim == 2:
-            robot = Robot(fields["env"], fields["dt"], *meaning, arrays[1].shape[-1])
-            found = Trajectories.from_rows(*arrays, lengths, robot, ended)
         else:
-            ends = {"lengths": lengths, "terminated": ended}
-            found = Trajectories(*arrays, fields["env"], fields["dt"], *meaning, **ends)
-        fingerprint = {**about["header"].get("fingerprint", {}), **fields}
-    except (KeyError, IndexError, TypeError, TrajectoryError) as error:
-        raise StoreError(f"{path} holds no usable trajectories: {error}. {remedy(path)}") from error
-    require_fit(path, fingerprint, expect, about["schema"])
-    return found
-
-
-# Models --------------------------------------------------------------------------------------------------------------
+            meaning = (robot.env, robot.dt, robot.names, robot.units, robot.angles)
+            trajectories = Trajectories(states, actions, *meaning, **ends)
+        stated: Any = header.get("fingerprint", {})
+        found = {**stated, **about}
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise StoreError(f"{path} holds no usable trajectories: {error}. {_AGAIN}") from error
+    require_fit(path, found, expect, only_stated=entry["schema"] == 1)
+    return trajectories
 
 
 def save_model(path: PathLike, model: Model, header: Mapping[str, Json] | None = None) -> None:
-    """Write the weights of ``model`` with its class name and constructor arguments.
+    """Write a model.
 
-    header["fingerprint"]: what the model fits (env, dt, names, ...), compared field by field by ``load_model``.
-    The length H of its segments joins it there.
+    Args:
+        path: ends in .safetensors.
+        model: its class, constructor arguments, robot and weights are kept.
+        header: JSON values; those of ``fingerprint`` are compared by ``load_model``.
+
+    Raises:
+        StoreError: weights that are not finite, or no room.
     """
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
     stated = about.get("fingerprint", {})
-    if isinstance(robot := getattr(model, "robot", None), Robot) and isinstance(stated, Mapping):
-        stated = {name: getattr(robot, name) for name in ROBOT} | stated
-        about["fingerprint"] = stated
     if hasattr(model, "segment_len") and isinstance(stated, Mapping):
         about["fingerprint"] = {"segment_len": model.segment_len, **stated}
+    robot = getattr(model, "robot", None)
+    if isinstance(robot, Robot):
+        about["robot"] = asdict(robot)
     save(path, model.state_dict(), kind="model", header=about)
 
 
 def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | None = None) -> M:
-    """``cls(**config)`` from the file, with its weights, strictly.
+    """Read a model; no random number is drawn.
 
-    expect: fields that the file's fingerprint must hold with these values. Raises StoreError naming both sides of
-    every field that differs, and for a file of another class or with weights of other shapes or types.
+    Args:
+        path: of the file.
+        cls: class of the model.
+        expect: fields of the file's fingerprint that must agree.
+
+    Returns:
+        The model, on the CPU, with its robot where the file states one.
+
+    Raises:
+        StoreError: the file is missing, damaged, of another class, or does not fit ``cls`` or
+            ``expect``; both sides of what differs are named.
     """
     path = Path(path)
-    tensors, about = _load(path, "model")
-    _require_finite(path, tensors, remedy(path))
-    header = about["header"]
+    tensors, entry = _load(path, "model")
+    header = entry["header"]
     if header.get("class") != cls.__name__:
         raise StoreError(
             f"{path} holds a {header.get('class')!r:.80}, expected a {cls.__name__}. {_OTHER}"
         )
     try:
-        config, fingerprint = {**header["config"]}, {**header.get("fingerprint", {})}
-        planned = _planned_layout(cls, config)
-        differs = differences(layout(tensors), planned) + [
-            f"{n} is unknown" for n in set(tensors) - set(planned)
-        ]
-    except (
-        Exception
-    ) as error:  # what the file says goes to a constructor, which may fail in any way
-        differs = [f"{error!r:.500}"]
-    if differs:
+        with torch.device("meta"):
+            model = cls(**header["config"])
+        differing = differences(_layout(tensors), _layout(model.state_dict()))
+        differing += [f"{name} is unknown" for name in tensors.keys() - model.state_dict().keys()]
+        fingerprint = {**header.get("fingerprint", {})}
+        robot = _robot(header, fingerprint)
+    except Exception as error:  # a constructor may fail in any way
+        differing = [f"{error!r:.500}"]
+    if differing:
         raise StoreError(
-            f"{path} does not fit the present {cls.__name__}: {'; '.join(differs[:5])}. {_OTHER}"
+            f"{path} does not fit the present {cls.__name__}: {'; '.join(differing[:5])}. {_OTHER}"
         )
-    require_fit(path, fingerprint, expect, about["schema"])
-    model = cls(**config)
-    model.load_state_dict(tensors, strict=True)
-    if hasattr(model, "robot") and fingerprint.keys() >= set(ROBOT):
-        model.robot = Robot(*(fingerprint[name] for name in ROBOT), model.action_dim)
+    require_fit(path, fingerprint, expect, only_stated=entry["schema"] == 1)
+    owned = {name: tensor.clone() for name, tensor in tensors.items()}
+    model.load_state_dict(owned, strict=True, assign=True)
+    if robot is not None and hasattr(model, "robot"):
+        model.robot = robot  # type: ignore[assignment] # of any model
     return model
 
 
-def _planned_layout(cls: type[torch.nn.Module], config: dict[str, Json]) -> dict[str, str]:
-    """Layout of ``cls(**config)``, found without its memory, however large the file says that it is."""
-    for name, value in config.items():
-        if max(_sizes(value), default=0) > LARGEST:
-            raise ValueError(f"{name} is {value!s:.80}, expected sizes of at most {LARGEST}")
-    parameters = itertools.count()
-
-    def count(*_: object) -> None:
-        if next(parameters) > LARGEST:
-            raise ValueError("it would be much larger than its file")
-
-    hook = register_module_parameter_registration_hook(count)
-    try:
-        with torch.device("meta"):
-            return layout(cls(**config).state_dict())
-    finally:
-        hook.remove()
-
-
-def _sizes(value: Json) -> Iterator[int]:
-    """Every integer within a JSON value, and the length of every list."""
-    if isinstance(value, int):
-        yield value
-    elif isinstance(value, list | dict):
-        yield len(value)
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from _sizes(item)
-
-
-# Comparison ----------------------------------------------------------------------------------------------------------
+def _robot(header: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> Robot | None:
+    """The robot that the file of a model states, if it states all of one."""
+    stated = header.get("robot") or {
+        **fingerprint,
+        "action_dim": header["config"].get("action_dim"),
+    }
+    names = [field.name for field in fields(Robot)]
+    if any(stated.get(name) is None for name in names):
+        return None
+    return Robot(**{name: stated[name] for name in names})
 
 
 def require_fit(
-    path: Path, found: Mapping[str, Json], expect: Mapping[str, Json] | None, schema: int = SCHEMA
+    path: PathLike,
+    found: Mapping[str, Json],
+    expect: Mapping[str, Json] | None,
+    *,
+    only_stated: bool = False,
 ) -> None:
-    """Misfit naming both sides of every field of ``expect`` that ``found``, from the file, does not hold."""
-    if differs := differences(found, expect or {}, only_stated=schema == 1):
-        raise Misfit(f"{path} does not fit: {'; '.join(differs)}. {_OTHER}", found)
+    """Misfit naming both sides of every field of ``expect`` that ``found`` does not hold."""
+    if differing := differences(found, expect or {}, only_stated=only_stated):
+        raise Misfit(f"{path} does not fit: {'; '.join(differing)}. {_OTHER}", found)
 
 
 def differences(
     found: Mapping[str, Json], expected: Mapping[str, Json], *, only_stated: bool = False
 ) -> list[str]:
-    """Fields of ``expected`` that ``found``, from a file, does not hold, naming both sides.
+    """Both sides of every field of ``expected`` that ``found``, from a file, does not hold.
 
-    ``standard``, in either of both: values of fields that the other leaves out.
-    only_stated: what ``found`` does not mention is not asked for, except the environment.
+    Args:
+        found: what the file says; ``standard`` in it holds values of fields that it leaves out.
+        expected: what is needed, with ``standard`` likewise.
+        only_stated: what the file does not mention is not compared, except the environment.
     """
     wanted = json.loads(json.dumps(dict(expected)))  # tuples become lists, as in a file
-    # Fields that only a variant of an environment states, with what the others mean by leaving them out.
     stated, usual = found.get("standard"), wanted.pop("standard", {})
     if "simulator" in wanted:  # a whole fingerprint
         usual = {**(stated if isinstance(stated, Mapping) else {}), **usual}
@@ -387,26 +331,25 @@ def differences(
     ]
 
 
-def layout(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+def _layout(tensors: Mapping[str, Tensor]) -> dict[str, Json]:
     """Type and shape of each array, in words."""
     return {
-        name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
-        for name, tensor in tensors.items()
+        name: f"{x.dtype} {list(x.shape)}".removeprefix("torch.") for name, x in tensors.items()
     }
 
 
 def digest(tensors: Mapping[str, Tensor]) -> str:
     """SHA-256 of named arrays, by name and content."""
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for name, tensor in sorted(tensors.items()):
-        found.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()
+        sha.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()
 
 
 def trajectories_digest(data: Trajectories) -> str:
-    """The first 16 digits of the ``digest`` of states, actions and, where episodes differ in length, lengths."""
-    if len(set(data.lengths)) == 1:
-        return digest(
-            {"states": torch.from_numpy(data.states), "actions": torch.from_numpy(data.actions)}
-        )[:16]
-    return digest(data.tensors()._asdict())[:16]
+    """Sixteen digits that tell the states and actions of data sets apart."""
+    arrays = {"states": data.flat_states, "actions": data.flat_actions}
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    if len(set(data.lengths)) > 1:
+        tensors["lengths"] = torch.tensor(data.lengths)
+    return digest(tensors)[:16]

@@ -1,9 +1,9 @@
-"""Atomic writes, one read, compression, JSON, and locks that name who holds them."""
+"""Atomic writes, one read, JSON, and a lock that names who holds it."""
+
+from __future__ import annotations
 
 import contextlib
-import glob
-import gzip
-import io
+import errno
 import json
 import math
 import os
@@ -11,36 +11,39 @@ import socket
 import sys
 import threading
 import time
-import zlib
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import psutil
 from filelock import FileLock, Timeout
 
 PathLike = str | os.PathLike[str]
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
-
-MANIFEST, STATUS = "MANIFEST.json", "status.json"
-UNPACKED = 2**28  # bytes that a compressed file may hold
+LEFT_AFTER = 3600  # s, after which a temporary file was left by a process that was killed
 
 
 class StoreError(ValueError):
-    """An artefact that cannot be written, read or trusted: names the file, what was found and expected, the remedy."""
+    """A file that cannot be written, read or trusted: what was found, expected, and the remedy."""
 
 
 def write_bytes(path: PathLike, data: bytes) -> None:
-    """Replace ``path`` by ``data`` in one step, creating its folder; on failure the old file stays and nothing else."""
-    path, here = Path(path), f".tmp-{socket.gethostname()}-"
-    temporary = path.with_name(f".{path.name}{here}{threading.get_ident()}-{os.getpid()}")
+    """Replace a file in one step, creating its folder; on failure the old file stays.
+
+    Args:
+        path: of the file.
+        data: its new content.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}-{threading.get_ident()}")
     try:
-        _make(path.parent)
-        for left in path.parent.glob(
-            f".*{glob.escape(here)}*"
-        ):  # by a process of this machine that was killed
-            if not alive(left.name.rpartition("-")[2]):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for left in path.parent.glob(".*.tmp-*"):
+            if left != temporary and time.time() - left.stat().st_mtime > LEFT_AFTER:
                 left.unlink(missing_ok=True)
         with open(temporary, "wb") as file:
             file.write(data)
@@ -56,65 +59,27 @@ def write_bytes(path: PathLike, data: bytes) -> None:
 
 
 def read_bytes(path: PathLike) -> bytes:
-    """The bytes of a regular file. Raises StoreError for anything else."""
+    """The bytes of a regular file; StoreError for anything else."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
             raise OSError("it is a folder or a device, expected a file")
         return path.read_bytes()
     except FileNotFoundError:
-        raise StoreError(
-            f"{path} does not exist. Check the name, or run the notebook that makes it."
-        ) from None
+        raise StoreError(f"{path} does not exist: check its name, or make it first.") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"cannot read {path}: {error}. Check its name and permissions.") from error
 
 
-def packed(data: bytes) -> bytes:
-    """Bytes as gzip, without a name or a time in it."""
-    file = io.BytesIO()
-    with gzip.GzipFile("", "wb", fileobj=file, mtime=0) as into:
-        into.write(data)
-    return file.getvalue()
-
-
-def unpacked(path: Path, data: bytes) -> bytes:
-    """What a file ``*.gz`` unpacks to. Raises StoreError for what is no gzip, cut, or larger than UNPACKED."""
-    try:
-        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            found = file.read(UNPACKED + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise StoreError(f"{path} is damaged, or no gzip: {error}. {remedy(path)}") from error
-    if len(found) > UNPACKED:
-        raise StoreError(
-            f"{path} unpacks to more than {UNPACKED} bytes, expected fewer. {remedy(path)}"
-        )
-    return found
-
-
-def remedy(path: Path) -> str:
-    """Advice about a damaged file."""
-    if "data" in path.absolute().parts:
-        return "Restore it: git checkout -- data in a clone; else install tsmlib again."
-    return "Delete it and make it again."
-
-
 def _cannot_write(what: str, error: OSError) -> StoreError:
     return StoreError(
-        f"cannot write {what}: {error.strerror or error}. Make room or permission there, or name another folder with "
-        "TSM_RUN_DIR."
+        f"cannot write {what}: {error.strerror or error}. Make room or permission there, or name "
+        "another folder."
     )
 
 
-def _make(folder: Path) -> None:
-    """Create a folder and those above it, so that they outlive a power cut."""
-    if not folder.is_dir():
-        _make(folder.parent)
-        folder.mkdir(exist_ok=True)
-        _sync(folder.parent)
-
-
 def _sync(folder: Path) -> None:
+    """Let a rename outlive a power cut."""
     if os.name == "nt":  # Windows opens no folders
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -125,34 +90,41 @@ def _sync(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def writer_lock(
-    folder: PathLike, purpose: str, *, name: str = "", wait: bool = False
-) -> Iterator[None]:
-    """Exclusive right to write in ``folder``, made if need be; it ends with this process, however that ends.
+def writer_lock(folder: PathLike, purpose: str) -> Iterator[None]:
+    """Hold the right to write in a folder, which ends with this process, however that ends.
 
-    name: of the part of the folder that is written, where others may write the rest; '' is all of it. wait: until
-    another holder is done, naming it on stderr, in place of StoreError naming it: process, machine, purpose and since.
+    Where the file system has no locks a warning says so, and nothing keeps two writers apart.
+
+    Args:
+        folder: made if it is not there.
+        purpose: told to another process that wants to write.
+
+    Raises:
+        StoreError: another process writes there; process, machine, purpose and since are named.
     """
-    hidden = f".{name}" if name else ""
-    lock, holder = FileLock(Path(folder) / f"{hidden}.lock"), Path(folder) / f"{hidden}.writer"
+    folder = Path(folder)
     try:
-        _make(Path(folder))
-        if who := _acquire_or_name(lock, holder):
-            if not wait:
-                raise StoreError(
-                    f"{Path(folder) / name} is being written by another process ({who}). Wait for it or end it, or "
-                    "take another seed, or another folder with TSM_RUN_DIR."
-                )
-            sys.stderr.write(f"waiting for {who}, which writes {Path(folder) / name}\n")
-            lock.acquire(poll_interval=0.5)
+        folder.mkdir(parents=True, exist_ok=True)
+        locks = _has_locks(folder)
+    except OSError as error:
+        raise _cannot_write(f"in {folder}", error) from error
+    if not locks:
+        warnings.warn(
+            f"{folder} is on a file system without locks (flock): see to it that no other process "
+            "writes there, or name a folder on a local disk",
+            stacklevel=3,
+        )
+        yield
+        return
+    lock, holder = FileLock(folder / ".lock"), folder / ".writer"
+    try:
+        _acquire(lock, holder)
     except OSError as error:
         raise _cannot_write(f"in {folder}", error) from error
     try:
-        since = time.strftime("%F %T%z")
+        since, host = time.strftime("%F %T%z"), socket.gethostname()
         with contextlib.suppress(OSError):  # a full disk: nameless, but locked
-            holder.write_text(
-                f"pid {os.getpid()} on {socket.gethostname()}, {purpose}, since {since}"
-            )
+            holder.write_text(f"pid {os.getpid()} on {host}, {purpose}, since {since}")
         yield
     finally:
         with contextlib.suppress(OSError):
@@ -160,36 +132,60 @@ def writer_lock(
         lock.release()
 
 
-def _acquire_or_name(lock: FileLock, holder: Path) -> str:
-    """Who holds the lock, "unknown" where that is not said within two seconds; '' once it is acquired."""
+def _acquire(lock: FileLock, holder: Path) -> None:
+    who = ""
     for _ in range(10):  # a new holder writes its name at once, on a busy machine a little later
         with contextlib.suppress(Timeout):
             lock.acquire(timeout=0.2)
-            return ""
+            return
         with contextlib.suppress(OSError):
-            if who := holder.read_text():
-                return who
-    return "unknown"
+            who = holder.read_text()
+        if who:
+            break
+    raise StoreError(
+        f"{holder.parent} is being written by another process ({who or 'unknown'}). Wait for it, "
+        "end it, or name another folder."
+    )
 
 
-def alive(pid: object, host: object = None) -> bool:
-    """Whether there may be a process of this number; True for what is none, or is of another machine.
-
-    host: the machine's name; None is this one.
-    """
-    try:
-        return host not in (None, socket.gethostname()) or psutil.pid_exists(int(str(pid)))
-    except (ValueError, OverflowError):
+def _has_locks(folder: Path) -> bool:
+    """Whether ``flock`` works here; a network folder may lack it."""
+    if sys.platform == "win32":
         return True
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
+    finally:
+        os.close(descriptor)
+    return True
 
 
 def loads(text: str | bytes) -> Json:
-    """JSON values without the numbers that JSON does not have. Raises ValueError, or RecursionError for deep ones."""
+    """JSON without the numbers that it does not have; ValueError, or RecursionError if deep."""
 
     def refuse(word: str) -> None:
         raise ValueError(f"{word} is not a JSON value")
 
-    return json.loads(text, parse_constant=refuse)
+    value: Json = json.loads(text, parse_constant=refuse)
+    return value
+
+
+def dumps(path: PathLike, value: Json) -> str:
+    """JSON for ``path``; StoreError for anything that it cannot hold, NaN included."""
+
+    def convert(item: object) -> object:
+        if isinstance(item, np.generic):
+            return item.item()
+        raise TypeError(f"a {type(item).__name__} is not a JSON value: {item!r:.80}")
+
+    try:
+        return json.dumps(value, allow_nan=False, default=convert, separators=(",", ":"))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise StoreError(f"the header of {path} cannot be written: {error}.") from error
 
 
 def encode_nonfinite(value: Json) -> Any:
@@ -202,29 +198,9 @@ def encode_nonfinite(value: Json) -> Any:
 
 
 def decode_nonfinite(value: Json) -> Any:
-    """The numbers again. Any text that is one of the three becomes one, so only for values without texts of their own;
-    tuples have become lists."""
+    """The numbers again; for values without texts of their own. Tuples have become lists."""
     if isinstance(value, Mapping):
         return {name: decode_nonfinite(item) for name, item in value.items()}
     if isinstance(value, list):
         return [decode_nonfinite(item) for item in value]
     return float(value) if isinstance(value, str) and value in ("nan", "inf", "-inf") else value
-
-
-def dumps(path: Path, value: Json, indent: int | None = None) -> str:
-    """JSON text for ``path``. Raises StoreError for anything that JSON cannot hold, NaN included."""
-
-    def convert(item: object) -> object:
-        if isinstance(item, np.generic):
-            return item.item()
-        raise TypeError(f"a {type(item).__name__} is not a JSON value: {item!r:.80}")
-
-    separators = (",", ":") if indent is None else None
-    try:
-        return json.dumps(
-            value, allow_nan=False, default=convert, indent=indent, separators=separators
-        )
-    except (TypeError, ValueError, RecursionError) as error:
-        raise StoreError(
-            f"the header or JSON for {path} cannot be written: {error}. Nothing was written."
-        ) from error
