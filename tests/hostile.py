@@ -1,4 +1,6 @@
-"""Environments as strangers write them: a cart that is pushed, each with one thing that used to go wrong."""
+"""Environments as strangers write them: a cart that is pushed, each with one thing that used to go
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -168,7 +170,9 @@ class DictObservation(Cart):
 
 
 class TupleObservation(Cart):
-    observation_space = Tuple((Box(-9, 9, (1,), np.float64), Dict(v=Box(-9, 9, (1, 1), np.float64))))
+    observation_space = Tuple(
+        (Box(-9, 9, (1,), np.float64), Dict(v=Box(-9, 9, (1, 1), np.float64)))
+    )
 
     def seen(self) -> Any:
         return self.x[:1], {"v": self.x[1:, None]}
@@ -375,8 +379,8 @@ class KeepsAView(HalfCheetahEnv):
 class Hostile:
     """One environment, and what has to come of it.
 
-    made: makes it. fails: the error of collecting, ''. warns: a warning of collecting. oracle: the refusal of the true
-    simulator, '' where it predicts what is executed. names: of its state.
+    made: makes it. fails: the error of collecting, ''. warns: a warning of collecting. oracle: the
+    refusal of the true simulator, '' where it predicts what is executed. names: of its state.
     """
 
     made: Callable[[], gymnasium.Env]

@@ -1,8 +1,9 @@
-"""Any environment: what is collected, executed and predicted is what stepping it gives, or an error says why not."""
+"""Any environment: what is collected, executed and predicted is what stepping it gives, or an error
+says why not.
+"""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from functools import partial
@@ -33,12 +34,27 @@ from tsmlib.envs.stepping import (
 from tsmlib.envs.unstable import SimulationUnstable
 
 PENDULUM, HOPPER, CHEETAH = "Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"
-V5 = ("Ant HalfCheetah Hopper Humanoid HumanoidStandup InvertedDoublePendulum InvertedPendulum Pusher Reacher Swimmer "
-      "Walker2d").split()
+V5 = [
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "InvertedDoublePendulum",
+    "InvertedPendulum",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+]
 IDS = [
-    PENDULUM, "MountainCarContinuous-v0", "Pendulum-v1(g=1.0)", "HalfCheetah-v5(frame_skip=10)",
-    *(f"{name}-v5" for name in V5), *(f"{name}-v4" for name in V5 if name != "Pusher"),
-]  # fmt: skip
+    PENDULUM,
+    "MountainCarContinuous-v0",
+    "Pendulum-v1(g=1.0)",
+    "HalfCheetah-v5(frame_skip=10)",
+    *(f"{name}-v5" for name in V5),
+    *(f"{name}-v4" for name in V5 if name != "Pusher"),
+]
 
 
 def still(states: Tensor, actions: Tensor) -> Tensor:
@@ -52,7 +68,9 @@ def random_actions(n: int, horizon: int, dim: int, seed: int = 0) -> Tensor:
 
 
 def stepped(env_id: str, actions: Tensor, seed: int) -> list[tuple[np.ndarray, float, bool]]:
-    """Observations, return and termination of every episode, from a loop that knows nothing of tsmlib."""
+    """Observations, return and termination of every episode, from a loop that knows nothing of
+    tsmlib.
+    """
     found = []
     name, _, given = env_id.partition("(")
     for i, own in enumerate(actions.double().numpy()):
@@ -92,7 +110,8 @@ def made() -> Iterator[Made]:
         del registry[name]
 
 
-# The table: from an id to data, a model and a closed loop -------------------------------------------------------------
+# The table: from an id to data, a model and a closed loop
+# -------------------------------------------------------------
 
 
 def closed_loop(env_id: str) -> tuple[tsmlib.Task, tsmlib.Trial]:
@@ -153,11 +172,16 @@ def test_hostile_environments_give_what_stepping_gives_or_an_error_that_says_why
     task = tsmlib.Task.from_env(env_id, n=2, horizon=12, reward=still, seed=3)
     candidates = torch.stack([random_actions(2, 12, task.action_dim, seed) for seed in range(3)])
     if expected.oracle:
-        with pytest.raises(UnsupportedEnvironment, match=f"no oracle and no replay: .*{expected.oracle}"):
+        with pytest.raises(
+            UnsupportedEnvironment, match=f"no oracle and no replay: .*{expected.oracle}"
+        ):
             tsmlib.simulator_predictor(task)(candidates)
         return
     predict = tsmlib.simulator_predictor(task)
-    for predicted in (predict(candidates)[0], predict(candidates)[0]):  # asked again, it says the same
+    for predicted in (
+        predict(candidates)[0],
+        predict(candidates)[0],
+    ):  # asked again, it says the same
         for one, own in zip(predicted, candidates, strict=True):
             torch.testing.assert_close(one, tsmlib.execute(task, own).states[:, 1:], rtol=0, atol=0)
 
@@ -166,7 +190,8 @@ def test_the_table_is_long_enough() -> None:
     assert len(HOSTILE) >= 40
 
 
-# Names of robots ------------------------------------------------------------------------------------------------------
+# Names of robots
+# ------------------------------------------------------------------------------------------------------
 
 
 def test_an_id_carries_the_arguments_in_which_a_robot_differs() -> None:
@@ -182,9 +207,13 @@ def test_an_id_carries_the_arguments_in_which_a_robot_differs() -> None:
     }
     for name, env in makes.items():
         data = collect(env, open_loop(torch.zeros(2, 3, 1)), horizon=3, seed=0)
-        assert data.env.partition("Observation(")[0].removesuffix("Observation") == name.removesuffix("Observation")
+        assert data.env.partition("Observation(")[0].removesuffix(
+            "Observation"
+        ) == name.removesuffix("Observation")
         if name.endswith(("+TimeAwareObservation", "differ)")):
-            with pytest.raises(UnsupportedEnvironment, match="cannot be made from its id.*register"):
+            with pytest.raises(
+                UnsupportedEnvironment, match="cannot be made from its id.*register"
+            ):
                 tsmlib.Task.from_env(data.env, n=1, horizon=3, reward=still)
     with pytest.raises(UnsupportedEnvironment, match="the arguments of .* cannot be read"):
         make_simulation("Pendulum-v1(g=earth)", 1)
@@ -200,13 +229,20 @@ def test_an_argument_that_no_id_can_carry_is_named(made: Made) -> None:
     with pytest.raises(UnsupportedEnvironment, match="argument weight of .* register it by itself"):
         simulation(env)
     registered = made(Weighed, kwargs={"weight": np.arange(3)})
-    assert environment_id(gymnasium.make(registered)) == make_simulation(registered, 1).id == registered
+    assert (
+        environment_id(gymnasium.make(registered))
+        == make_simulation(registered, 1).id
+        == registered
+    )
 
 
-# Time -----------------------------------------------------------------------------------------------------------------
+# Time
+# -----------------------------------------------------------------------------------------------------------------
 
 
-def test_a_step_is_as_long_as_the_clocks_say_or_the_environment_or_counts_as_a_second(made: Made) -> None:
+def test_a_step_is_as_long_as_the_clocks_say_or_the_environment_or_counts_as_a_second(
+    made: Made,
+) -> None:
     def dt(env: VectorEnv | str) -> float:
         run = make_simulation(env, 1) if isinstance(env, str) else simulation(env)
         with closing(run):
@@ -221,19 +257,30 @@ def test_a_step_is_as_long_as_the_clocks_say_or_the_environment_or_counts_as_a_s
         for env_id in (PENDULUM, CHEETAH):
             env = gymnasium.make_vec(env_id, num_envs=1, vectorization_mode=mode, wrappers=[repeat])
             assert dt(env) == pytest.approx(0.15)
-    with pytest.warns(UserWarning, match="does not say how long a step is; .* Give it an attribute"):
+    with pytest.warns(
+        UserWarning, match="does not say how long a step is; .* Give it an attribute"
+    ):
         assert dt(made(type("Timeless", (Cart,), {"dt": None, "metadata": {}}))) == 1.0
 
 
 def test_what_an_environment_says_of_itself_is_kept(made: Made) -> None:
-    said = {"names": ["turn", "speed"], "units": ("rad", "m/s"), "angles": [0], "dt": np.float32(0.5)}
+    said = {
+        "names": ["turn", "speed"],
+        "units": ("rad", "m/s"),
+        "angles": [0],
+        "dt": np.float32(0.5),
+    }
     data = tsmlib.collect_random(made(type("Said", (Cart,), said)), episodes=2, horizon=3)
     assert (data.names, data.units, data.angles, data.dt) == (
-        ("turn", "speed"), ("rad", "m/s"), (0,), 0.5,
-    )  # fmt: skip
+        ("turn", "speed"),
+        ("rad", "m/s"),
+        (0,),
+        0.5,
+    )
 
 
-# Actions --------------------------------------------------------------------------------------------------------------
+# Actions
+# --------------------------------------------------------------------------------------------------------------
 
 
 def test_full_actions_are_the_bounds_and_the_idle_one_is_zero_or_nearest_to_it() -> None:
@@ -246,7 +293,9 @@ def test_full_actions_are_the_bounds_and_the_idle_one_is_zero_or_nearest_to_it()
 
 def test_actions_of_another_size_or_without_a_number_are_refused() -> None:
     run = make_simulation(PENDULUM, 2)
-    with pytest.raises(ValueError, match=r"actions are \(2, 3, 2\); Pendulum-v1 expected \(2, T, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"actions are \(2, 3, 2\); Pendulum-v1 expected \(2, T, 1\)"
+    ):
         run.rollout(np.zeros((2, 3, 2)))
     with pytest.raises(ValueError, match=r"actions has shape \(2, 3, 2\); expected \(2, T, 1\)"):
         collect(run, open_loop(torch.zeros(2, 3, 2)), horizon=3)
@@ -254,7 +303,8 @@ def test_actions_of_another_size_or_without_a_number_are_refused() -> None:
         run.rollout(np.full((2, 1, 1), np.nan))
 
 
-# Episodes -------------------------------------------------------------------------------------------------------------
+# Episodes
+# -------------------------------------------------------------------------------------------------------------
 
 
 def test_an_episode_ends_at_the_limit_of_time_without_being_terminated() -> None:
@@ -289,9 +339,13 @@ def test_what_float32_cannot_tell_apart_is_said_and_not_only_lost(made: Made) ->
 
 def test_other_robots_begin_from_seeds_and_not_from_observations() -> None:
     run, states = make_simulation(PENDULUM, 2), np.zeros((2, 3))
-    with pytest.raises(UnsupportedEnvironment, match="Pendulum-v1 cannot begin in given states.*name the seed"):
+    with pytest.raises(
+        UnsupportedEnvironment, match="Pendulum-v1 cannot begin in given states.*name the seed"
+    ):
         collect(run, open_loop(torch.zeros(2, 3, 1)), horizon=3, states=states)
-    with pytest.raises(ValueError, match="3 seeds for 2 episodes of Pendulum-v1; expected one each"):
+    with pytest.raises(
+        ValueError, match="3 seeds for 2 episodes of Pendulum-v1; expected one each"
+    ):
         run.reset(seed=[1, 2, 3])
     np.testing.assert_array_equal(run.reset(seed=np.int64(3)), run.reset(seed=[3, 4]))
 
@@ -327,7 +381,8 @@ def test_environments_are_closed_where_something_raises(made: Made) -> None:
     assert Counted.open == 0
 
 
-# Vector environments --------------------------------------------------------------------------------------------------
+# Vector environments
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -343,7 +398,11 @@ def test_what_a_vector_environment_makes_of_ended_episodes_stays_out_of_the_data
         states = run.rollout(actions.numpy())
     for i, (seen, total, over) in enumerate(stepped(env_id, actions, seed=1)):
         np.testing.assert_array_equal(states[i, : len(seen) - 1], seen[1:])
-        assert (run.steps[i], bool(run.terminated[i]), run.returns[i]) == (len(seen) - 1, over, total)
+        assert (run.steps[i], bool(run.terminated[i]), run.returns[i]) == (
+            len(seen) - 1,
+            over,
+            total,
+        )
     assert min(run.steps) < 20
 
 
@@ -358,7 +417,9 @@ def test_dictionaries_come_from_vector_environments_too(kind: Any) -> None:
 
 def test_copies_that_are_one_object_are_refused() -> None:
     one = Cart()
-    with pytest.raises(UnsupportedEnvironment, match="2 copies of Cart are one and the same object"):
+    with pytest.raises(
+        UnsupportedEnvironment, match="2 copies of Cart are one and the same object"
+    ):
         simulation(SyncVectorEnv([lambda: one] * 2))
 
 
@@ -411,7 +472,9 @@ def test_a_vector_environment_that_takes_one_seed_is_given_one() -> None:
     np.testing.assert_array_equal(first.states, again.states)
     assert first.states[0, 0] != first.states[1, 0] != other.states[1, 0]
     assert first.steps.tolist() == [3, 3]
-    with pytest.raises(UnsupportedEnvironment, match="Drifts takes no seed for each .* give one for all"):
+    with pytest.raises(
+        UnsupportedEnvironment, match="Drifts takes no seed for each .* give one for all"
+    ):
         collect(Drifts(), still, horizon=5, seed=[1, 2])
 
 
@@ -458,7 +521,9 @@ def test_an_episode_that_is_not_finite_is_told_with_its_step_since_reset() -> No
         with closing(simulation(kind([BlowsUp] * 3))) as run:
             run.reset(seed=0)
             run.rollout(actions[:, :2])
-            with pytest.raises(SimulationUnstable, match="episode 1 at step 3: x1 is nan") as caught:
+            with pytest.raises(
+                SimulationUnstable, match="episode 1 at step 3: x1 is nan"
+            ) as caught:
                 run.rollout(actions[:, 2:])
             assert (caught.value.env, caught.value.episode, caught.value.step) == ("BlowsUp", 1, 3)
 

@@ -1,7 +1,6 @@
 """What must hold in the MuJoCo world, whatever the torques."""
 
 import os
-import warnings
 from pathlib import Path
 
 import gymnasium
@@ -9,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from tsmlib.envs import mujoco_arm
 from tsmlib.envs.geometry import (
     ARM_RADIUS,
     BLOCK_DECAY,
@@ -49,7 +47,9 @@ def smooth_torques(n: int, rms: float, steps: int = 100, seed: int = 0) -> np.nd
 
 
 def full_torques(n: int, steps: int = 100, seed: int = 0) -> np.ndarray:
-    """Actions (n, steps, 2) of -1 or 1 that jump every tenth step; in a third of the episodes they never jump."""
+    """Actions (n, steps, 2) of -1 or 1 that jump every tenth step; in a third of the episodes they
+    never jump.
+    """
     actions = np.repeat(
         np.random.default_rng(seed).choice([-1.0, 1.0], (n, steps // 10, 2)), 10, axis=1
     )
@@ -189,7 +189,9 @@ def test_the_object_bounces_off_the_walls_and_slows_down() -> None:
 
 @pytest.mark.parametrize("env_id", [OBSTACLE, PUSH])
 def test_nothing_penetrates_except_in_the_instant_of_impact(env_id: str) -> None:
-    """Deeper than 1 mm for no two steps in a row, and even the deepest impact of collected data stays below 3 mm."""
+    """Deeper than 1 mm for no two steps in a row, and even the deepest impact of collected data
+    stays below 3 mm.
+    """
     env, _ = arms(env_id, 300)
     deep = depth(env.rollout(smooth_torques(300, DATA_RMS)), env_id)
     assert longest_runs(deep > 1e-3).max() <= 1
@@ -222,12 +224,6 @@ def test_a_free_object_slows_down_by_e_in_its_decay_time() -> None:
     assert decay == pytest.approx(0.05, rel=0.02)
 
 
-def test_random_torques_push_the_object_no_deeper_than_a_centimetre_into_a_wall() -> None:
-    env, _ = arms(PUSH, 300)
-    states = env.rollout(smooth_torques(300, 0.1))
-    assert ROOM - 0.002 < np.abs(states[..., 6:8]).max() < ROOM + 0.01  # walls are met
-
-
 @pytest.mark.parametrize("env_id", MUJOCO_IDS)
 def test_energy_does_not_grow_without_torque(env_id: str) -> None:
     env, start = arms(env_id, 150)
@@ -257,11 +253,7 @@ def test_a_blow_up_is_raised_with_episode_and_step(
     monkeypatch.chdir(tmp_path)
     env, _ = arms(env_id, 300)
     env.rollout(np.zeros((300, 3, 2)))
-    snapshot = env.get_state()
-    snapshot[277, 1 + env.model.nq] = value  # the shoulder's velocity
-    with pytest.raises(SimulationUnstable, match="episode 277"):
-        env.set_state(snapshot)
-    env._physics = snapshot[:, :-4]  # as if it had come about by itself
+    env._physics[277, 1 + env.model.nq] = value  # the shoulder's velocity, as if by itself
     with pytest.raises(SimulationUnstable) as caught:
         env.rollout(np.zeros((300, 4, 2)))
     assert (caught.value.env, caught.value.episode, caught.value.step) == (
@@ -271,24 +263,6 @@ def test_a_blow_up_is_raised_with_episode_and_step(
     )  # steps since reset
     assert "QVEL" in caught.value.reason
     assert not os.listdir(tmp_path)  # MuJoCo would leave a log file here
-
-
-def test_a_machine_without_opengl_draws_the_scene_all_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*args: object) -> None:
-        raise mujoco.FatalError("an OpenGL platform library has not been loaded")
-
-    monkeypatch.setattr(mujoco_arm, "_gl_works", True)
-    monkeypatch.setattr(MujocoArm, "_photograph", fail)
-    env = gymnasium.make(PUSH, render_mode="rgb_array").unwrapped
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="drawing with matplotlib"):
-        image = env.render()
-    assert image.shape[2] == 3
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # it says so once
-        np.testing.assert_array_equal(env.render(), image)
 
 
 def test_threads_change_nothing_but_time() -> None:

@@ -1,11 +1,8 @@
 """What must hold in the pymunk world, whatever the torques."""
 
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from tsmlib.envs.arm import ArmVectorEnv
 from tsmlib.envs.geometry import (
@@ -13,7 +10,6 @@ from tsmlib.envs.geometry import (
     BLOCK_MASS,
     BLOCK_RADIUS,
     DT,
-    ELBOW_LIMIT,
     GEAR,
     LINK_LENGTHS,
     WALL,
@@ -43,7 +39,9 @@ def smooth_torques(n: int = N, steps: int = T, rms: float = 0.1, seed: int = 0) 
 
 
 def full_torques(n: int = N, steps: int = T, seed: int = 0) -> np.ndarray:
-    """Actions (n, steps, 2) of -1 or 1 that jump at random; in a third of the episodes they never jump."""
+    """Actions (n, steps, 2) of -1 or 1 that jump at random; in a third of the episodes they never
+    jump.
+    """
     actions = np.random.default_rng(seed).choice([-1.0, 1.0], (n, steps, 2))
     actions[: n // 3] = actions[: n // 3, :1]
     return actions
@@ -54,16 +52,6 @@ def at_rest(
 ) -> np.ndarray:
     """A state (1, 10)."""
     return np.array([[*q, 0.0, 0.0, *fingertip(np.array(q)), *block, *velocity]])
-
-
-@pytest.mark.parametrize("env_id", PYMUNK_IDS)
-def test_gymnasium_finds_no_fault(env_id: str) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings(
-            "ignore", message=".*Box observation space (minimum|maximum) value is.*"
-        )
-        check_env(gymnasium.make(env_id, render_mode="rgb_array").unwrapped)
 
 
 @pytest.mark.parametrize("env_id", [OBSTACLE, PUSH])
@@ -78,32 +66,21 @@ def test_an_untouched_object_does_not_move(env_id: str) -> None:
     assert moved.max() < 1e-9
 
 
-def test_an_obstacle_never_moves() -> None:
-    env, start = arms(OBSTACLE)
-    np.testing.assert_array_equal(
-        env.rollout(full_torques())[..., 6:], np.repeat(start[:, None, 6:], T, axis=1)
-    )
-
-
-def test_an_obstacle_stops_the_arm() -> None:
+def test_an_obstacle_never_moves_and_stops_the_arm() -> None:
     env, _ = arms(OBSTACLE, n=1)
     env.reset(options={"states": at_rest((0.0, 0.0), (0.0, 0.1))})
     states = env.rollout(np.tile([0.1, 0.0], (1, T, 1)))
     assert states[0, :, 0].max() < np.pi / 2
+    np.testing.assert_array_equal(states[0, :, 6:], np.tile([0.0, 0.1, 0.0, 0.0], (T, 1)))
     reacher, _ = arms(REACHER, n=1)
     free = reacher.rollout(np.tile([0.1, 0.0], (1, T, 1)))
     assert free[0, :, 0].max() > np.pi
 
 
-def test_a_pushed_object_moves_ahead_of_the_arm() -> None:
-    env, _ = arms(PUSH, n=1)
-    env.reset(options={"states": at_rest((0.0, 0.0), (0.18, 0.06))})
-    states = env.rollout(np.tile([0.05, 0.0], (1, 40, 1)))
-    assert states[0, -1, 7] > 0.1
-
-
 def test_energy_without_torque_only_falls() -> None:
-    """It goes into the joint dampers, the drag, the elbow's limit and the impacts, and nothing comes back."""
+    """It goes into the joint dampers, the drag, the elbow's limit and the impacts, and nothing
+    comes back.
+    """
     env, states = arms(PUSH)
     rng = np.random.default_rng(0)
     states[:, 2:4] = rng.uniform(-5, 5, (N, 2))
@@ -147,16 +124,6 @@ def test_drag_slows_a_free_object_at_the_given_rate() -> None:
     np.testing.assert_allclose(speed, 0.3 * np.exp(-DT * np.arange(1, 21) / BLOCK_DECAY), rtol=1e-3)
 
 
-def test_the_state_describes_one_arm() -> None:
-    """The fingertip fits the angles, and velocities are the change of positions."""
-    env, start = arms(REACHER)
-    states = np.concatenate([start[:, None], env.rollout(smooth_torques())], axis=1)
-    np.testing.assert_allclose(states[..., 4:6], fingertip(states[..., :2]), atol=1e-12)
-    free = (np.abs(states[..., 1]) < 2.5).all(axis=1)
-    mean_speed = (states[free, 1:, 2:4] + states[free, :-1, 2:4]) / 2
-    np.testing.assert_allclose(np.diff(states[free, :, :2], axis=1) / DT, mean_speed, atol=0.5)
-
-
 @pytest.mark.parametrize("torques", [smooth_torques, full_torques])
 @pytest.mark.parametrize("env_id", [OBSTACLE, PUSH])
 def test_bodies_overlap_at_most_in_the_instant_of_impact(env_id: str, torques) -> None:
@@ -167,14 +134,6 @@ def test_bodies_overlap_at_most_in_the_instant_of_impact(env_id: str, torques) -
     )
     assert np.mean(overlap > 1e-3) < (1e-3 if torques is smooth_torques else 1e-2)
     assert overlap.max() < BLOCK_RADIUS  # never past the middle: nothing passes through anything
-
-
-def test_nothing_escapes_under_full_random_torque() -> None:
-    env, _ = arms(PUSH, n=100)
-    states = env.rollout(full_torques(100, 150, seed=1))
-    assert np.isfinite(states).all()
-    assert np.abs(states[..., 6:8]).max() < WALL - BLOCK_RADIUS / 2
-    assert np.abs(states[..., 1]).max() < ELBOW_LIMIT + 0.2
 
 
 @pytest.mark.parametrize("env_id", PYMUNK_IDS)
@@ -202,42 +161,6 @@ def test_an_episode_goes_on_past_its_time_limit_as_if_there_were_none() -> None:
     env.reset(seed=0)
     parts = [env.rollout(part) for part in np.split(actions, [100, 101, 120], axis=1)]
     np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
-
-
-def test_an_episode_replayed_from_its_first_state_repeats_bit_for_bit() -> None:
-    env, start = arms(PUSH)
-    actions = smooth_torques(rms=0.2)
-    first = env.rollout(actions)
-    env.reset(seed=99, options={"states": start})
-    np.testing.assert_array_equal(env.rollout(actions), first)
-
-
-def test_restoring_an_episode_in_the_middle_is_refused() -> None:
-    env, _ = arms(PUSH, n=1)
-    env.rollout(smooth_torques(1, 5))
-    for attempt in (env.get_state, lambda: env.set_state(None)):
-        with pytest.raises(RuntimeError, match="pymunk cannot restore.*Replay instead"):
-            attempt()
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_no_number_is_refused_before_anything_moves(bad: float) -> None:
-    env, _ = arms(PUSH, n=3)
-    actions = smooth_torques(3, 10)
-    whole = env.rollout(actions)
-    env.reset(seed=0)
-    broken = actions.copy()
-    broken[1, 4, 0] = bad
-    with pytest.raises(ValueError, match="episode 1, step 4"):
-        env.rollout(broken)
-    np.testing.assert_array_equal(env.rollout(actions), whole)
-
-
-def test_a_huge_action_counts_as_the_largest() -> None:
-    env, _ = arms(PUSH, n=3)
-    huge = env.rollout(np.full((3, 20, 2), 1e308))
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.rollout(np.ones((3, 20, 2))), huge)
 
 
 @pytest.mark.parametrize(

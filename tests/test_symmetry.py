@@ -3,9 +3,18 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
+from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs.symmetry import COPIES, mirrored, symmetric, turned
-from reproduction.data import random_data
+from tsmlib.trajectory import Trajectories
+
+
+def random_data(env_id: str, n: int, seed: int, horizon: int) -> Trajectories:
+    torques = smooth_torques(n, horizon, generator=torch.Generator().manual_seed(seed))
+    env = gymnasium.make_vec(env_id, num_envs=n)
+    return collect(env, open_loop(torques), horizon=horizon, seed=seed)
+
 
 PUSH = ("tsm/ReacherPush-v1", "tsm/PymunkPush-v1")
 

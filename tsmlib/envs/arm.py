@@ -102,17 +102,11 @@ class ArmVectorEnv(VectorEnv, ABC):
         adds those before.
         """
 
-    @abstractmethod
-    def get_state(self) -> np.ndarray:
-        """Everything the simulator's future depends on; `set_state` brings it back bit for bit."""
-
-    @abstractmethod
-    def set_state(self, snapshot: np.ndarray) -> None:
-        """Continue from what `get_state` returned."""
-
-    @abstractmethod
     def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
         """One state (dx,) and target (2,) drawn, as uint8 (height, width, 3)."""
+        from tsmlib.envs.render import render_array  # and with it matplotlib
+
+        return render_array(state, self.env_id, target)
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None

@@ -13,24 +13,21 @@ against the obstacle.
 import hashlib
 import operator
 import os
-import sys
-import warnings
 from functools import cache
 from pathlib import Path
 from typing import Unpack
 
-if (
-    sys.platform == "linux"
-):  # EGL draws without a screen; elsewhere MuJoCo refuses to be imported with it
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
+from tsmlib.envs.unstable import SimulationUnstable, import_mujoco, without_log
 
-import gymnasium.envs.mujoco
-import mujoco
-import mujoco.rollout
-import numpy as np
+import_mujoco()
 
-from tsmlib.envs.arm import ArmVectorEnv
-from tsmlib.envs.geometry import (
+import gymnasium.envs.mujoco  # noqa: E402
+import mujoco  # noqa: E402
+import mujoco.rollout  # noqa: E402
+import numpy as np  # noqa: E402
+
+from tsmlib.envs.arm import ArmVectorEnv  # noqa: E402
+from tsmlib.envs.geometry import (  # noqa: E402
     BLOCK_DECAY,
     BLOCK_MASS,
     DT,
@@ -40,34 +37,22 @@ from tsmlib.envs.geometry import (
     capsule_length,
     fingertip,
 )
-from tsmlib.envs.physics import Changes, Physics
-from tsmlib.envs.render import render_array
-from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.unstable import SimulationUnstable, without_log
+from tsmlib.envs.physics import Changes, Physics  # noqa: E402
+from tsmlib.envs.spec import EnvSpec  # noqa: E402
 
 ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move
-TIMESTEP = 0.00125  # s, of the variants (the basic arm keeps 0.01 s): a fingertip at 30 m/s cannot step past the block
-CONTACT_TIME = (
-    2 * TIMESTEP
-)  # s; the stiffest contact that is stable at this time step, and critically damped
-WALL_TIME = (
-    6 * TIMESTEP
-)  # s, of the wall's spring: returns 0.38 to 0.53 of the speed, depending on when the step falls
-RIGID = (
-    0.999,
-    0.9999,
-    0.001,
-    0.5,
-    2,
-)  # solimp: what remains of a squeeze at full torque is below 0.1 mm
+# Seconds, of the variants (the basic arm keeps 0.01 s): a fingertip at 30 m/s cannot step past the
+# block.
+TIMESTEP = 0.00125
+# Seconds; the stiffest contact that is stable at this time step, and critically damped.
+CONTACT_TIME = 2 * TIMESTEP
+# Seconds, of the wall's spring: it returns 0.38 to 0.53 of the speed, depending on when the step
+# falls.
+WALL_TIME = 6 * TIMESTEP
+RIGID = (0.999, 0.9999, 0.001, 0.5, 2)  # solimp: at full torque a squeeze stays below 0.1 mm
 MAX_SPEED = 1e3  # rad/s or m/s; full torque held for a whole episode reaches 180 rad/s
-IMAGE_SIZE = 480  # pixels
-CHUNK = (
-    256  # episodes handed to MuJoCo together: 256 episodes of 100 steps of 16 substeps are 30 MB
-)
-
-_gl_works = True  # until the first failure to get a context
+CHUNK = 256  # episodes handed to MuJoCo together: of 100 steps of 16 substeps they are 30 MB
 
 
 @cache
@@ -242,7 +227,6 @@ class MujocoArm(ArmVectorEnv):
             (num_envs, mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         )
         self._obstacle = np.zeros((num_envs, 2))
-        self._renderer: mujoco.Renderer | None = None
 
     def _start(self, states: np.ndarray) -> None:
         nq, nv = self.model.nq, self.model.nv
@@ -363,74 +347,5 @@ class MujocoArm(ArmVectorEnv):
             reason = next(reason for reason, where in reasons if where[episode, step])
             raise SimulationUnstable(self.env_id, first + int(episode), int(step), reason)
 
-    def get_state(self) -> np.ndarray:
-        return np.concatenate([self._physics, self._obstacle, self.target], axis=1)
-
-    def set_state(self, snapshot: np.ndarray) -> None:
-        """Continue from `get_state`, of this or another environment of the same id and N; bit for
-        bit.
-
-        Targets and the limit of time are those of the snapshot too.
-        """
-        snapshot = np.asarray(snapshot, np.float64)
-        expected = (self.num_envs, self._physics.shape[1] + 4)
-        if snapshot.shape != expected:
-            raise ValueError(
-                f"the snapshot for {self.env_id} is {snapshot.shape}; expected {expected}"
-            )
-        self._physics, self._obstacle, self.target = (
-            part.copy() for part in np.split(snapshot, [-4, -2], axis=1)
-        )
-        self._check(self._physics[:, None], self._physics[:, 0] - DT, 0)
-        self._states = self._to_states(self._physics[:, None], self._obstacle)[:, 0]
-        self._elapsed = round(self._physics[:, 0].max() / DT)
-
-    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Seen from above by MuJoCo's renderer, or drawn by matplotlib where there is no OpenGL."""
-        global _gl_works
-        if _gl_works:
-            try:
-                return self._photograph(state, target)
-            except Exception as error:  # without GL the failure depends on the driver: FatalError, AttributeError, ...
-                _gl_works = False
-                warnings.warn(
-                    f"MuJoCo cannot render here ({error}); drawing with matplotlib instead",
-                    stacklevel=2,
-                )
-        return render_array(state, self.env_id, target)
-
-    def _photograph(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.model, IMAGE_SIZE, IMAGE_SIZE)
-        data = self._data[0]
-        mujoco.mj_resetData(self.model, data)
-        data.qpos[:2] = state[:2]
-        if self.task == "reach":
-            data.qpos[2:] = target
-        elif self.task == "push":
-            data.qpos[2:] = state[6:8]
-        else:
-            data.mocap_pos[0, :2] = state[6:8]
-        mujoco.mj_kinematics(self.model, data)
-        camera = mujoco.MjvCamera()
-        camera.lookat[:] = 0.0, 0.0, PLANE
-        camera.distance, camera.azimuth, camera.elevation = 0.85, 90.0, -90.0
-        self._renderer.update_scene(data, camera)
-        if self.task != "reach":  # the variants have no target body
-            scene = self._renderer.scene
-            mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom],
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.full(3, 0.009),
-                np.array([*target, 3 * PLANE]),
-                np.eye(3).ravel(),
-                np.array([0.9, 0.2, 0.2, 1.0], np.float32),
-            )
-            scene.ngeom += 1
-        return self._renderer.render()
-
     def close_extras(self, **kwargs: object) -> None:
         self._pool.close()
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None

@@ -74,17 +74,6 @@ class Physics:
         """
         return "".join(f"-{_WORDS[name]}{_spelled(value)}" for name, value in self.changed.items())
 
-    @property
-    def label(self) -> str:
-        """The changed values as a figure names them: ``"mass × 2, upper link × 1.2"``; '' for the
-        standard arm.
-        """
-        found = list[str]()
-        for name, value in self.changed.items():
-            both = zip(_LABELS[name], _several(value), _several(STANDARD[name]), strict=True)
-            found += [f"{label} × {new / usual:.3g}" for label, new, usual in both if new != usual]
-        return ", ".join(found)
-
 
 SHORTEST, LONGEST = (
     0.06,
@@ -104,13 +93,6 @@ _WORDS = {
     "object_radius": "radius",
     "torque_gain": "gain",
 }
-_LABELS = {
-    "mass": ("mass",),
-    "damping": ("damping",),
-    "link_lengths": ("upper link", "lower link"),
-    "object_radius": ("object",),
-    "torque_gain": ("torque",),
-}
 PATTERN = "".join(
     rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values()
 )  # of ``Physics.word``, a group for each
@@ -124,10 +106,6 @@ def parse(groups: Iterable[str | None]) -> Changes:
         Changes,
         {name: value if name == "link_lengths" else value[0] for name, value in values.items()},
     )
-
-
-def _several(value: object) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (cast(float, value),)
 
 
 def _spelled(value: object) -> str:

@@ -33,7 +33,6 @@ from tsmlib.envs.geometry import (
     capsule_length,
 )
 from tsmlib.envs.physics import Physics
-from tsmlib.envs.render import render_array
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.unstable import SimulationUnstable
 
@@ -132,25 +131,6 @@ class PymunkArm(ArmVectorEnv):
         ).tolist():
             episode.step(shoulder, elbow)
         return episode
-
-    def get_state(self) -> np.ndarray:
-        """Always RuntimeError: Chipmunk's cached contact impulses cannot be read, so no snapshot
-        would be complete.
-        """
-        raise RuntimeError(
-            f"{self.env_id}: pymunk cannot restore an episode in the middle, because the cached "
-            "contact impulses are "
-            "not accessible. Replay instead: reset(options={'states': <its first states>}) and "
-            "rollout the same "
-            "actions, which gives the same numbers bit for bit."
-        )
-
-    def set_state(self, snapshot: np.ndarray) -> None:
-        """Always RuntimeError, see `get_state`."""
-        self.get_state()
-
-    def image(self, state: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return render_array(state, self.env_id, target)
 
 
 class _Episode:

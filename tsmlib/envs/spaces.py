@@ -308,7 +308,7 @@ def idle_action(space: Box) -> np.ndarray:
     low, high = (side.astype(np.float64).reshape(-1) for side in (space.low, space.high))
     half = (high - low) / 2
     idle = np.divide(-(low + high) / 2, half, out=np.zeros_like(half), where=half > 0)
-    return np.clip(idle, -1, 1).astype(np.float32)
+    return (np.clip(idle, -1, 1) + 0.0).astype(np.float32)  # and not -0
 
 
 # What an environment says of itself

@@ -31,10 +31,6 @@ _NOTHING_TO_CHANGE: dict[TaskName, dict[str, str]] = {
     "obstacle": {"mass": "its obstacle does not move"},
     "push": {},
 }
-_CHANGED = {
-    "push": "the physics of pushing changed (a free object slows down by e in 0.05 s, before in 0.2 s; walls at 0.24 m "
-    "from the shoulder, before at 0.28 m; first poses in every direction; T = 100 steps, before 50)"
-}
 
 
 @dataclass(frozen=True)
@@ -54,13 +50,12 @@ class EnvSpec:
     def parse(env_id: str) -> EnvSpec:
         """The environment of an id, which Gymnasium knows from then on.
 
-        ValueError for another id; of one that is gone, why, and what took its place.
+        ValueError for another id.
         """
         arm, changed, noise, delay, version = _parts(env_id)
         if f"{arm}-v{version}" not in _PLAIN:
             raise ValueError(
-                gone(env_id)
-                or f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them, "
+                f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them, "
                 "nor a variant()"
             )
         spec = replace(
@@ -155,20 +150,6 @@ _PLAIN = {
 }
 ENV_IDS = tuple(_PLAIN)
 MUJOCO_IDS, PYMUNK_IDS = ENV_IDS[:3], ENV_IDS[3:]
-
-
-def gone(env_id: str) -> str:
-    """Why an id of an older version is refused, and which took its place; '' for any other text."""
-    arm, changed, noise, delay, version = _parts(env_id)
-    for spec in _PLAIN.values():
-        if arm == f"tsm/{spec.name}" and int(version) < _VERSION[spec.task]:
-            present = replace(
-                spec.varied(**physics.parse(changed)),
-                noise=float(noise or 0.0),
-                delay=int(delay or 0),
-            ).id
-            return f"{env_id} is gone: {_CHANGED[spec.task]}. {present} took its place"
-    return ""
 
 
 def _parts(env_id: str) -> tuple[str, tuple[str | None, ...], str | None, str | None, str]:

@@ -34,7 +34,7 @@ from tsmlib.envs.spaces import (
     layers,
     within_bounds,
 )
-from tsmlib.envs.unstable import SimulationUnstable, without_log
+from tsmlib.envs.unstable import SimulationUnstable, import_mujoco, without_log
 
 TRIED = 10  # steps of a copy, before the first episode
 Seeds = int | Sequence[int] | None  # of the first episode, those after it following; or of each
@@ -141,6 +141,8 @@ def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
     """
     spec = find_spec(env_id)
     quiet = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+    if quiet:
+        import_mujoco()
     shown = {} if render_mode is None else {"render_mode": render_mode}
     with without_log() if quiet else nullcontext():
         return gymnasium.make(spec, disable_env_checker=True, **shown)

@@ -1,5 +1,7 @@
-"""What goes wrong in a simulator: the error that says so, and MuJoCo's own warnings."""
+"""What goes wrong in a simulator: the error that says so, MuJoCo's warnings, a missing screen."""
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -38,3 +40,17 @@ def without_log() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(handler)
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo so that it draws without a screen, or, where it cannot, simulates all the same.
+
+    It refuses to be imported where the library that draws, which MUJOCO_GL names, is missing.
+    """
+    if sys.platform == "linux":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import mujoco  # noqa: F401
+    except (ImportError, AttributeError, OSError, RuntimeError):
+        os.environ["MUJOCO_GL"] = "disabled"
+        import mujoco  # noqa: F401
