@@ -16,7 +16,9 @@ import tsmlib
 from tsmlib.pretrained import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-MODULES = sorted(path for name in ("tsmlib", "reproduction") for path in (ROOT / name).rglob("*.py"))
+MODULES = sorted(
+    path for name in ("tsmlib", "reproduction") for path in (ROOT / name).rglob("*.py")
+)
 BY_HAND = ("cluster", "mbrl", "lerobot")  # extras in no lock
 
 

@@ -1,4 +1,4 @@
-"""Runs, targets, tables and notebooks: a thing is made once, whole, and named where it is missing."""
+"""Runs, targets, tables and notebooks: a thing is made once, whole, and named where missing."""
 
 from __future__ import annotations
 

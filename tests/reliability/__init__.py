@@ -1,4 +1,6 @@
-"""Reliability checks: faults injected many times. The tests run each briefly, ``make reliability`` at full length.
+"""Reliability checks: faults injected many times. The tests run each briefly, ``make reliability``
+at full length.
 
-A check is a function of the number of trials that gives an `Outcome`; R numbers are those of docs/reliability.md.
+A check is a function of the number of trials that gives an `Outcome`; R numbers are those of
+docs/reliability.md.
 """

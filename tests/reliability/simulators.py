@@ -32,7 +32,9 @@ def torques(n: int, steps: int, seed: int = 0, size: float = 0.4) -> np.ndarray:
 
 
 def faults_in_mujoco(trials: int) -> Outcome:
-    """R17: NaN and huge positions, speeds, torques, and overlaps, at a random step: each raises there, by name."""
+    """R17: NaN and huge positions, speeds, torques, and overlaps, at a random step: each raises
+    there, by name.
+    """
     found = Outcome()
     for trial in range(trials):
         draw, env_id = rng(17, trial), MUJOCO_IDS[trial % 3]
@@ -73,7 +75,9 @@ def faults_in_mujoco(trials: int) -> Outcome:
 
 
 def faults_in_pymunk(trials: int) -> Outcome:
-    """R18: NaN, infinite and huge angles, speeds, forces and velocities: each raises at the same step."""
+    """R18: NaN, infinite and huge angles, speeds, forces and velocities: each raises at the same
+    step.
+    """
     found = Outcome()
     for trial in range(trials):
         draw, env_id = rng(18, trial), PYMUNK_IDS[trial % 3]
@@ -106,7 +110,9 @@ def faults_in_pymunk(trials: int) -> Outcome:
 
 
 def restores(trials: int) -> Outcome:
-    """R19: at random steps, contacts among them: MuJoCo from its snapshot, pymunk by replay; the same bits after."""
+    """R19: at random steps, contacts among them: MuJoCo from its snapshot, pymunk by replay; the
+    same bits after.
+    """
     found, n, steps = Outcome(), 8, 60
     contacts = 0
     for env_id in (PUSH, PYMUNK_PUSH):
@@ -152,7 +158,8 @@ def large_sets(trials: int) -> Outcome:
         states = random_data(env_id, n, seed=17).states.astype(float)
         change, speed = np.abs(np.diff(states[..., :2], axis=1)), np.abs(states[..., 2:4])
         fastest = np.maximum(speed[:, 1:], speed[:, :-1])
-        # Within a step a joint may bounce off its stop or the block: then speeds before and after say less
+        # Within a step a joint may bounce off its stop or the block: then speeds before and after
+        # say less
         found.count(
             (change <= 1.5 * fastest.max() * DT).all(), f"{env_id}: a jump of {change.max()} rad"
         )

@@ -29,7 +29,7 @@ from tsmlib.models.tsm import TSM
 from tsmlib.policies.learning import LearningOptions, episodes_from, learn_policy
 from tsmlib.policies.networks import OneStepPolicy
 from tsmlib.rewards import Reward
-from tsmlib.storage import artifacts, files, manifest, tables
+from tsmlib.storage import artifacts, files
 from tsmlib.training.checkpoint import load_generation
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Trajectories
@@ -42,7 +42,9 @@ SIZES: dict[str, Any] = dict(
 
 @dataclass
 class Outcome:
-    """How many trials went as they should, of how many; ``wrong`` describes the others, ``note`` what was measured."""
+    """How many trials went as they should, of how many; ``wrong`` describes the others, ``note``
+    what was measured.
+    """
 
     right: int = 0
     of: int = 0
@@ -118,15 +120,17 @@ def new_model(make: Callable[[], Any] = small) -> Any:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = make()
-    model.features.fit(torch.from_numpy(TRAIN.states))
+    model.features.fit(TRAIN)
     return model
 
 
 def train(checkpoint: Path | None, loss: Any = None, **settings: Any) -> str:
-    """Train to the end and give a digest of weights, curve and, with a checkpoint, everything in it."""
+    """Train to the end and give a digest of weights, curve and, with a checkpoint, everything in
+    it.
+    """
     model = new_model()
     options = TrainingOptions(**{**SIZES, **settings})
-    curve = fit(model, loss or model.loss, TRAIN, HELD_OUT, options, checkpoint=checkpoint)
+    curve = fit(model, TRAIN, HELD_OUT, options, loss, checkpoint=checkpoint, progress=False)
     return outcome_digest(model, curve, checkpoint)
 
 
@@ -144,7 +148,9 @@ def learn(checkpoint: Path | None) -> str:
 
 
 def outcome_digest(model: torch.nn.Module, curve: Any, checkpoint: Path | None) -> str:
-    """SHA-256 over the weights, the curve without its times, and weights and Adam's moments of the last generation."""
+    """SHA-256 over the weights, the curve without its times, and weights and Adam's moments of the
+    last generation.
+    """
     noted = {name: value for name, value in asdict(curve).items() if name != "seconds"}
     parts = [artifacts.digest(model.state_dict()), json.dumps(noted)]
     if checkpoint is not None:
@@ -163,7 +169,7 @@ def reference(work: Callable[[Path], str] = train) -> tuple[str, float]:
         return value, time.perf_counter() - began
 
 
-# Children ------------------------------------------------------------------------------------------------------------
+# Children -----------------------------------------------------------------------------------------
 
 
 class Child:
@@ -224,7 +230,7 @@ def in_child(work: Callable[[], Any]) -> Any:
     return value
 
 
-# Artefacts -----------------------------------------------------------------------------------------------------------
+# Artefacts ----------------------------------------------------------------------------------------
 
 
 def forged(
@@ -243,9 +249,6 @@ def forged(
 
 def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
     """One file of each kind, and what loads it."""
-    from reproduction.notebooks import _note, require
-    from reproduction.runs import Run
-
     data, model = place / "data.safetensors", place / "model.safetensors"
     artifacts.save_trajectories(data, TRAIN.take(slice(3)), {"seed": 1})
     artifacts.save_model(model, new_model(), {"fingerprint": {"env": "tsm/Made-v0"}})
@@ -255,22 +258,11 @@ def artefacts(place: Path) -> dict[str, tuple[Path, Callable[[], Any]]]:
     task = place / "task.safetensors"
     arrays = {"start": torch.zeros(3, 6), "target": torch.ones(3, 2)}
     artifacts.save(task, arrays, kind="task", header={"task": "reach"})
-    table = place / "shipped" / "table.csv"
-    tables.save(table, [{"metric": "success", "value": 0.5, "n": i} for i in range(20)])
-    manifest.write_manifest(table.parent)
-    run = Run("05_control", "smoke", 0, place / "run")
-    result = run.metrics / "05_control.csv"
-    tables.save(result, [{"metric": "success", "value": 0.25, "n": i} for i in range(20)])
-    _note(run, {"state": "complete", "pid": 1, "files": manifest.listing(run.dir, [result])})
     return {
         "dataset": (data, lambda: artifacts.load_trajectories(data)),
         "model": (model, lambda: artifacts.load_model(model, TSM)),
         "checkpoint": (generation, lambda: load_generation(checkpoint)),
         "task": (task, lambda: artifacts.load(task, kind="task")),
-        "shipped table": (table, lambda: tables.records(tables.load(table))),
-        "manifest": (table.parent / files.MANIFEST, lambda: tables.records(tables.load(table))),
-        "table of a run": (result, lambda: tables.records(tables.load(result))),
-        "status": (run.dir / f"05_control.{files.STATUS}", lambda: require(run, "05_control")),
     }
 
 
