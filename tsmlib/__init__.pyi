@@ -6,7 +6,8 @@ from .evaluation.prediction import score as score
 from .exploration import Exploration as Exploration
 from .exploration import ExplorationOptions as ExplorationOptions
 from .exploration import explore as explore
-from .film import film as film
+from .films import episode_film as episode_film
+from .films import film as film
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout

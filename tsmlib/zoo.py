@@ -201,10 +201,10 @@ _H20 = _choice(  # receptive field 2 H
 )
 _LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
 _MODELS = (
-    ModelSpec("tsm", Look("TSM", "#0072B2", "o"), _TSM, _PAPER, _wide, planned=True),
+    ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
     ModelSpec(
         "rtsm",
-        Look("recurrent TSM", "#003C8F", "*"),
+        Look("recurrent TSM", "#0B2F8A", "*"),
         "tsmlib.models.recurrent:RecurrentTSM",
         _recurrent(0.01),
         planned=True,
@@ -275,7 +275,7 @@ LOOKS = {  # of what is run and drawn beside the models; greys for what is no me
     "ppo": Look("PPO", "#999933"),
     "trpo": Look("TRPO", "#7B4B2A"),
     "sac": Look("SAC", "#D81B60"),
-    "oracle": Look("oracle", "#111111"),
+    "oracle": Look("simulator, same search", "#111111"),
     "random": Look("random torques", "#7A7A7A"),
     "zero": Look("zero torque", "#B0B0B0"),
     "data": Look("data", "#4A4A4A"),

@@ -49,7 +49,8 @@ def codes(
         lines = numbers(f"panel {title!r}", given, f"{len(at)} T", f"{len(at)} T 2")
         for line, hue in zip(lines, hues, strict=True):
             if lines.ndim == 2:
-                ax.step(dt * np.arange(len(line)), line, where="post", color=hue, lw=1.2)
+                held = np.append(line, line[-1])
+                ax.step(dt * np.arange(len(held)), held, where="post", color=hue, lw=1.2)
             else:
                 ax.plot(*line.T, color=hue, lw=1.2)
                 ax.plot(*line[-1], "o", color=hue, ms=3, mew=0)

@@ -173,7 +173,7 @@ def _lines(
         mean, half = np.array([interval(column[~np.isnan(column)]) for column in values.T]).T
         ax.fill_between(at, mean - half, mean + half, color=look.colour, alpha=0.15, lw=0)
         values = mean
-    marker = look.marker if len(at) <= 12 and not held else ""
+    marker = look.marker if len(at) <= 12 and not (held or truth) else ""
     ax.plot(
         at,
         values,

@@ -72,6 +72,7 @@ def paths(
         if goal is not None:
             ax.plot(*numbers("target", goal, "2"), "+", color=RED, ms=9, mew=1.6, zorder=7)
         scene(ax)
+        ax.set_aspect("equal", adjustable="datalim")  # all pictures are squares
     handles = [
         entry(look.name, look.colour, dashes) for look, dashes in known.values() if look.name
     ]

@@ -29,7 +29,7 @@ WIDTH = 7.0  # inches, the text width of a two-column page
 DARK, NOTE, PALE, GRID = "#222222", "#555555", "#B0B0B0", "#E6E6E6"
 BLUE, ORANGE, RED = "#0072B2", "#E69F00", "#D55E00"  # Okabe and Ito's, where no model is drawn
 TRUTH = ("simulator", "executed")  # words that are drawn in black, above everything else
-LABELS = ("#4A4A4A", "#9467BD", "#17807E", "#A05A2C", "#8C8C8C", "#C05C8E")  # of other words
+LABELS = ("#8E5FBF", "#17807E", "#A05A2C", "#8C8C8C", "#C05C8E")  # of other words
 DASHES: tuple[Dashes, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
 
 
@@ -121,16 +121,18 @@ def numbers(name: str, value: ArrayLike, *shapes: str) -> np.ndarray:
 
 
 def grid(
-    panels: Panels, columns: int, height: float, *, share: str = "", width: float = WIDTH
+    panels: Panels, columns: int, height: float, *, share: str = "", width: float | None = None
 ) -> tuple[Figure, list[Axes]]:
     """A figure with one titled panel for each of ``panels``, ``height`` inches each.
 
-    share: axes that all panels have in common, "x", "y" or "xy".
+    share: axes that all panels have in common, "x", "y" or "xy". width: inches; a single panel is
+    narrower than the page without.
     """
     if not panels or not all(len(series) for series in panels.values()):
         raise ValueError("there is nothing to draw: panels, or one of them, is empty")
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
+    width = width or (WIDTH if columns > 1 else 0.7 * WIDTH)
     figure, axes = plt.subplots(
         rows,
         columns,
