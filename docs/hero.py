@@ -27,7 +27,7 @@ from tsmlib.envs.render import draw_scene
 from tsmlib.planning.tasks import Task
 from tsmlib.storage.files import write_bytes
 
-ENV, TARGET = "tsm/ReacherPush-v1", 0
+ENV, TARGET = "tsm/ReacherPush-v1", 6
 FUTURES = 32
 BLOCK, RADIUS = slice(6, 8), 0.03
 SEGMENTS, ONE_STEP = (zoo.look(word).colour for word in ("rtsm", "onestep"))
@@ -36,7 +36,7 @@ FIGURES = Path(__file__).resolve().parents[1] / "figures"
 
 @dataclass(frozen=True)
 class Push:
-    """A plan: predicted futures (S, T, dx), the first of them the mode, and the execution (T, dx)."""
+    """A plan: predicted futures (S, T, dx), the mode first, and the execution (T, dx)."""
 
     futures: np.ndarray
     executed: np.ndarray
@@ -48,7 +48,8 @@ def planned(task: Task, word: str, *, seed: int = 0) -> Push:
     past = task.past(model.past_len)
     space = tsmlib.LatentActions(tsmlib.load_pretrained("prior", env=task.env), task.horizon)
     judge = tsmlib.expected_predictor if model.stochastic else tsmlib.model_predictor
-    plan = tsmlib.cem(judge(model, past), task.reward, space, 1, candidates=128, seed=seed)
+    search = dict(candidates=192, iterations=12, screened=0.25, seed=seed)
+    plan = tsmlib.cem(judge(model, past), task.reward, space, 1, **search)
     with torch.no_grad():
         mode = tsmlib.model_predictor(model, past)(plan.actions[None])[:, 0, 0]
         futures = mode

@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from tsmlib import zoo
-from tsmlib.zoo import Look
 from tsmlib.storage.files import write_bytes
+from tsmlib.zoo import Look
 
 P = ParamSpec("P")
 Dashes = str | tuple[int, tuple[float, ...]]  # matplotlib's
