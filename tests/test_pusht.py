@@ -26,6 +26,7 @@ from tsmlib.models.egocentric import Egocentric
 from tsmlib.planning.pusht import (
     coverage,
     pusht_task,
+    random_play,
     solved_b,
     solved_c,
     success_a,
@@ -106,11 +107,12 @@ def test_starts_lie_within_the_walls_and_apart():
 
 
 def test_the_physics_commute_with_quarter_turns_and_mirrors(data):
-    states, actions = symmetric_copies(data.states.astype(float), data.actions.astype(float))
-    apart = np.abs(begun(states[:, 0]).rollout(actions) - states[:, 1:]).max((1, 2))
-    first = np.abs(begun(data.states[:, 0]).rollout(data.actions) - data.states[:, 1:]).max((1, 2))
-    assert np.median(apart) < 0.01
-    assert (apart[: len(first)] == first).all()
+    copies = symmetric_copies(data.states.astype(float), data.actions.astype(float))
+    assert len(copies) == 8
+    assert (copies[0][0] == data.states).all()
+    for states, actions in copies:
+        apart = np.abs(begun(states[:, 0]).rollout(actions) - states[:, 1:]).max((1, 2))
+        assert np.median(apart) < 0.01
 
 
 def test_a_larger_t_is_another_environment_that_its_id_remembers():
@@ -255,6 +257,15 @@ def test_plans_of_a_lookahead_follow_each_other_to_the_end_of_the_episode():
         tsmlib.mpc(task, None, space, planner, every=3, lookahead=2)
 
 
+def test_random_play_ends_where_the_t_leaves_the_picture():
+    seen = random_play(20, horizon=60, seed=3)
+    assert len(seen) % 8 == 0
+    assert min(seen.lengths) >= 30
+    corners = placed(pusht_physics(seen.env).boxes.reshape(-1, 2), seen.flat_states)
+    assert corners.min() >= -0.01
+    assert corners.max() <= 512.01
+
+
 def test_bad_pairs_are_named():
     start, goal, _ = pairs(1)
     with pytest.raises(ValueError, match="pair 0 is solved at the start by protocol B"):
@@ -272,9 +283,8 @@ def model(data):
 
 def test_what_is_seen_from_the_t_does_not_depend_on_where_it_lies(model, data):
     x, u = torch.from_numpy(data.states[:, 3]), torch.from_numpy(data.actions[:, 3])
-    turned, actions = symmetric_copies(data.states[:, 3:5], data.actions[:, 3:4])
-    x2, u2 = torch.from_numpy(turned[len(x) :, 0]), torch.from_numpy(actions[len(x) :, 0])
-    seen, other = model._seen(x, u), model._seen(x2, u2)[: len(x)]  # a quarter turn later
+    turned = symmetric_copies(data.states[:, 3], data.actions[:, 3])[1]  # by a quarter
+    seen, other = model._seen(x, u), model._seen(*map(torch.from_numpy, turned))
     assert torch.allclose(seen[:, :6], other[:, :6], atol=1e-3)  # all but where the T itself is
 
 

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from tsmlib import plots, rewards
 from tsmlib.envs import drawing
 from tsmlib.envs.geometry import DT
+from tsmlib.envs.pusht_field import pusht_frames, pusht_physics
 from tsmlib.envs.render import render_array
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.planning.execution import Trial
@@ -60,6 +61,8 @@ def episode_film(data: Trajectories, episode: int) -> np.ndarray:
         Frames (T + 1, H, W, 3) uint8.
     """
     states, _ = data.episode(episode)
+    if data.env.startswith("tsm/PushT-"):
+        return pusht_frames(states, None, pusht_physics(data.env))
     if not data.env.startswith("tsm/"):
         return drawing.frames(data.env, states)
     seconds = DT * np.arange(len(states))
@@ -72,6 +75,8 @@ def _drawn(task: Task, states: np.ndarray, target: int) -> np.ndarray:
     """A film of a rollout (T, dx), which begins with the state after the first step."""
     if task.begins_by_seed:  # not an arm
         return drawing.frames(task.env, states)
+    if task.env.startswith("tsm/PushT-"):
+        return pusht_frames(states, task.target[target].numpy(), pusht_physics(task.env))
     mover = task.position
     goal = None if mover is None else task.target[target].numpy()
     frames = []

@@ -164,9 +164,11 @@ def require_in_field(name: str, states: np.ndarray, physics: PushTPhysics | None
         )
 
 
-def symmetric_copies(states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes (N, T + 1, 7), actions (N, T, 2), turned by quarters and mirrored: 8 N of each."""
-    centre, found = (LOW + HIGH) / 2, []
+def symmetric_copies(
+    states: np.ndarray, actions: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """States (..., 7) and actions (..., 2), turned by quarters and mirrored: eight of each."""
+    centre, copies = (LOW + HIGH) / 2, []
     for mirror in (1.0, -1.0):
         for quarters in range(4):
             cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters]
@@ -177,9 +179,8 @@ def symmetric_copies(states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarra
                 x[..., part] = (states[..., part] - centre) @ turn + centre
             x[..., 4] = mirror * states[..., 4] + quarters * np.pi / 2
             x[..., 5:] = states[..., 5:] @ turn
-            found.append((x, actions @ turn))
-    every_state, every_action = zip(*found, strict=True)
-    return np.concatenate(every_state), np.concatenate(every_action)
+            copies.append((x, actions @ turn))
+    return copies
 
 
 def pusht_image(
@@ -198,6 +199,13 @@ def pusht_image(
     draw_pusht(ax, state, goal, physics)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def pusht_frames(
+    states: np.ndarray, goal: np.ndarray | None = None, physics: PushTPhysics | None = None
+) -> np.ndarray:
+    """States (T, 7) drawn over their goal: uint8 (T, H, W, 3)."""
+    return np.stack([pusht_image(state, goal, physics) for state in states])
 
 
 def draw_pusht(

@@ -7,23 +7,31 @@ Protocols are never mixed; ``docs/explanation/pusht.md`` says where each comes f
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import require_choice
+from tsmlib.checks import require_choice, require_count
+from tsmlib.collection import collect
+from tsmlib.envs.pusht import weak_policy
 from tsmlib.envs.pusht_field import (
     ENV_ID,
     SHAPES,
+    SIZE,
     PushTPhysics,
+    placed,
     pusht_physics,
     require_in_field,
     require_states,
+    symmetric_copies,
 )
+from tsmlib.envs.stepping import make_simulation
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward
+from tsmlib.trajectory import Trajectories
 
 COVERED = 0.95  # A: share of the goal's area
 NEAR, TURNED = 20.0, math.pi / 9  # B: px of (pusher, T) as one vector of four, rad
@@ -108,6 +116,42 @@ def closest(
         return -torch.where(last, best[..., None], 0.0) - 0.1 * away / steps
 
     return reward
+
+
+def random_play(
+    episodes: int, *, horizon: int = 100, seed: int = 0, symmetries: bool = True, env: str = ENV_ID
+) -> Trajectories:
+    """Collect episodes of random play (``weak_policy``), as training data.
+
+    An episode ends where the T leaves the picture, squeezed out by pusher and wall; those that are
+    then shorter than 30 steps are left out.
+
+    Args:
+        episodes: simulated.
+        horizon: steps of each.
+        seed: of starts and actions.
+        symmetries: whether to add the quarter turns and mirror images, eight copies in all.
+        env: id of the field.
+
+    Returns:
+        Episodes of up to ``horizon`` steps.
+    """
+    physics, states, actions = pusht_physics(env), [], []
+    with closing(make_simulation(env, require_count("episodes", episodes))) as fields:
+        policy = weak_policy(torch.Generator().manual_seed(seed))
+        played = collect(fields, policy, horizon=horizon, past_len=1, seed=seed)
+    corners = placed(physics.boxes.reshape(-1, 2), played.states)
+    outside = ((corners < 0) | (corners > SIZE)).any((-2, -1))
+    ends = np.where(outside.any(1), outside.argmax(1) - 1, horizon)
+    pairs = [(played.states, played.actions)]
+    if symmetries:
+        pairs = symmetric_copies(played.states, played.actions)
+    for x, u in pairs:
+        kept = [i for i, end in enumerate(ends) if end >= min(30, horizon)]
+        states += [x[i, : ends[i] + 1] for i in kept]
+        actions += [u[i, : ends[i]] for i in kept]
+    robot = played.robot
+    return Trajectories(states, actions, env, robot.dt, robot.names, robot.units, robot.angles)
 
 
 PROTOCOLS = {  # success, steps, whether the pusher has a goal, and steps to hold
