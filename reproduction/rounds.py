@@ -14,7 +14,7 @@ from reproduction.tables import Row, place
 from tsmlib import zoo
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import symmetric
-from tsmlib.exploration import ExplorationOptions
+from tsmlib.exploration.options import ExplorationOptions
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import without_unstable
 from tsmlib.planning.predictors import JUDGING, expected_predictor, fresh_predictor, model_predictor

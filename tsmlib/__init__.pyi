@@ -3,11 +3,11 @@ from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop
 from .collection import smooth_torques as smooth_torques
 from .evaluation.prediction import score as score
-from .exploration import Exploration as Exploration
-from .exploration import ExplorationOptions as ExplorationOptions
-from .exploration import explore as explore
 from .films import episode_film as episode_film
 from .films import film as film
+from .exploration.options import Exploration as Exploration
+from .exploration.options import ExplorationOptions as ExplorationOptions
+from .exploration.explore import explore as explore
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout

@@ -164,3 +164,26 @@ def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
             "a root in it"
         )
     return rewards
+
+
+@torch.no_grad()
+def fingerprint(
+    reward: Reward, start: Tensor, horizon: int, action_dim: int
+) -> tuple[float, float]:
+    """Mean and deviation of a reward on random states and actions: what it is, by values.
+
+    Args:
+        reward: one number per step.
+        start: (B, dx), around which the states wander.
+        horizon: T, steps.
+        action_dim: du.
+
+    Returns:
+        Two numbers, the same on every machine up to rounding.
+    """
+    generator = torch.Generator().manual_seed(0)
+    wander = torch.randn(len(start), horizon, start.shape[1], generator=generator).cumsum(1)
+    scale = 0.1 * (start.std(0, unbiased=False) + start.abs().mean(0))
+    actions = 2 * torch.rand(len(start), horizon, action_dim, generator=generator) - 1
+    rewards = rewarded(reward, start[:, None] + scale * wander, actions).double()
+    return float(rewards.mean()), float(rewards.std(unbiased=False))

@@ -1,7 +1,9 @@
-"""mbrl-lib's models behind the planners of this package, and models of this package behind mbrl-lib's ``ModelEnv``.
+"""mbrl-lib's models behind the planners of this package, and models of this package behind
+mbrl-lib's ``ModelEnv``.
 
-mbrl-lib is not needed to import this module. Its own pins do not install beside today's Gymnasium, so it is installed
-without them: ``pip install 'tsmlib[mbrl]'`` and then ``pip install --no-deps mbrl==0.2.0``.
+mbrl-lib is not needed to import this module. Its own pins do not install beside today's Gymnasium,
+so it is installed without them: ``pip install 'tsmlib[mbrl]'`` and then ``pip install --no-deps
+mbrl==0.2.0``.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from tsmlib.models.base import Model, Step, as_dynamics, stepper
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
+from tsmlib.models.base import Model, Step, as_dynamics, stepper
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
@@ -52,11 +54,12 @@ class TransitionModel(Protocol):
 
 
 class MbrlModel(torch.nn.Module, OneStepEnsemble):
-    """A trained ``mbrl.models.OneDTransitionRewardModel`` with a ``GaussianMLP`` as a model of this package.
+    """A trained ``mbrl.models.OneDTransitionRewardModel`` with a ``GaussianMLP`` as a model of this
+    package.
 
-    Its observations are the states here, in physical units, and its actions those here, in [-1, 1]. Of a learned reward
-    nothing is used: rewards are functions here. Only the elite members predict, where there are some.
-    TypeError naming what another object lacks.
+    Its observations are the states here, in physical units, and its actions those here, in [-1, 1].
+    Of a learned reward nothing is used: rewards are functions here. Only the elite members predict,
+    where there are some. TypeError naming what another object lacks.
     """
 
     def __init__(self, model: TransitionModel) -> None:
@@ -96,7 +99,8 @@ class MbrlModel(torch.nn.Module, OneStepEnsemble):
         inputs = torch.cat([seen, u], dim=-1)
         if theirs.input_normalizer is not None:
             inputs = theirs.input_normalizer.normalize(inputs).to(x.dtype)
-        # Every network takes the rows of its own member; one that is not among the elite computes for nothing.
+        # Every network takes the rows of its own member; one that is not among the elite computes
+        # for nothing.
         every = inputs.new_zeros(theirs.model.num_members, *inputs.shape[1:])
         every[self.elite] = inputs
         mean, log_variance = theirs.model.forward(every, use_propagation=False)
@@ -114,7 +118,9 @@ class MbrlModel(torch.nn.Module, OneStepEnsemble):
 
 
 class ModelState(TypedDict):
-    """A state of a simulation: ``obs`` (B, dx) as mbrl-lib has it, the past, and what steps on from here."""
+    """A state of a simulation: ``obs`` (B, dx) as mbrl-lib has it, the past, and what steps on from
+    here.
+    """
 
     obs: Tensor
     past: Segment
@@ -131,11 +137,12 @@ class _Run:
 
 
 class ForModelEnv:
-    """A model of this package as what ``mbrl.models.ModelEnv`` asks of its dynamics model: ``reset`` and ``sample``.
+    """A model of this package as what ``mbrl.models.ModelEnv`` asks of its dynamics model:
+    ``reset`` and ``sample``.
 
-    A code, or a member, is drawn for each segment of H steps and held, as in ``rollout``. The past of a rollout is its
-    first state, repeated, unless ``saw`` said what really happened before. Rewards are not predicted: give ``ModelEnv``
-    a function (``reward_function``).
+    A code, or a member, is drawn for each segment of H steps and held, as in ``rollout``. The past
+    of a rollout is its first state, repeated, unless ``saw`` said what really happened before.
+    Rewards are not predicted: give ``ModelEnv`` a function (``reward_function``).
     """
 
     def __init__(self, model: Model, action_dim: int) -> None:
@@ -149,11 +156,15 @@ class ForModelEnv:
         self._past: Segment | None = None
 
     def saw(self, past: Segment | None) -> None:
-        """Let rollouts start from ``past`` (1, L, .), what has happened until now; None at the start of an episode."""
+        """Let rollouts start from ``past`` (1, L, .), what has happened until now; None at the
+        start of an episode.
+        """
         self._past = past
 
     def reset(self, obs: np.ndarray | Tensor, rng: torch.Generator | None = None) -> ModelState:
-        """Begin rollouts in ``obs`` (B, dx). ValueError where these are not the states in which the seen past ends."""
+        """Begin rollouts in ``obs`` (B, dx). ValueError where these are not the states in which the
+        seen past ends.
+        """
         x = torch.as_tensor(obs, dtype=torch.float32, device=self.device)
         if self._past is None:
             past = initial_past(x, self._past_len, self.action_dim)
@@ -161,8 +172,9 @@ class ForModelEnv:
             past = Segment(*(part.to(x).expand(len(x), -1, -1) for part in self._past))
             if not torch.allclose(past.states[:, -1], x, atol=1e-4):
                 raise ValueError(
-                    "rollouts are asked for from another state than the one in which the past of saw(past) ends: say "
-                    "saw(...) after every step of the environment, and saw(None) when an episode begins"
+                    "rollouts are asked for from another state than the one in which the past of "
+                    "saw(past) ends: say saw(...) after every step of the environment, and "
+                    "saw(None) when an episode begins"
                 )
         return {"obs": x, "past": past, "steps": 0, "run": _Run()}
 
@@ -173,14 +185,17 @@ class ForModelEnv:
         deterministic: bool = False,
         rng: torch.Generator | None = None,
     ) -> tuple[Tensor, None, None, ModelState]:
-        """Next states (B, dx) under ``act`` (B, du), no rewards, no ends, and the state to go on from.
+        """Next states (B, dx) under ``act`` (B, du), no rewards, no ends, and the state to go on
+        from.
 
-        deterministic: the mode; else samples drawn from ``rng``. ValueError for a state that was stepped on before.
+        deterministic: the mode; else samples drawn from ``rng``. ValueError for a state that was
+        stepped on before.
         """
         run, past = model_state["run"], model_state["past"]
         if model_state["steps"] != run.steps:
             raise ValueError(
-                f"this model state, {model_state['steps']} steps after its reset, was stepped on before, to step "
+                f"this model state, {model_state['steps']} steps after its reset, was stepped on "
+                f"before, to step "
                 f"{run.steps}; go on from the state that sample() gave, or reset() again"
             )
         u = torch.as_tensor(act).to(model_state["obs"])
@@ -198,7 +213,9 @@ class ForModelEnv:
 
 
 def reward_function(reward: Reward) -> Callable[[Tensor, Tensor], Tensor]:
-    """A reward of this package, for one instance of a task, as mbrl-lib has them: (B, du), next (B, dx) -> (B, 1)."""
+    """A reward of this package, for one instance of a task, as mbrl-lib has them: (B, du), next (B,
+    dx) -> (B, 1).
+    """
 
     def of_steps(act: Tensor, next_obs: Tensor) -> Tensor:
         return rewarded(reward, next_obs[:, None, None], act[:, None, None])[:, 0]
@@ -207,7 +224,9 @@ def reward_function(reward: Reward) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def never(act: Tensor, next_obs: Tensor) -> Tensor:
-    """mbrl-lib's termination function of an episode that only a limit of time ends: (B, 1) of False."""
+    """mbrl-lib's termination function of an episode that only a limit of time ends: (B, 1) of
+    False.
+    """
     return torch.zeros(len(next_obs), 1, dtype=torch.bool, device=next_obs.device)
 
 
@@ -219,17 +238,20 @@ def model_env(
     terminated: Callable[[Tensor, Tensor], Tensor] = never,
     generator: torch.Generator | None = None,
 ) -> ModelEnv:
-    """An ``mbrl.models.ModelEnv`` in which a model of this package stands in for ``env``, for mbrl-lib's agents.
+    """An ``mbrl.models.ModelEnv`` in which a model of this package stands in for ``env``, for
+    mbrl-lib's agents.
 
-    reward: of this package, for one instance of a task (``task.take(1).reward``). terminated: mbrl-lib's function of
-    actions (B, du) and next states (B, dx) to (B, 1) bool. Actions lie in [-1, 1], whatever the bounds of ``env``.
-    ``found.dynamics_model.saw(past)`` says what happened before a plan is asked for in the middle of an episode.
+    reward: of this package, for one instance of a task (``task.take(1).reward``). terminated:
+    mbrl-lib's function of actions (B, du) and next states (B, dx) to (B, 1) bool. Actions lie in
+    [-1, 1], whatever the bounds of ``env``. ``found.dynamics_model.saw(past)`` says what happened
+    before a plan is asked for in the middle of an episode.
     """
     try:
         from mbrl.models import ModelEnv
     except ImportError as error:
         raise ImportError(
-            f"mbrl-lib cannot be imported ({error}): pip install 'tsmlib[mbrl]', then pip install --no-deps mbrl==0.2.0"
+            f"mbrl-lib cannot be imported ({error}): pip install "
+            "'tsmlib[mbrl]', then pip install --no-deps mbrl==0.2.0"
         ) from error
     space = cast(Box, env.action_space)
     (action_dim,) = space.shape
@@ -246,7 +268,9 @@ def model_env(
 
 
 def transition_batch(data: Trajectories) -> TransitionBatch:
-    """All transitions of episodes as an ``mbrl.types.TransitionBatch``, with rewards of zero, episode by episode."""
+    """All transitions of episodes as an ``mbrl.types.TransitionBatch``, with rewards of zero,
+    episode by episode.
+    """
     from mbrl.types import TransitionBatch
 
     last = np.cumsum(data.steps) - 1  # row of the last action of each episode

@@ -1,4 +1,5 @@
-"""Action statistics: roughness, spectrum and novelty of torques, and samples of the action prior (section 5.3.5).
+"""Action statistics: roughness, spectrum and novelty of torques, and samples of the action prior
+(section 5.3.5).
 
 Letters in shapes: B plans or episodes, T steps, F frequencies, q traits.
 """
@@ -10,13 +11,14 @@ from torch import Tensor
 from tsmlib.envs.geometry import DT
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.layers import on_device_of
-from tsmlib.trajectory import Window
 
 TRAITS = ("change", "centroid", "autocorrelation")  # of claim C51
 
 
 def traits(actions: Tensor, *, shape: bool = False) -> Tensor:
-    """TRAITS of torques (B, T, du), (B, 3). shape: of each plan divided by its own root mean square."""
+    """TRAITS of torques (B, T, du), (B, 3). shape: of each plan divided by its own root mean
+    square.
+    """
     if shape:
         actions = actions / actions.square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-9)
     found = roughness(actions)
@@ -24,15 +26,18 @@ def traits(actions: Tensor, *, shape: bool = False) -> Tensor:
 
 
 def spectrum(actions: Tensor, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (F,) in Hz and the mean power density (F,) of torques (B, T, du), per Hz; it integrates to the mean
-    square torque (without the constant part, which is left out)."""
+    """Frequencies (F,) in Hz and the mean power density (F,) of torques (B, T, du), per Hz; it
+    integrates to the mean square torque (without the constant part, which is left out).
+    """
     frequency, power = _power(actions, dt)
     density = power.mean(0) * (dt / (actions.shape[1] * actions.shape[2]))
     return frequency.numpy()[1:], density.numpy()[1:]
 
 
 def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Frequencies (F,) in Hz and the power (B, F) of torques (B, T, du): T times what each adds to their squares."""
+    """Frequencies (F,) in Hz and the power (B, F) of torques (B, T, du): T times what each adds to
+    their squares.
+    """
     steps = actions.shape[1]
     power = torch.fft.rfft(actions.double(), dim=1).abs().square().sum(-1)
     power[:, 1 : (steps + 1) // 2] *= (
@@ -43,7 +48,9 @@ def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def sample_actions(prior: ActionPrior, n: int, horizon: int, generator: torch.Generator) -> Tensor:
-    """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0); on the generator's device."""
+    """Torques (n, horizon, du) of codes from N(0, I), from rest (U_0 = 0); on the generator's
+    device.
+    """
     z = torch.randn(
         n,
         -(-horizon // prior.segment_len),
@@ -56,26 +63,13 @@ def sample_actions(prior: ActionPrior, n: int, horizon: int, generator: torch.Ge
 
 @torch.no_grad()
 def reconstruct(prior: ActionPrior, actions: Tensor) -> Tensor:
-    """Torques (B, T, du) encoded segment by segment and decoded from the mean codes, T a multiple of H."""
+    """Torques (B, T, du) encoded segment by segment and decoded from the mean codes, T a multiple
+    of H.
+    """
     home, (actions,) = actions.device, on_device_of(prior, actions)
     segments = actions.unflatten(1, (-1, prior.segment_len))  # (B, K, H, du)
     codes, _ = prior.encode(segments.flatten(0, 1))
     return prior.plan(_rest(prior, len(actions)), codes.unflatten(0, segments.shape[:2])).to(home)
-
-
-@torch.no_grad()
-def rebuilt(prior: ActionPrior, window: Window) -> tuple[float, float]:
-    """Error of segments of torques that are decoded from their own mean codes, and from those of other segments.
-
-    Root mean squares, over the deviation of the training torques. window: its future is one segment of H steps.
-    """
-    past, true = on_device_of(prior, window.past.actions, window.future.actions)
-    z, _ = prior.encode(true)
-    off = (
-        ((prior.decode(past, codes) - true) / prior.std).square().mean().sqrt()
-        for codes in (z, z.roll(7, 0))
-    )
-    return float(next(off)), float(next(off))
 
 
 def _rest(prior: ActionPrior, n: int) -> Tensor:
@@ -85,8 +79,9 @@ def _rest(prior: ActionPrior, n: int) -> Tensor:
 def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
     """Roughness of torques (B, T, du) (claims C12, C51, C52), one number per plan: (B,) each.
 
-    ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power. ``fast``: share of power
-    above 5 Hz. ``autocorrelation``: of successive torques. Without any torque all are zero.
+    ``change``: mean |u_{t+1} - u_t|. ``centroid``: mean frequency in Hz, weighted by power.
+    ``fast``: share of power above 5 Hz. ``autocorrelation``: of successive torques. Without any
+    torque all are zero.
     """
     tiny = 1e-12
     frequency, power = _power(actions, dt)
@@ -100,21 +95,17 @@ def roughness(actions: Tensor, dt: float = DT) -> dict[str, Tensor]:
     }
 
 
-def typical(actions: Tensor) -> int:
-    """Index of the plan of median size among torques (B, T, du): by ``change`` of ``roughness``, of two middle ones the
-    smaller, of equal ones the first."""
-    return int(roughness(actions)["change"].argsort(stable=True)[(len(actions) - 1) // 2])
-
-
 def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
     """Distance (B,) of plans (B, T, du) from the training torques (N, T', du).
 
-    The root mean square difference between each segment of a plan and the nearest of all segments of the data, in
-    standard deviations of the data's torques, averaged over the plan. Held-out torques give the value to compare with.
+    The root mean square difference between each segment of a plan and the nearest of all segments
+    of the data, in standard deviations of the data's torques, averaged over the plan. Held-out
+    torques give the value to compare with.
     """
     if min(actions.shape[1], data.shape[1]) < segment_len:
         raise ValueError(
-            f"plans of {actions.shape[1]} and data of {data.shape[1]} steps hold no segment of {segment_len} steps"
+            f"plans of {actions.shape[1]} and data of {data.shape[1]} steps "
+            f"hold no segment of {segment_len} steps"
         )
     std = data.flatten(0, 1).std(0)
     segments = (actions / std).unfold(1, segment_len, segment_len).flatten(2)  # (B, K, du H)
@@ -126,10 +117,11 @@ def novelty(actions: Tensor, data: Tensor, *, segment_len: int = 10) -> Tensor:
 
 
 def within(actions: Tensor, data: Tensor, *, share: float = 0.95) -> Tensor:
-    """Share of the steps of plans (B, T, du) whose torques are no larger than the training data's: (B,) (claim C16).
+    """Share of the steps of plans (B, T, du) whose torques are no larger than the training data's:
+    (B,) (claim C16).
 
-    No larger means inside the box around zero that holds ``share`` of all steps of the data (N, T', du); its sides are
-    as the standard deviations of the data's torques.
+    No larger means inside the box around zero that holds ``share`` of all steps of the data (N, T',
+    du); its sides are as the standard deviations of the data's torques.
     """
     std = data.flatten(0, 1).std(0)
     size, known = ((torques / std).abs().amax(-1) for torques in (actions, data))

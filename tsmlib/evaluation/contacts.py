@@ -1,4 +1,5 @@
-"""Contacts of arm, object and walls: steps in contact, contact events, recall, and deflections (figure 9).
+"""Contacts of arm, object and walls: steps in contact, contact events, recall, and deflections
+(figure 9).
 
 Letters in shapes: S samples, N windows of test episodes, T steps, E first touches.
 """
@@ -20,7 +21,8 @@ from tsmlib.trajectory import Trajectories
 
 
 def contact_steps(states: np.ndarray, env: str, *, gap: float = 0.002) -> Tensor:
-    """(N, T + 1, dx) -> (N, T) bool: the arm is within ``gap`` metres of the block before or after the step.
+    """(N, T + 1, dx) -> (N, T) bool: the arm is within ``gap`` metres of the block before or after
+    the step.
 
     Within 2 mm lie 99 % of the steps in which the arm speeds the object up.
     """
@@ -34,8 +36,10 @@ def after_first(steps: Tensor) -> Tensor:
 
 
 def first_episodes(test: Trajectories, *, after: int) -> dict[str, Trajectories]:
-    """The first episode in which the arm meets the block, but not in its first ``after`` steps ("contact"), and the
-    first in which it never does ("free"); where there is no block, or no such episode, only the other."""
+    """The first episode in which the arm meets the block, but not in its first ``after`` steps
+    ("contact"), and the first in which it never does ("free"); where there is no block, or no such
+    episode, only the other.
+    """
     touched = np.zeros((len(test), 1), dtype=bool)
     if EnvSpec.parse(test.env).has_block:
         touched = closest_gap(test.states, test.env) < 0.001
@@ -47,7 +51,8 @@ def first_episodes(test: Trajectories, *, after: int) -> dict[str, Trajectories]
 
 
 WITHIN = 2  # steps by which a predicted contact may be early or late
-LEAD = 5  # steps before the first touch at which the windows of figure 9 begin: the arm is about to swing
+# steps before the first touch at which the windows of figure 9 begin: the arm is about to swing
+LEAD = 5
 AHEAD = 5  # steps after the touch at which a deflection is read
 EVENTS = ("object", "wall")  # the arm touches the object, the object touches a wall
 
@@ -56,10 +61,11 @@ EVENTS = ("object", "wall")  # the arm touches the object, the object touches a 
 def windows_before_contact(
     model: Coded, test: Trajectories, *, samples: int, horizon: int = HORIZON, seed: int = 0
 ) -> tuple[SampledFutures, np.ndarray]:
-    """The windows of figure 9, which begin LEAD steps before the first touch of an episode, and whose they are.
+    """The windows of figure 9, which begin LEAD steps before the first touch of an episode, and
+    whose they are.
 
-    Column LEAD - 1 of the future holds the first state that touches. Episodes (N,) without a touch, or without room
-    for past and horizon around it, are left out; ValueError where none is left.
+    Column LEAD - 1 of the future holds the first state that touches. Episodes (N,) without a touch,
+    or without room for past and horizon around it, are left out; ValueError where none is left.
     """
     near = closest_gap(test.states, test.env) < NEAR
     begin = near.argmax(1) - LEAD  # the state that is observed last
@@ -68,7 +74,8 @@ def windows_before_contact(
     )
     if not len(episodes):
         raise ValueError(
-            f"none of the {len(test)} episodes of {test.env} has a first touch between steps {model.past_len + LEAD} "
+            f"none of the {len(test)} episodes of {test.env} has a first touch between "
+            f"steps {model.past_len + LEAD} "
             f"and {test.horizon - horizon + LEAD}; take more episodes or a shorter horizon"
         )
     begins = torch.from_numpy(begin[episodes])
@@ -81,23 +88,12 @@ def windows_before_contact(
     return SampledFutures(test.env, window, torch.stack(drawn)), episodes
 
 
-def into_a_wall(seen: SampledFutures, *, n: int = 4) -> np.ndarray:
-    """Up to ``n`` of those windows in which the object hits a wall, evenly spaced by how far it travels.
-
-    Of all windows where fewer than ``n`` of them do.
-    """
-    (past, future), (truth, _) = seen.window, contacts(seen)["wall"]
-    hits = truth.any(1) if truth.any(1).sum() >= n else torch.ones(len(truth), dtype=torch.bool)
-    far = (future.states[:, -1, BLOCK] - past.states[:, -1, BLOCK]).norm(dim=1)
-    among = np.flatnonzero(hits)[far[hits].argsort()]
-    return among[np.linspace(0, len(among) - 1, min(n, len(among))).astype(int)]
-
-
 def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
     """Where contacts begin: event -> truth (N, T) and samples (S, N, T), bool.
 
-    Arm and object touch where they are within 5 mm. Object and wall touch where they are, or where the speed with which
-    the object entered the step would have brought them: between two states 20 ms apart it can have been there and back.
+    Arm and object touch where they are within 5 mm. Object and wall touch where they are, or where
+    the speed with which the object entered the step would have brought them: between two states 20
+    ms apart it can have been there and back.
     """
     past, truth = seen.window.past.states[:, -2:], seen.window.future.states
     every = torch.cat([truth[None], seen.samples])  # (1 + S, N, T, dx)
@@ -121,11 +117,12 @@ def contacts(seen: SampledFutures) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 def recall(truth: Tensor, samples: Tensor, steps: range) -> dict[str, float]:
-    """Recall and precision of events that begin at ``steps`` ahead: truth (N, T) and samples (S, N, T) bool.
+    """Recall and precision of events that begin at ``steps`` ahead: truth (N, T) and samples (S, N,
+    T) bool.
 
-    ``recall``: share of events that a sample has too, up to WITHIN steps early or late, mean over samples;
-    ``majority``: share that at least half of the samples have; ``precision``: share of the samples' events that are
-    true. ``n`` events. What nothing can be said of is NaN.
+    ``recall``: share of events that a sample has too, up to WITHIN steps early or late, mean over
+    samples; ``majority``: share that at least half of the samples have; ``precision``: share of the
+    samples' events that are true. ``n`` events. What nothing can be said of is NaN.
     """
     at = torch.zeros(truth.shape[1], dtype=torch.bool)
     at[list(steps)] = True
@@ -149,10 +146,12 @@ def _around(begins: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Deflections:
-    """Where an object goes that the arm hits: E first touches after which it moved by more than a centimetre.
+    """Where an object goes that the arm hits: E first touches after which it moved by more than a
+    centimetre.
 
-    off (S, E): angle in radians between the sampled path and the true one, to the left positive, NaN for a sample
-    whose object did not move; travel (E,) and travels (S, E): distance in metres between start and end of the window.
+    off (S, E): angle in radians between the sampled path and the true one, to the left positive,
+    NaN for a sample whose object did not move; travel (E,) and travels (S, E): distance in metres
+    between start and end of the window.
     """
 
     off: Tensor
@@ -175,12 +174,16 @@ class Deflections:
         return float(self.off.isnan().float().mean())
 
     def inside(self, level: float = 0.8) -> Tensor:
-        """(E,) bool: the true direction is in the central interval of the sampled ones that should hold ``level``."""
+        """(E,) bool: the true direction is in the central interval of the sampled ones that should
+        hold ``level``.
+        """
         low, high = self.interval(level)
         return (low <= 0) & (high >= 0)
 
     def interval(self, level: float = 0.8) -> tuple[Tensor, Tensor]:
-        """The central interval (E,) of the sampled directions around their mean, degrees off the true one."""
+        """The central interval (E,) of the sampled directions around their mean, degrees off the
+        true one.
+        """
         if not len(self.travel):
             return self.travel, self.travel
         mean = self._mean.angle()
@@ -199,7 +202,9 @@ class Deflections:
 
 
 def deflections(seen: SampledFutures) -> Deflections:
-    """From windows of ``windows_before_contact``: the way of the object until AHEAD steps after its first touch."""
+    """From windows of ``windows_before_contact``: the way of the object until AHEAD steps after its
+    first touch.
+    """
     start, step = seen.window.past.states[:, -1, BLOCK], LEAD - 1 + AHEAD
     ways = [
         states[..., [step, -1], BLOCK] - start[:, None]
@@ -214,7 +219,9 @@ def deflections(seen: SampledFutures) -> Deflections:
 
 
 def touched(seen: SampledFutures) -> Tensor:
-    """(N, T) bool: the arm touches the obstacle or object before or after the step; never where there is none."""
+    """(N, T) bool: the arm touches the obstacle or object before or after the step; never where
+    there is none.
+    """
     future = seen.window.future.states
     if not EnvSpec.parse(seen.env).has_block:
         return torch.zeros(future.shape[:2], dtype=torch.bool)

@@ -1,4 +1,6 @@
-"""Statistics of collected data: workspace coverage, autocorrelation of velocities, contacts (section 5.1)."""
+"""Statistics of collected data: workspace coverage, autocorrelation of velocities, contacts
+(section 5.1).
+"""
 
 import numpy as np
 
@@ -11,8 +13,8 @@ CONTACT_GAP = 0.001  # m between arm and block
 def cells_visited(points: np.ndarray, *, inner: float, outer: float, cells: int = 20) -> float:
     """Share of the cells of a grid that ``points`` (..., 2) visit (claim C17).
 
-    The grid covers the square around a disc of radius ``outer`` (m) with ``cells`` cells along each side; what counts
-    are those whose centre is in the disc and not in its hole of radius ``inner``.
+    The grid covers the square around a disc of radius ``outer`` (m) with ``cells`` cells along each
+    side; what counts are those whose centre is in the disc and not in its hole of radius ``inner``.
     """
     edges = np.linspace(-outer, outer, cells + 1)
     x, y = np.asarray(points, np.float64).reshape(-1, 2).T
@@ -23,10 +25,13 @@ def cells_visited(points: np.ndarray, *, inner: float, outer: float, cells: int 
 
 
 def autocorrelation(series: np.ndarray, lag: int) -> np.ndarray:
-    """Correlation of ``series`` (N, T, d) with itself ``lag`` steps later, over all episodes and steps: (d,)."""
+    """Correlation of ``series`` (N, T, d) with itself ``lag`` steps later, over all episodes and
+    steps: (d,).
+    """
     if not 1 <= lag < series.shape[1]:
         raise ValueError(
-            f"lag is {lag}, expected 1 to {series.shape[1] - 1}: the episodes have {series.shape[1]} steps"
+            f"lag is {lag}, expected 1 to {series.shape[1] - 1}: the episodes have "
+            f"{series.shape[1]} steps"
         )
     sides = (
         np.asarray(side, np.float64).reshape(-1, series.shape[2])
@@ -36,14 +41,10 @@ def autocorrelation(series: np.ndarray, lag: int) -> np.ndarray:
     return (before * after).mean(0) / np.sqrt(np.square(before).mean(0) * np.square(after).mean(0))
 
 
-def contact_counts(states: np.ndarray, env: str) -> np.ndarray:
-    """Contacts of each episode of ``states`` (N, T + 1, dx): (N,), how often the arm comes within 1 mm of the block."""
-    near = closest_gap(states, env) < CONTACT_GAP
-    return near[:, 0] + (near[:, 1:] & ~near[:, :-1]).sum(1)
-
-
 def shares(states: np.ndarray, env: str) -> dict[str, float]:
-    """Shares of ``states`` (N, T + 1, dx): of steps at the elbow's stop, of episodes with contact and with a push."""
+    """Shares of ``states`` (N, T + 1, dx): of steps at the elbow's stop, of episodes with contact
+    and with a push.
+    """
     spec = EnvSpec.parse(env)
     found = {"limit_share": (np.abs(states[:, 1:, 1]) > ELBOW_LIMIT - 0.02).mean()}
     if spec.has_block:

@@ -1,12 +1,15 @@
 """Errors to the clean state behind noisy sensors, of models and of filters (section 5.3.3).
 
-Errors count in the units in which the noise does, data scaled to [-1, 1] (``envs.geometry.HALF_RANGE``), so that the
-raw observation's error is the noise's sigma. Angles are compared on the circle.
+Errors count in the units in which the noise does, data scaled to [-1, 1]
+(``envs.geometry.HALF_RANGE``), so that the raw observation's error is the noise's sigma. Angles are
+compared on the circle.
 
-Against a model stands an extended Kalman filter that is told more than any model here: clean states to fit its
-dynamics on, the arm's kinematics, and the noise; and an exponential filter. Both are tuned on validation episodes.
+Against a model stands an extended Kalman filter that is told more than any model here: clean states
+to fit its dynamics on, the arm's kinematics, and the noise; and an exponential filter. Both are
+tuned on validation episodes.
 
-Letters in shapes: N episodes, T steps, K steps predicted, dx = 6 state size of the plain arm, du action size.
+Letters in shapes: N episodes, T steps, K steps predicted, dx = 6 state size of the plain arm, du
+action size.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ PARTS = {"angles": slice(0, 2), "velocities": slice(2, 4), "fingertip": slice(4,
 
 
 def errors(predicted: np.ndarray, clean: np.ndarray) -> np.ndarray:
-    """Differences (..., dx) of two states (..., dx) in units of data scaled to [-1, 1], angles on the circle."""
+    """Differences (..., dx) of two states (..., dx) in units of data scaled to [-1, 1], angles on
+    the circle.
+    """
     difference = np.array(predicted, np.float64) - clean
     difference[..., :2] = (difference[..., :2] + np.pi) % (2 * np.pi) - np.pi
     return difference / HALF_RANGE[: difference.shape[-1]]
@@ -46,7 +51,8 @@ def model_errors(
     samples: int = 32,
     progress: str = "",
 ) -> np.ndarray:
-    """Errors (N, K, dx) of a model's mean to the clean states, over K = 10 steps after noisy pasts (``STARTS``).
+    """Errors (N, K, dx) of a model's mean to the clean states, over K = 10 steps after noisy pasts
+    (``STARTS``).
 
     clean: the same episodes without noise. ValueError where their torques differ.
     """
@@ -60,7 +66,9 @@ def model_errors(
 def filter_errors(
     estimate: KalmanFilter, noisy: Trajectories, clean: Trajectories
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the filter at ``STARTS``: of the present state (N, dx), and of the K = 10 predicted ones (N, K, dx)."""
+    """Errors of the filter at ``STARTS``: of the present state (N, dx), and of the K = 10 predicted
+    ones (N, K, dx).
+    """
     _require_same(noisy, clean)
     means = estimate.means(noisy)
     now = np.stack([means[:, start] for start in STARTS], 1).reshape(-1, 4)
@@ -76,7 +84,9 @@ def filter_errors(
 
 
 def exponential_errors(keep: float, noisy: Trajectories, clean: Trajectories) -> np.ndarray:
-    """Errors (N, dx) of m_t = keep m_{t-1} + (1 - keep) x_t, the exponential filter, to the present at ``STARTS``."""
+    """Errors (N, dx) of m_t = keep m_{t-1} + (1 - keep) x_t, the exponential filter, to the present
+    at ``STARTS``.
+    """
     _require_same(noisy, clean)
     mean, found = noisy.states[:, 0].astype(np.float64), []
     for step in range(max(STARTS) + 1):
@@ -95,10 +105,12 @@ def tuned_exponential(noisy: Trajectories, clean: Trajectories) -> float:
 
 @dataclass(frozen=True)
 class KalmanFilter:
-    """Extended Kalman filter of angles and velocities s (4,) of the plain arm, behind noisy sensors.
+    """Extended Kalman filter of angles and velocities s (4,) of the plain arm, behind noisy
+    sensors.
 
-    s' = A [s, u, 1] + N(0, Q), fitted by least squares on clean states; it observes s and the fingertip, whose
-    position follows from the angles. weight: what Q is multiplied with. sigma: the sensors' noise. lengths: links.
+    s' = A [s, u, 1] + N(0, Q), fitted by least squares on clean states; it observes s and the
+    fingertip, whose position follows from the angles. weight: what Q is multiplied with. sigma: the
+    sensors' noise. lengths: links.
     """
 
     transition: np.ndarray  # (7, 4)
@@ -169,7 +181,7 @@ class KalmanFilter:
 
 
 def _segments(steps: np.ndarray) -> np.ndarray:
-    """(N, T, ...) -> the K = 10 steps after each of ``STARTS``, in the order of ``sample_states``."""
+    """(N, T, ...) -> the K = 10 steps after each of ``STARTS``, as of ``sample_states``."""
     return cut(torch.from_numpy(np.ascontiguousarray(steps)), STARTS, 10).numpy()
 
 
@@ -177,6 +189,7 @@ def _require_same(noisy: Trajectories, clean: Trajectories) -> None:
     noisy.require_equal_lengths("a comparison of filters")
     if not np.array_equal(noisy.actions, clean.actions):
         raise ValueError(
-            f"the episodes of {noisy.env} and of {clean.env} hold other torques; draw both from one seed, so that they "
+            f"the episodes of {noisy.env} and of {clean.env} hold other torques; draw both "
+            "from one seed, so that they "
             "are the same episodes with and without noise"
         )

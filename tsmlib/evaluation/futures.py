@@ -51,7 +51,9 @@ def sample_futures(
     seed: int = 0,
     progress: str = "",
 ) -> SampledFutures:
-    """Windows from STARTS of every test episode, episode by episode, and sampled futures under their true actions."""
+    """Windows from STARTS of every test episode, episode by episode, and sampled futures under
+    their true actions.
+    """
     test.require_equal_lengths("a look at the futures of every episode")
     drawn = sample_states(
         model, test, samples=samples, horizon=horizon, starts=STARTS, seed=seed, progress=progress

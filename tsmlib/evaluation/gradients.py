@@ -1,6 +1,8 @@
-"""Gradients of the return: their errors (claim C07) and their signal to noise (claim C13, section 4.2).
+"""Gradients of the return: their errors (claim C07) and their signal to noise (claim C13, section
+4.2).
 
-Letters in shapes: B starts, S model samples, K segments, T horizon, dz and du size of code and action.
+Letters in shapes: B starts, S model samples, K segments, T horizon, dz and du size of code and
+action.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,19 +27,21 @@ ROUNDING = 1e-6  # relative: a deviation below it is that of float32
 def relative_errors(
     value: Callable[[], Tensor], variables: Sequence[Tensor], *, step: float = 1e-7
 ) -> list[float]:
-    """Errors of derivatives by autograd against central differences, relative to the former, one number per variable.
+    """Errors of derivatives by autograd against central differences, relative to the former, one
+    number per variable.
 
-    value: a function of no arguments that gives a number; variables: leaves of type float64 that it reads, as they are
-    again afterwards. Each is moved along its gradient plus a random direction. step: so small that the curvature of a
-    long rollout with contacts does not count, whose share falls with its square. ValueError where the number does not
-    depend on one of them.
+    value: a function of no arguments that gives a number; variables: leaves of type float64 that it
+    reads, as they are again afterwards. Each is moved along its gradient plus a random direction.
+    step: so small that the curvature of a long rollout with contacts does not count, whose share
+    falls with its square. ValueError where the number does not depend on one of them.
     """
     gradients = torch.autograd.grad(value(), variables, allow_unused=True)
     draw, found = torch.Generator().manual_seed(5), []
     for i, (variable, gradient) in enumerate(zip(variables, gradients, strict=True)):
         if gradient is None or not gradient.norm() > 0:
             raise ValueError(
-                f"variable {i}, {tuple(variable.shape)}, has no gradient: the value does not depend on it"
+                f"variable {i}, {tuple(variable.shape)}, has no gradient: the value "
+                "does not depend on it"
             )
         direction = gradient / gradient.norm() + 0.1 * torch.randn(
             gradient.shape, generator=draw
@@ -56,10 +60,12 @@ def relative_errors(
 def of_return(
     task: Task, model: nn.Module, prior: ActionPrior, *, seed: int = 0
 ) -> dict[str, float]:
-    """The largest of ``relative_errors`` of the expected return of ``task`` through model, prior and reward, by what
-    it is a function of: random codes, random torques, the weights of the model, the weights of the prior.
+    """The largest of ``relative_errors`` of the expected return of ``task`` through model, prior
+    and reward, by what it is a function of: random codes, random torques, the weights of the model,
+    the weights of the prior.
 
-    Of copies in float64, with two model samples. Weights that play no part, those of the encoders, are left out.
+    Of copies in float64, with two model samples. Weights that play no part, those of the encoders,
+    are left out.
     """
     net: Any = deepcopy(model).double().requires_grad_()
     prior = deepcopy(prior).double().requires_grad_()
@@ -94,10 +100,12 @@ def _playing(net: nn.Module) -> list[Tensor]:
 def signal(
     task: Task, model: DynamicsModel, space: SearchSpace, *, samples: int = 32, seed: int = 0
 ) -> Tensor:
-    """Signal to noise of the gradient that a planner follows: |mean| / standard deviation over ``samples`` samples of
-    the model, for each variable; of these the geometric mean, at one random point of ``space`` per start: (B,).
+    """Signal to noise of the gradient that a planner follows: |mean| / standard deviation over
+    ``samples`` samples of the model, for each variable; of these the geometric mean, at one random
+    point of ``space`` per start: (B,).
 
-    A deviation within rounding of the mean counts as that: the ratio ends where a model ignores its codes.
+    A deviation within rounding of the mean counts as that: the ratio ends where a model ignores its
+    codes.
     """
     points = space.scale * space.noise(1, len(task), torch.Generator().manual_seed(seed))
     past, gradients = task.past(model.past_len), []

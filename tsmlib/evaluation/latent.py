@@ -1,15 +1,14 @@
 """Latent codes of a segment model (section 5.3.4).
 
-At test time codes are drawn from N(0, I), and from the encoder where the future is known. Deviations and errors are in
-units of the training data's deviation (the feature space of ``evaluation.prediction``).
+At test time codes are drawn from N(0, I), and from the encoder where the future is known.
+Deviations and errors are in units of the training data's deviation (the feature space of
+``evaluation.prediction``).
 
 Letters in shapes: S samples, N windows of test episodes, T steps, H segment length, dz code size.
 """
 
 import math
-from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +18,6 @@ from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
 from tsmlib.models.tsm import TSM
-from tsmlib.rewards import BLOCK
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
 
@@ -29,21 +27,24 @@ ACTIVE = (
 
 
 def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """KL(Q(Z_i | X+) || N(0, 1)) in nats, (N, dz) for the encoder's mean and log variance (N, dz)."""
+    """KL(Q(Z_i | X+) || N(0, 1)) in nats (N, dz), for mean and log variance (N, dz)."""
     return kl_from_standard_normal(mean[..., None], log_variance[..., None])
 
 
 def active_units(mean: Tensor) -> Tensor:
-    """(dz,) bool: dimensions whose posterior mean (N, dz) varies over segments with more than ACTIVE."""
+    """(dz,) bool: dimensions whose posterior mean (N, dz) varies over segments with more than
+    ACTIVE.
+    """
     return mean.var(0) > ACTIVE
 
 
 @torch.no_grad()
 def total_effects(model: Coded, window: Window, generator: torch.Generator) -> Tensor:
-    """Total effect of each dimension of the code on the next segment, (dz,), in deviations of the data.
+    """Total effect of each dimension of the code on the next segment, (dz,), in deviations of the
+    data.
 
-    The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, mean over features, steps and windows. Says what
-    the decoder does with a code however it was trained; the encoder has no part in it.
+    The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, mean over features, steps and windows.
+    Says what the decoder does with a code however it was trained; the encoder has no part in it.
     """
     past, actions = window.past, window.future.actions[:, : model.code_len]
     z, again = (
@@ -60,9 +61,11 @@ def total_effects(model: Coded, window: Window, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> dict[str, Tensor]:
-    """Error (N,) of the next segment, root mean square over features and steps, by where its code comes from.
+    """Error (N,) of the next segment, root mean square over features and steps, by where its code
+    comes from.
 
-    ``posterior``: drawn from Q(Z | X+), which has seen the segment; ``prior``: drawn from N(0, I); ``zero``: z = 0.
+    ``posterior``: drawn from Q(Z | X+), which has seen the segment; ``prior``: drawn from N(0, I);
+    ``zero``: z = 0.
     """
     future = Segment(*(part[:, : model.code_len] for part in window.future))
     mean, log_variance = model.encode(future.states)
@@ -81,16 +84,20 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
 
 
 def deviations(seen: SampledFutures, features: Features) -> tuple[Tensor, Tensor]:
-    """Variance of the samples, and squared error of their mean: (N, T) each, mean over the features that change."""
+    """Variance of the samples, and squared error of their mean: (N, T) each, mean over the features
+    that change.
+    """
     samples = prediction.scored(features, seen.samples)
     error = samples.mean(0) - prediction.scored(features, seen.window.future.states)
     return scoring.spread(samples).mean(-1), error.square().mean(-1)
 
 
 def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
-    """The root of the mean of squares (N, T): over windows (at the places ``where``) first, then over steps.
+    """The root of the mean of squares (N, T): over windows (at the places ``where``) first, then
+    over steps.
 
-    Every step counts alike, so that places which lie later than others do not look worse for it. NaN without a place.
+    Every step counts alike, so that places which lie later than others do not look worse for it.
+    NaN without a place.
     """
     where = torch.ones_like(squares, dtype=torch.bool) if where is None else where
     some = where.any(0)
@@ -98,20 +105,12 @@ def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
     return math.sqrt(by_step.mean()) if some.any() else math.nan
 
 
-def by_spread(
-    variance: Tensor, squared: Tensor, *, groups: int = 10
-) -> tuple[np.ndarray, np.ndarray]:
-    """Spread and error (groups,) of windows sorted by their spread and cut into equal groups, smallest first."""
-    spread, error = variance.mean(1), squared.mean(1)
-    parts = [part for part in spread.argsort().tensor_split(groups) if len(part)]
-    by_group = ([math.sqrt(x[part].mean()) for part in parts] for x in (spread, error))
-    return np.array(next(by_group)), np.array(next(by_group))
-
-
 def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
-    """n codes from ``first`` to ``second`` (..., dz) along cos(a) first + sin(a) second: (n, ..., dz).
+    """n codes from ``first`` to ``second`` (..., dz) along cos(a) first + sin(a) second: (n, ...,
+    dz).
 
-    If both are drawn from N(0, I), so is every code in between, which is not true of a straight line.
+    If both are drawn from N(0, I), so is every code in between, which is not true of a straight
+    line.
     """
     if n < 2:
         raise ValueError(f"n is {n}; a walk from one code to another has at least 2 codes")
@@ -121,24 +120,10 @@ def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
     return codes
 
 
-def widest(seen: SampledFutures, model: Coded, codes: Tensor, steps: int) -> Window:
-    """The window (N = 1) in which the object's place after ``steps`` differs most under some codes (n, dz): by the
-    largest distance from that under the first of them; of equal windows the first."""
-    windows = [_alone(seen.window, i) for i in range(len(seen.window.past.states))]
-    ends = torch.stack(
-        [decode_codes(model, one, codes, steps)[:, -1, BLOCK] for one in windows]
-    )  # (N, n, 2)
-    return windows[int((ends - ends[:, :1]).norm(dim=-1).amax(1).argmax())]
-
-
-def _alone(window: Window, i: int) -> Window:
-    """One of several windows."""
-    return Window(*(Segment(*(part[i : i + 1] for part in side)) for side in window))
-
-
 @torch.no_grad()
 def decode_codes(model: Coded, window: Window, codes: Tensor, steps: int) -> Tensor:
-    """Futures of codes (n, dz) for one window: states (n, T, dx). One code, then the mode (z = 0) in later segments.
+    """Futures of codes (n, dz) for one window: states (n, T, dx). One code, then the mode (z = 0)
+    in later segments.
 
     window: N = 1. steps: T, at most as long as its future.
     """
@@ -152,48 +137,12 @@ def decode_codes(model: Coded, window: Window, codes: Tensor, steps: int) -> Ten
     return torch.cat([states, rollout(model, past, actions[:, first:])], dim=1)
 
 
-@dataclass(frozen=True)
-class CodeMap:
-    """Codes for one moment, and what they do to the object (n codes, T steps).
-
-    codes (n, dz); ways (n, T, 2), of the object; plane (2, dz): the ``directions`` that move its end; told: the share
-    of the end's variance that is linear in the code.
-    """
-
-    codes: Tensor
-    ways: Tensor
-    plane: Tensor
-    told: float
-
-    @property
-    def at(self) -> Tensor:
-        """The codes in the plane, (n, 2)."""
-        return self.codes @ self.plane.T
-
-
-def code_map(model: Coded, window: Window, *, n: int = 600, seed: int = 0) -> CodeMap:
-    """Codes from N(0, I) for one window (N = 1), and the object's ways to the end of its future."""
-    codes = torch.randn(n, model.latent_dim, generator=torch.Generator().manual_seed(seed))
-    ways = decode_codes(model, window, codes, window.future.actions.shape[1])[..., BLOCK]
-    return CodeMap(codes, ways, *directions(codes, ways[:, -1]))
-
-
-def held(codes: Tensor, plane: Tensor, at: Tensor) -> Tensor:
-    """Codes (n, dz) whose part in a plane, orthonormal (2, dz), is replaced by ``at`` (2,): z - z P'P + at P."""
-    return codes - codes @ plane.T @ plane + at @ plane
-
-
-def principal(codes: Tensor) -> tuple[Tensor, Tensor]:
-    """The two directions of largest variance of codes (N, dz): coordinates (N, 2), and the share of variance (2,)."""
-    centred = codes - codes.mean(0)
-    _, sizes, axes = torch.linalg.svd(centred, full_matrices=False)
-    return centred @ axes[:2].T, sizes[:2].square() / sizes.square().sum().clamp_min(1e-30)
-
-
 def directions(codes: Tensor, outcome: Tensor) -> tuple[Tensor, float]:
-    """The directions (2, dz) of codes (N, dz) along which an outcome (N, 2) changes most, orthonormal, most first.
+    """The directions (2, dz) of codes (N, dz) along which an outcome (N, 2) changes most,
+    orthonormal, most first.
 
-    By least squares; also the share of the outcome's variance that a linear function of the code explains.
+    By least squares; also the share of the outcome's variance that a linear function of the code
+    explains.
     """
     x, y = codes - codes.mean(0), outcome - outcome.mean(0)
     slope = torch.linalg.lstsq(x, y).solution  # (dz, 2)

@@ -1,4 +1,5 @@
-"""Open-loop and teacher-forced predictions of a model, scored (section 5.3.1). The scores are those of ``scoring``.
+"""Open-loop and teacher-forced predictions of a model, scored (section 5.3.1). The scores are those
+of ``scoring``.
 
 Letters in shapes: S samples, N trajectories or segments, T predicted steps, D scored features.
 """
@@ -12,24 +13,31 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from tsmlib.checks import require_count, require_seed, require_type
 from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, measure
-from tsmlib.models.base import DynamicsModel, Model, as_dynamics, predict_segment, rollout
+from tsmlib.models.base import Model, as_dynamics, require_robot, rollout
 from tsmlib.models.features import Features
-from tsmlib.models.tsm import TSM
+from tsmlib.planning.tasks import warn_of_other_env
 from tsmlib.sampling import generator_of
-from tsmlib.trajectory import Segment, Trajectories, Window
+from tsmlib.trajectory import Segment, Trajectories
 
-VERSION = 2  # raise it when a score changes: scores that are kept are found again only by the version that made them
+# raise it when a score changes: scores that are kept are found again only by the version that made
+# them
+VERSION = 2
 ROWS = 800  # samples times trajectories that are rolled out and scored at once
-WORST = 1e6  # where a sample that is not finite, or beyond, is kept: it counts as worst, and every score stays finite
+# where a sample that is not finite, or beyond, is kept: it counts as worst, and every score stays
+# finite
+WORST = 1e6
 
 
 @dataclass(frozen=True)
 class Scores:
-    """One model's scores. The caller averages: over trajectories, over some of them, over the horizon.
+    """One model's scores. The caller averages: over trajectories, over some of them, over the
+    horizon.
 
-    values: metric -> (N, T). pit: (N, T, D), the predictive distribution function at the truth, uniform on [0, 1]
-    where calibrated. outside: (N,), the share of samples that leave the physical range or are not finite at any step.
+    values: metric -> (N, T). pit: (N, T, D), the predictive distribution function at the truth,
+    uniform on [0, 1] where calibrated. outside: (N,), the share of samples that leave the physical
+    range or are not finite at any step.
     """
 
     values: dict[str, Tensor]
@@ -47,7 +55,9 @@ class Scores:
         return means
 
     def calibration(self, where: Tensor | None = None) -> Tensor:
-        """Observed coverage (19,) of the central intervals of ``LEVELS``, over all steps or those of ``where``."""
+        """Observed coverage (19,) of the central intervals of ``LEVELS``, over all steps or those
+        of ``where``.
+        """
         return torch.stack(
             [
                 _mean(coverage(self.pit, float(level)).flatten(), _flat(where, self))
@@ -69,16 +79,33 @@ def score(
     seed: int = 0,
     progress: str = "",
 ) -> Scores:
-    """Every score of ``model`` on ``test``, with all that is fitted taken from ``validation``.
+    """Score a model's predictions, with all that is fitted taken from validation data.
 
-    Open loop with the true actions after ``starts`` observed steps, for ``horizon`` steps. Teacher-forced segments are
-    starts=range(10, 100, 10) and horizon=10: each predicts H steps from the true past, and N counts segments, those of
-    one trajectory after each other. Of episodes that end early, N counts the segments that lie within their episode.
+    Open loop with the true actions. Teacher-forced segments are starts=range(10, 100, 10) and
+    horizon=10: each predicts H steps from the true past, and N counts segments, those of one
+    trajectory after each other. Of episodes that end early, N counts the segments within them.
 
-    Memory: the validation samples (S, N, T, D), 0.4 GiB at the paper's sizes; test samples are never held together.
-    Raises ValueError where model, test and validation data are not of one kind, naming both sides.
+    Args:
+        model: that predicts.
+        features: of the training data, in whose units scores are: ``model.features``.
+        test: episodes that are scored.
+        validation: held-out episodes, on which variances and noise are fitted.
+        samples: S, rollouts of each; their memory on validation is S N T D numbers.
+        horizon: T, steps predicted.
+        starts: steps observed before a prediction, at least 1.
+        seed: of the samples.
+        progress: title of the progress bar; none without.
+
+    Returns:
+        The scores, one number per trajectory and step.
+
+    Raises:
+        ValueError: model, features, test and validation data are not of one robot, or starts and
+            horizon do not fit the episodes; both sides are named.
+        FloatingPointError: a score is not a number.
     """
-    _require_fit(features, test, validation, samples)
+    _require_fit(model, features, test, validation)
+    samples, seed = require_count("samples", samples), require_seed("seed", seed)
     rollouts = partial(
         _rollouts, model, samples=samples, horizon=horizon, starts=starts, progress=progress
     )
@@ -100,6 +127,13 @@ def score(
         )
         parts.append((values, pit, outside))
     values = {metric: torch.cat([part[0][metric] for part in parts]) for metric in parts[0][0]}
+    for metric, value in values.items():
+        if value.isnan().any():
+            n, t = value.isnan().nonzero()[0].tolist()
+            raise FloatingPointError(
+                f"{metric} of trajectory {n} at step {t} is nan; the data hold values too large "
+                "for float32, or features no statistics: model.features.fit(training data)"
+            )
     return Scores(
         values,
         torch.cat([part[1] for part in parts]),
@@ -108,47 +142,23 @@ def score(
     )
 
 
-@torch.no_grad()
-def ways_apart(model: DynamicsModel, window: Window, *, seed: int = 0) -> dict[str, float]:
-    """How far apart the same prediction x is by two ways of computing it: at most, relative to 1 + |x|.
-
-    ``steps``: the mode of a whole segment, and one action at a time. ``teacher forcing``, of a TSM: a segment decoded
-    state by state, and all at once from what was decoded. window: its future is one segment.
-    """
-    past, actions = window.past, window.future.actions
-    step = model.begin(past)
-    both = {
-        "steps": (
-            predict_segment(model, past, actions),
-            torch.stack([step(u) for u in actions.unbind(1)], dim=1),
-        )
-    }
-    if isinstance(model, TSM):
-        z = torch.randn(
-            len(actions), model.latent_dim, generator=torch.Generator().manual_seed(seed)
-        )
-        states = model.decode(past, actions, z)
-        both["teacher forcing"] = (
-            states,
-            model.decode_teacher_forced(Window(past, Segment(states, actions)), z),
-        )
-    return {
-        way: float(((x - again) / (1 + x.abs())).abs().max()) for way, (x, again) in both.items()
-    }
-
-
 def _require_fit(
-    features: Features, test: Trajectories, validation: Trajectories, samples: int
+    model: Model, features: Features, test: Trajectories, validation: Trajectories
 ) -> None:
-    """ValueError unless all of it belongs together."""
-    if samples < 1:
-        raise ValueError(f"samples is {samples}, expected at least 1")
+    """An error unless all of it belongs together."""
+    as_dynamics(model)
+    require_type("features", features, Features, "tsmlib's Features, as model.features")
+    for name, data in (("test", test), ("validation", validation)):
+        require_type(name, data, Trajectories, "tsmlib.Trajectories")
     test.robot.require_same(validation.robot, "test and validation data")
+    require_robot(model, test.robot, "the model and the test data", but=("env",))
+    warn_of_other_env(getattr(model, "robot", None), test.robot, "the model and the test data")
     expected, found = len(features.step_std), test.robot.state_dim
-    if expected != found or features.angles != list(test.angles):
+    if expected != found or list(features.angles) != list(test.angles):
         raise ValueError(
-            f"the model's states have {expected} dimensions with angles {features.angles}, those of {test.env} {found} "
-            f"with angles {list(test.angles)}; score a model that was trained on {test.env}"
+            f"features are of {expected} states with angles {list(features.angles)}, those of "
+            f"{test.env} {found} with angles {list(test.angles)}; expected those of a model that "
+            f"was trained on {test.env}"
         )
 
 
@@ -162,7 +172,8 @@ def sample_states(
     seed: int = 0,
     progress: str = "",
 ) -> Tensor:
-    """Open-loop samples (S, N, T, dx), physical units, with the true actions after ``starts`` observed steps.
+    """Open-loop samples (S, N, T, dx) in physical units, with the true actions after ``starts``
+    observed steps.
 
     Column k holds the prediction of x_{start + k + 1}. N counts as in ``score``.
     A deterministic model gives one sample, whatever S.
@@ -180,7 +191,8 @@ def sample_states(
 
 
 def scored(features: Features, states: Tensor) -> Tensor:
-    """(..., dx) -> (..., D), the space of the scores. What is not finite becomes the worst that can be counted.
+    """(..., dx) -> (..., D), the space of the scores. What is not finite becomes the worst that can
+    be counted.
 
     ``features`` may be on another device; what is returned is where ``states`` are.
     """
@@ -189,12 +201,15 @@ def scored(features: Features, states: Tensor) -> Tensor:
 
 
 def cut(steps: Tensor, starts: Sequence[int], horizon: int) -> Tensor:
-    """(N, T, ...) -> (N * len(starts), horizon, ...): columns start .. start + horizon, in the order of ``score``."""
+    """(N, T, ...) -> (N * len(starts), horizon, ...): columns start .. start + horizon, in the
+    order of ``score``.
+    """
     return torch.stack([steps[:, start : start + horizon] for start in starts], 1).flatten(0, 1)
 
 
 def physical_range(*data: Trajectories) -> tuple[Tensor, Tensor]:
-    """Lowest and highest state (dx,) that counts as physical: the range of the data, half as wide again at each end.
+    """Lowest and highest state (dx,) that counts as physical: the range of the data, half as wide
+    again at each end.
 
     Angles may be anything finite.
     """
@@ -218,9 +233,12 @@ def _rollouts(
     progress: str,
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Blocks of trajectories: states (S, n, T, dx) and truth (n, T, dx). Blocks are independent."""
+    horizon = require_count("horizon", horizon)
+    starts = [require_count("a start", start) for start in starts]
     if not (starts and min(starts) >= 1 and 1 <= horizon <= data.horizon - max(starts)):
         raise ValueError(
-            f"starts {list(starts)} and horizon {horizon} do not fit: at least one step is observed first, and "
+            f"starts {list(starts)} and horizon {horizon} do not fit: at least one step "
+            "is observed first, and "
             f"episodes have {data.horizon}"
         )
     data.window_counts(min(starts) + horizon, "scores")  # warns of those that are left out

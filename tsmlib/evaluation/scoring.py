@@ -1,22 +1,24 @@
-"""Scores of samples against the truth, and the constants that they take from validation data (sections 5.2, 5.3.1).
+"""Scores of samples against the truth, and the constants that they take from validation data
+(sections 5.2, 5.3.1).
 
-All live in the standardised feature space of the training data: angles as cosine and sine, unit variance, dimensions
-that never change within an episode left out. Likelihoods are sums over dimensions, in nats per time step. What a score
-leaves open (variances, residual noise) is fitted on validation data alone, with the same freedom for every model.
-Letters in shapes: S samples, N trajectories or segments, T predicted steps, D scored features.
+All live in the standardised feature space of the training data: angles as cosine and sine, unit
+variance, dimensions that never change within an episode left out. Likelihoods are sums over
+dimensions, in nats per time step. What a score leaves open (variances, residual noise) is fitted on
+validation data alone, with the same freedom for every model. Letters in shapes: S samples, N
+trajectories or segments, T predicted steps, D scored features.
 
-    ll_paper            the paper's protocol: diagonal Gaussian fitted to the samples, plus one scalar variance
-    ll_shared           one scalar variance around the samples' mean
-    ll_horizon          one variance per step and dimension around the samples' mean
-    ll_own              the model's own density: an equal mixture of Gaussians around its samples, whose one variance
+    ll_paper            the paper's protocol: diagonal Gaussian fitted to the samples, plus one
+    scalar variance ll_shared           one scalar variance around the samples' mean ll_horizon
+    one variance per step and dimension around the samples' mean ll_own              the model's own
+    density: an equal mixture of Gaussians around its samples, whose one variance
                         per step and dimension is residual noise
-    energy_score, crps  proper scores of the samples themselves; lower is better
-    ..._noise           the same after Gaussian residual noise, one variance per step, was added to every sample
+    energy_score, crps  proper scores of the samples themselves; lower is better ..._noise
+    the same after Gaussian residual noise, one variance per step, was added to every sample
     squared_error       of the samples' mean, mean over dimensions; its root mean is the NRMSE
 
-A deterministic model is one sample. Then ll_paper is the paper's likelihood of its baselines, ll_own is ll_horizon,
-energy score and CRPS are distances, and the Gaussian of ll_horizon takes the place of the samples in coverage. With
-residual noise it becomes S noisy copies.
+A deterministic model is one sample. Then ll_paper is the paper's likelihood of its baselines,
+ll_own is ll_horizon, energy score and CRPS are distances, and the Gaussian of ll_horizon takes the
+place of the samples in coverage. With residual noise it becomes S noisy copies.
 """
 
 import math
@@ -47,7 +49,9 @@ class Fitted:
 
 
 def fit(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> Fitted:
-    """Everything that ``measure`` takes from validation data. copies: of a deterministic model's sample."""
+    """Everything that ``measure`` takes from validation data. copies: of a deterministic model's
+    sample.
+    """
     horizon = (truth - samples.mean(0)).square().mean(0)
     return Fitted(
         floor=fit_floor(samples, truth),
@@ -59,7 +63,8 @@ def fit(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> Fitted
 
 
 def fit_floor(samples: Tensor, truth: Tensor) -> float:
-    """The scalar floor that maximises ``ll_paper``, by a fine grid of powers of ten and the mean squared error.
+    """The scalar floor that maximises ``ll_paper``, by a fine grid of powers of ten and the mean
+    squared error.
 
     With a single sample the mean squared error is the best.
     """
@@ -75,10 +80,12 @@ def fit_shared(samples: Tensor, truth: Tensor) -> float:
 
 
 def fit_own(samples: Tensor, truth: Tensor, *, iterations: int = 30) -> Tensor:
-    """The variances (T, D) that maximise ``ll_own``, by expectation maximisation, each step on its own.
+    """The variances (T, D) that maximise ``ll_own``, by expectation maximisation, each step on its
+    own.
 
-    It starts at a tenth of the mean's squared error. Samples tell more than one stationary point apart: from there the
-    better one was found, and 30 iterations were within 0.005 nats of 400. With a single sample one iteration is exact.
+    It starts at a tenth of the mean's squared error. Samples tell more than one stationary point
+    apart: from there the better one was found, and 30 iterations were within 0.005 nats of 400.
+    With a single sample one iteration is exact.
     """
     start = 0.1 * (truth - samples.mean(0)).square().mean(0).clamp_min(FLOORS[0])
     variances = []
@@ -96,7 +103,8 @@ def fit_own(samples: Tensor, truth: Tensor, *, iterations: int = 30) -> Tensor:
 
 
 def fit_noise(samples: Tensor, truth: Tensor, *, copies: int, seed: int = 0) -> Tensor:
-    """The residual variance (T,) that minimises each step's energy score, of the squares of ``NOISE``.
+    """The residual variance (T,) that minimises each step's energy score, of the squares of
+    ``NOISE``.
 
     By at most 50 samples.
     """
@@ -137,7 +145,9 @@ def measure(
 
 
 def gaussian(error: Tensor, variance: Tensor) -> Tensor:
-    """Log-density (..., T) of an error (..., T, D) under a diagonal Gaussian, in nats, summed over dimensions."""
+    """Log-density (..., T) of an error (..., T, D) under a diagonal Gaussian, in nats, summed over
+    dimensions.
+    """
     return -0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi)).sum(-1)
 
 
@@ -148,24 +158,10 @@ def spread(samples: Tensor) -> Tensor:
     )  # ten times as fast as var
 
 
-def fit_loss(samples: int, dims: int) -> float:
-    """Nats per step that ``ll_paper`` without a floor loses for having S samples of a true Gaussian, in expectation.
-
-    The fitted variance is (v / (S - 1)) chi-squared with S - 1 degrees of freedom, independent of the fitted mean:
-
-        D / 2 (E log chi2_{S-1} / (S - 1) + (1 + 1 / S) E (S - 1) / chi2_{S-1} - 1)
-
-    Infinite below 4 samples. About D / S.
-    """
-    if samples < 4:
-        return math.inf
-    half = (samples - 1) / 2
-    log_variance = float(torch.digamma(torch.tensor(half, dtype=torch.float64))) - math.log(half)
-    return dims / 2 * (log_variance + (1 + 1 / samples) * (samples - 1) / (samples - 3) - 1)
-
-
 def ll_own(samples: Tensor, truth: Tensor, variance: Tensor) -> Tensor:
-    """Log-likelihood (N, T) under the mixture 1/S sum_s N(x; x_s, diag v), v (T, D) residual noise (``fit_own``)."""
+    """Log-likelihood (N, T) under the mixture 1/S sum_s N(x; x_s, diag v), v (T, D) residual noise
+    (``fit_own``).
+    """
     nearness = (samples - truth).square_().mul_(-0.5 / variance).sum(-1).logsumexp(0)  # (N, T)
     return nearness + gaussian(torch.zeros_like(variance), variance) - math.log(len(samples))
 
@@ -173,8 +169,9 @@ def ll_own(samples: Tensor, truth: Tensor, variance: Tensor) -> Tensor:
 def distances(samples: Tensor, truth: Tensor, *, shifts: int = SHIFTS) -> tuple[Tensor, Tensor]:
     """Energy score and CRPS (N, T), E|X - x| - E|X - X'| / 2, the CRPS as a mean over dimensions.
 
-    Unbiased. X' are the samples moved on by 1, 2, ..., ``shifts`` in a circle, which is as good as all pairs once S is
-    large and costs O(S); shifts >= S - 1 are all pairs. A single sample has no spread: both are distances.
+    Unbiased. X' are the samples moved on by 1, 2, ..., ``shifts`` in a circle, which is as good as
+    all pairs once S is large and costs O(S); shifts >= S - 1 are all pairs. A single sample has no
+    spread: both are distances.
     """
     energy, crps = (part.mean(0) for part in _lengths(samples - truth))
     last = min(shifts, len(samples) - 1)
@@ -189,16 +186,18 @@ def distances(samples: Tensor, truth: Tensor, *, shifts: int = SHIFTS) -> tuple[
 
 
 def rank(samples: Tensor, truth: Tensor, generator: torch.Generator) -> Tensor:
-    """PIT values (N, T, D): where the truth falls among the samples, uniform on [0, 1] if both are drawn alike.
+    """PIT values (N, T, D): where the truth falls among the samples, uniform on [0, 1] if both are
+    drawn alike.
 
-    A place drawn at random between the two samples around the truth, so that this holds for few samples too.
+    A place drawn at random between the two samples around the truth, so that this holds for few
+    samples too.
     """
     below = (len(samples) + (truth - samples).sign_().sum(0)) / 2  # a tie counts half
     return (below + torch.rand(below.shape, generator=generator)) / (len(samples) + 1)
 
 
 def coverage(pit: Tensor, level: float) -> Tensor:
-    """Share of dimensions (N, T) in which the truth lies within the central interval of ``level``."""
+    """Share of dimensions (N, T) whose truth lies within the central interval of ``level``."""
     return ((2 * pit - 1).abs() <= level).float().mean(-1)
 
 

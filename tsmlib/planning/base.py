@@ -69,8 +69,6 @@ class Plan:
         curve: (iterations + 1, B), what the best so far was judged by, from the start on; -inf
             where no return was finite yet.
         seconds: of the planning, on the wall.
-        trace: (iterations + 1, B, *shape), parameters of the best so far (``plan_at``); None where
-            they were not kept.
         start: (B, dx), the states that the plan begins in; None where the predictor did not say.
             ``execute`` refuses the plan for other starts.
         robot: that the predictor is of; None where it did not say.
@@ -82,7 +80,6 @@ class Plan:
     predicted_return: Tensor
     curve: Tensor
     seconds: float
-    trace: Tensor | None = None
     start: Tensor | None = None
     robot: Robot | None = None
 

@@ -309,37 +309,6 @@ def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
     return replace(plan, states=states[:, 0], predicted_return=predicted_return)
 
 
-@torch.no_grad()
-def plan_at(
-    plan: Plan, iteration: int, predict: Predictor, reward: Reward, space: SearchSpace
-) -> Plan:
-    """The plan as it was after some iterations of its planner.
-
-    Args:
-        plan: with its ``trace``.
-        iteration: 0 for the start.
-        predict: gives its predicted return and states; as in ``reevaluate``, samples of its own.
-        reward: of states and actions, one number per step.
-        space: that was searched.
-
-    Returns:
-        The plan, with its curve and trace until then.
-    """
-    iteration = require_count("iteration", iteration, least=0)
-    if plan.trace is None or iteration >= len(plan.trace):
-        steps = "kept no trace" if plan.trace is None else f"took {len(plan.trace) - 1} iterations"
-        raise ValueError(f"the planner {steps}; there is no plan as of iteration {iteration}")
-    parameters = plan.trace[iteration]
-    earlier = replace(
-        plan,
-        parameters=parameters,
-        actions=space.decode(parameters[None])[0],
-        curve=plan.curve[: iteration + 1],
-        trace=plan.trace[: iteration + 1],
-    )
-    return reevaluate(earlier, predict, reward)
-
-
 def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
     """Iterations after which a planner has gained most of all that it gains (claim C15).
 

@@ -120,7 +120,6 @@ class Search:
         self.parameters = self.start[0].clone()
         self.returns = self.start.new_full((self.start.shape[1],), -torch.inf)
         self.curve: list[Tensor] = []
-        self.trace: list[Tensor] = []
 
     def returns_of(self, parameters: Tensor) -> Tensor:
         """What candidates (C, B, *shape) are judged by: (C, B)."""
@@ -159,7 +158,6 @@ class Search:
         self.parameters = torch.where(like(better, chosen), chosen, self.parameters)
         self.returns = torch.where(better, value, self.returns)
         self.curve.append(self.returns)
-        self.trace.append(self.parameters)
 
     @torch.no_grad()
     def plan(self) -> Plan:
@@ -173,7 +171,6 @@ class Search:
             predicted_return=expected_return(states, actions, self.reward)[0],
             curve=torch.stack(self.curve),
             seconds=time.perf_counter() - self.began,
-            trace=torch.stack(self.trace),
             start=getattr(self.predict, "start", None),
             robot=getattr(self.predict, "robot", None),
         )

@@ -363,12 +363,7 @@ class Task:
         if robot is None or robot == self.robot:
             return
         robot.require_same(self.robot, what, but=("env",))
-        if robot.env != self.robot.env:
-            warnings.warn(
-                f"{what} are of two environments, {robot.env} and {self.robot.env}, whose states "
-                "have the same names; predictions hold as far as the two are alike",
-                stacklevel=4,
-            )
+        warn_of_other_env(robot, self.robot, what)
 
     def require_start(self, states: Tensor, what: str) -> None:
         """ValueError unless ``states`` (B, dx) are this task's starts, up to rounding."""
@@ -387,6 +382,16 @@ class Task:
                 f"task {self.name!r} of {self.env} with {float(start[i, d]):.6g}; expected the "
                 "same starts"
             )
+
+
+def warn_of_other_env(one: Robot | None, other: Robot, what: str) -> None:
+    """Say aloud that two robots whose states have the same names are of two environments."""
+    if one is not None and one.env != other.env:
+        warnings.warn(
+            f"{what} are of two environments, {one.env} and {other.env}, whose states have the "
+            "same names; predictions hold as far as the two are alike",
+            stacklevel=4,
+        )
 
 
 @cache

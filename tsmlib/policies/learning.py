@@ -35,13 +35,12 @@ from tsmlib.models.base import Model, as_dynamics
 from tsmlib.policies.imagination import imagine
 from tsmlib.policies.networks import Policy
 from tsmlib.policies.options import LearningCurve, LearningOptions
-from tsmlib.rewards import Reward, rewarded
+from tsmlib.rewards import Reward, fingerprint, rewarded
 from tsmlib.sampling import SeparateNoise
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, PathLike
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import TrainingState, resumable
-from tsmlib.trajectory import Segment
 
 RewardFor = Callable[[Tensor], Reward]  # targets (R, dg) -> reward
 # n, generator -> starting states (n, dx), targets (n, dg)
@@ -197,7 +196,7 @@ class _Learner:
         )
         if not torch.isfinite(seen.states).all():
             raise self.state.stopped("the model predicts states that are not finite", iteration)
-        rewards = self.judged(target, seen)
+        rewards = rewarded(self.reward_for(target), *seen)
         if rewards.isinf().any():
             raise FloatingPointError(
                 "the reward is infinite, although the states are finite; look for a division in it"
@@ -209,8 +208,8 @@ class _Learner:
             )
         return rewards.unflatten(0, (self.policy.copies, -1))
 
-    def judged(self, target: Tensor, seen: Segment) -> Tensor:
-        """Rewards (R, T) of episodes (R, T, .)."""
+    def reward_for(self, target: Tensor) -> Reward:
+        """The reward of some targets (R, dg)."""
         hint = "a function of targets that gives a reward, such as tsmlib.rewards.reach"
         try:
             reward = self.reward(target)
@@ -219,26 +218,23 @@ class _Learner:
                 f"reward fails on targets {tuple(target.shape)}: {error}; expected {hint}"
             ) from error
         require_callable("what reward gave", reward, hint)
-        return rewarded(reward, *seen)
+        return reward
 
     @torch.no_grad()
     def identity(self) -> dict[str, Json]:
         """What a run is, by values: the model's weights, starts, targets, and rewards of chance."""
-        n, steps, generator = 200, self.options.horizon, torch.Generator().manual_seed(0)
-        start, target = self.drawn(n, generator)
-        wander = torch.randn(n, steps, start.shape[1], generator=generator).cumsum(1)
-        scale = start.std(0) + start.abs().mean(0)
-        actions = 2 * torch.rand(n, steps, self.policy.action_dim, generator=generator) - 1
-        chance = self.judged(target, Segment(start[:, None] + 0.1 * scale * wander, actions))
+        start, target = self.drawn(200, torch.Generator().manual_seed(0))
+        steps, du = self.options.horizon, self.policy.action_dim
+        chance = fingerprint(self.reward_for(target), start, steps, du)
         model = self.model
         digest = artifacts.digest(model.state_dict()) if isinstance(model, nn.Module) else ""
         identity: dict[str, Json] = {
             "policy": type(self.policy).__name__,
             "copies": self.policy.copies,
             "model": f"{type(model).__name__} {digest}",
+            "reward of chance": list(chance),
         }
-        values = {"starts": start, "targets": target, "rewards of chance": chance.flatten(0, -1)}
-        for name, part in values.items():
+        for name, part in {"starts": start, "targets": target}.items():
             moments = torch.stack([part.double().mean(0), part.double().std(0)])
             identity[name] = moments.flatten().tolist()
         return identity

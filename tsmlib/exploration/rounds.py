@@ -1,0 +1,91 @@
+"""The files of a round of exploration."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+from torch import Tensor, nn
+
+from tsmlib.models.action_prior import ActionPrior
+from tsmlib.models.base import DynamicsModel
+from tsmlib.storage import artifacts
+from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite
+from tsmlib.training.fit import Loss
+from tsmlib.trajectory import Trajectories
+
+
+class Trainable(DynamicsModel, Protocol):
+    """A dynamics model of this package: a module with a loss and the arguments that made it."""
+
+    @property
+    def loss(self) -> Loss: ...
+    @property
+    def config(self) -> Callable[[], dict[str, Json]]: ...
+    @property
+    def state_dict(self) -> Callable[[], dict[str, Tensor]]: ...
+
+
+@dataclass(frozen=True)
+class RoundFiles:
+    """The files of one round: its episodes, then the prior, at last the model with its record.
+
+    Attributes:
+        folder: of the round.
+        identity: of the loop and of what the round learns from; files of another are refused.
+    """
+
+    folder: Path
+    identity: Mapping[str, Json]
+
+    def episodes(self) -> tuple[Trajectories | None, dict[str, float]] | None:
+        """Episodes, None where all were lost, and their record; None where nothing is there."""
+        path, whole = self.folder / "episodes.safetensors", self.folder / "model.safetensors"
+        if path.exists():
+            return artifacts.load_trajectories(path), self._record(path)
+        return (None, self._record(whole)) if whole.exists() else None
+
+    def keep_episodes(self, episodes: Trajectories, record: Mapping[str, float]) -> None:
+        """Write episodes and their record."""
+        path = self.folder / "episodes.safetensors"
+        artifacts.save_trajectories(path, episodes, self._header(record))
+
+    def models(self, model: Trainable, prior: ActionPrior | None) -> dict[str, float] | None:
+        """The record of the whole round, its weights now in the nets; None if not all is there."""
+        path = self.folder / "model.safetensors"
+        if not path.exists():
+            return None
+        record = self._record(path)
+        for name, net in {"model": cast(nn.Module, model), "prior": prior}.items():
+            if net is not None:
+                file = self.folder / f"{name}.safetensors"
+                stored = artifacts.load_model(file, cast(Any, type(net)))
+                net.load_state_dict(stored.state_dict())
+        return record
+
+    def keep_models(
+        self, model: Trainable, prior: ActionPrior | None, record: Mapping[str, float]
+    ) -> None:
+        """Write the nets and the record of the whole round; its checkpoints go."""
+        header = self._header(record)
+        if prior is not None:
+            artifacts.save_model(self.folder / "prior.safetensors", prior, header)
+        artifacts.save_model(self.folder / "model.safetensors", cast(Any, model), header)
+        for checkpoint in self.folder.glob("*.checkpoint"):
+            shutil.rmtree(checkpoint)
+
+    def _header(self, record: Mapping[str, float]) -> dict[str, Json]:
+        return {"identity": dict(self.identity), "record": encode_nonfinite(dict(record))}
+
+    def _record(self, path: Path) -> dict[str, float]:
+        header = artifacts.read_header(path)
+        stored = cast(dict[str, Json], header.get("identity", {}))
+        if differs := artifacts.differences(stored, dict(self.identity)):
+            raise StoreError(
+                f"{path} is of another exploration: {'; '.join(differs)}. Delete "
+                f"{self.folder.parent} to start anew, or go back to those settings"
+            )
+        return dict(decode_nonfinite(header["record"]))
