@@ -1,14 +1,14 @@
-"""Minari data sets: read as ``Trajectories``, and written from them. Needs ``pip install 'tsmlib[minari]'``.
+"""Minari data sets: read as ``Trajectories``, and written from them. Needs tsmlib[minari].
 
-An HDF5 file from a stranger can point at other files on this machine and declare terabytes in a kilobyte, and Minari
-imports the environment that a data set names where it states no spaces. So before Minari reads, the data set must
-state two flat Box spaces, and its file hold plain numbers only, stored in it. No environment that a file names is made.
+An HDF5 file from a stranger can point at other files on this machine and declare terabytes in a
+kilobyte, and Minari imports the environment that a data set names where it states no spaces. So
+before Minari reads, the data set must state two flat Box spaces, and its file hold plain numbers
+only, stored in it. No environment that a file names is made.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from tsmlib.storage.files import Json, PathLike, StoreError, read_bytes
 from tsmlib.trajectory import Trajectories
 
-MAX_RATIO = 20  # bytes that a file declares, or of its episodes padded to one length, over its own
+MAX_RATIO = 20  # bytes that a file declares over its own
 _SUPPORTED = "supported are observations that are a Box of one dimension, and actions that are one too, with bounds"
 
 
@@ -33,31 +33,31 @@ def load_minari(
     units: tuple[str, ...] | None = None,
     angles: tuple[int, ...] | None = None,
 ) -> Trajectories:
-    """The episodes of a local Minari data set: its folder, or its id where Minari keeps it.
+    """Read the episodes of a local Minari data set; rewards are not read.
 
-    Observations (T + 1, dx) are the states. Actions (T, du) are scaled from the bounds of the action space to [-1, 1].
-    Episodes may differ in length; those that the environment ended are ``terminated``. Rewards are not read.
+    Args:
+        path: its folder, or its id where Minari keeps it.
+        env: id of the environment; by default the data set's, or the name of the data set.
+        dt: seconds per step; by default that of ``save_minari``, else one with a warning.
+        names: one word per state dimension; by default as saved, else x0, x1, ...
+        units: one per state dimension; by default as saved, else none.
+        angles: state dimensions that are angles in radians; by default as saved, else none.
 
-    env, dt (seconds), names, units, angles: what the data mean, by default what ``save_minari`` wrote into the file;
-    else the id of the environment or of the data set, one second with a warning, x0, x1, ..., no units and no angles.
-    Raises StoreError for anything else than flat Box spaces and plain numbers, before data are read.
+    Returns:
+        Trajectories whose actions are scaled from the bounds of the action space to [-1, 1].
+
+    Raises:
+        StoreError: anything else than flat Box spaces and plain numbers.
     """
     minari = _minari(path)
-    given = Path(path) if Path(path).is_dir() else minari.storage.get_dataset_path(str(path))
-    folder = given / "data" if (given / "data").is_dir() else given
+    place = Path(path) if Path(path).is_dir() else minari.storage.get_dataset_path(str(path))
+    folder = place / "data" if (place / "data").is_dir() else place
     try:
         metadata = json.loads(read_bytes(folder / "metadata.json"))
         low, high = _require_plain(folder, metadata)
         meaning = _meaning(metadata, len(json.loads(metadata["observation_space"])["low"]))
-        for name, value in (
-            ("env", env),
-            ("dt", dt),
-            ("names", names),
-            ("units", units),
-            ("angles", angles),
-        ):
-            if value is not None:
-                meaning[name] = value
+        given = {"env": env, "dt": dt, "names": names, "units": units, "angles": angles}
+        meaning |= {name: value for name, value in given.items() if value is not None}
         states, actions, terminated = [], [], []
         for x, u, ended in _episodes(minari.MinariDataset(folder), low, high):
             states.append(x)
@@ -65,7 +65,7 @@ def load_minari(
             terminated.append(ended)
         if meaning["dt"] is None:
             warnings.warn(
-                f"{given} does not say how long a step is; one step counts as one second. Say dt=...",
+                f"{place} does not say how long a step is; one step counts as one second: give dt=...",
                 stacklevel=2,
             )
             meaning["dt"] = 1.0
@@ -74,18 +74,24 @@ def load_minari(
         Exception
     ) as error:  # what the files say goes through other libraries, which may fail in any way
         raise StoreError(
-            f"{given} holds no usable Minari data set: {str(error) or repr(error):.500}. Expected flat Box spaces and "
-            "plain numbers in main_data.hdf5: ask whoever made it for a copy written by Minari itself."
+            f"{place} holds no usable Minari data set: {str(error) or repr(error):.500}. Expected "
+            "flat Box spaces and plain numbers in main_data.hdf5, as Minari itself writes them."
         ) from error
 
 
 def save_minari(
     dataset_id: str, trajectories: Trajectories, rewards: np.ndarray | None = None
 ) -> Path:
-    """Write ``trajectories`` as the local Minari data set ``dataset_id`` ("tsm/reacher/random-v0"). Returns its folder.
+    """Write trajectories as a local Minari data set, in $MINARI_DATASETS_PATH or ~/.minari.
 
-    Actions are written in the bounds of the environment's action space where Gymnasium knows its id, else in [-1, 1].
-    rewards: (N, T); zeros where there are none. Minari keeps its data sets in $MINARI_DATASETS_PATH, or ~/.minari.
+    Args:
+        dataset_id: such as "tsm/reacher/random-v0".
+        trajectories: actions are written in the bounds of the environment's action space where
+            Gymnasium knows its id, else in [-1, 1].
+        rewards: (N, T) of each step; zeros by default.
+
+    Returns:
+        The folder of the data set.
     """
     from gymnasium.spaces import Box
 
@@ -170,18 +176,8 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
             "units": [""] * dx,
             "angles": [],
         }
-    words = [about["env"], *about["names"], *about["units"]]
-    dt = about["dt"]
-    if not all(isinstance(word, str) and len(word) <= 500 for word in words):
-        raise ValueError(f"env, names and units are {words!r:.200}, expected texts")
-    if dt is not None and not (isinstance(dt, int | float) and 0 < dt < math.inf):
-        raise ValueError(f"dt is {dt!r:.80}, expected seconds above 0")
-    if not all(type(index) is int and 0 <= index < dx for index in about["angles"]):
-        raise ValueError(
-            f"angles are {about['angles']!r:.80}, expected some of the {dx} state dimensions"
-        )
     lists = {name: tuple(about[name]) for name in ("names", "units", "angles")}
-    return {"env": about["env"], "dt": dt} | lists
+    return {"env": about["env"], "dt": about["dt"]} | lists
 
 
 def _episodes(
@@ -216,19 +212,6 @@ def _episodes(
         )
 
 
-def _require_paddable(folder: Path, states: list[np.ndarray], actions: list[np.ndarray]) -> None:
-    """ValueError where few long episodes among many short ones would need far more memory than the file has bytes."""
-    longest = max(len(u) for u in actions)
-    padded = (
-        len(actions) * ((longest + 1) * states[0].shape[-1] + longest * actions[0].shape[-1]) * 4
-    )
-    if padded > MAX_RATIO * (folder / "main_data.hdf5").stat().st_size:
-        raise ValueError(
-            f"its {len(actions)} episodes of up to {longest} steps, padded to one length, take {padded / 1e9:.2g} GB, "
-            f"more than {MAX_RATIO} times the file: read it with minari and cut the long ones into pieces"
-        )
-
-
 def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarray, np.ndarray]:
     """Two flat Box spaces, as many episodes as stated, and numbers within the file itself, no more than it can hold.
 
@@ -251,26 +234,27 @@ def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarr
     file = folder / "main_data.hdf5"
     left = MAX_RATIO * len(read_bytes(file))
 
-    def look(name: str, link: object) -> None:
+    def refusal(name: str, link: object) -> str | None:
+        """What is wrong with an entry; h5py would lose the reason of an error raised here."""
         nonlocal left
+        entry = f"{name[:80]!a}"
         if not isinstance(link, h5py.HardLink):
-            raise ValueError(
-                f"{name[:80]!a} is a link ({type(link).__name__}), possibly to another file"
-            )
-        found = root[name]
-        if isinstance(found, h5py.Dataset):
-            left -= found.nbytes
-            if found.external or found.is_virtual:
-                raise ValueError(f"{name[:80]!a} has its data in other files or arrays")
-            if found.dtype.kind not in "fiub":
-                raise ValueError(f"{name[:80]!a} holds {found.dtype}, not numbers")
-            if left < 0:
-                raise ValueError(
-                    f"{name[:80]!a} declares {found.nbytes} bytes, more than the file can hold"
-                )
+            return f"{entry} is a link ({type(link).__name__}), possibly to another file"
+        dataset = root[name]
+        if not isinstance(dataset, h5py.Dataset):
+            return None
+        left -= dataset.nbytes
+        if dataset.external or dataset.is_virtual:
+            return f"{entry} has its data in other files or arrays"
+        if dataset.dtype.kind not in "fiub":
+            return f"{entry} holds {dataset.dtype}, not numbers"
+        if left < 0:
+            return f"{entry} declares {dataset.nbytes} bytes, more than the file can hold"
+        return None
 
     with h5py.File(file, "r", locking=False) as root:
-        root.visititems_links(look)
+        if reason := root.visititems_links(refusal):
+            raise ValueError(reason)
         if not len(root) == stated["total_episodes"] > 0:
             raise ValueError(
                 f"it holds {len(root)} groups, but states {stated['total_episodes']!r:.80} episodes"
