@@ -92,7 +92,7 @@ class Log:
             self.notes.append(f"dt is {dt:g} s, the median step of '{self.time}'")
         dt = require_number("dt", dt, 0, above=True)
         follows = within & (np.abs(steps - dt) <= 0.5 * dt)
-        if follows.sum() < 0.5 * within.sum():
+        if follows.sum() < 0.7 * within.sum():
             raise TrajectoryError(
                 f"only {follows.sum()} of {within.sum()} steps of '{self.time}' are near dt = "
                 f"{dt:g} s, their median is {median:g}; expected even steps in seconds: convert "
@@ -177,7 +177,8 @@ def names_of(field_: str, names: Sequence[str]) -> tuple[str, ...]:
 
 def _column(table: Table, name: str) -> np.ndarray:
     """A column of any table as an array (M,) of whatever it holds."""
-    names = getattr(table, "column_names", getattr(table, "columns", table))
+    names = getattr(table, "column_names", getattr(table, "columns", None))
+    names = table if isinstance(table, Mapping) else names
     known = [str(n) for n in names] if isinstance(names, Iterable) else []
     if known and name not in known:
         near = get_close_matches(name, known, 1)
@@ -218,8 +219,9 @@ def _number(name: str, row: int, value: object) -> float:
             raise ValueError
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
+        shown = str(value) if isinstance(value, str) else value
         raise TrajectoryError(
-            f"column '{name}' holds {value!r:.40} in row {row} of the table; expected a number"
+            f"column '{name}' holds {shown!r:.40} in row {row} of the table; expected a number"
         ) from None
 
 

@@ -348,6 +348,20 @@ class Trajectories(FromLogs):
             )
         return self.tensors().window(episodes, starts, past_len, future_len)
 
+    def past(self, episode: int, past_len: int) -> Segment:
+        """The end of an episode, for a plan that goes on from there.
+
+        Args:
+            episode: its number.
+            past_len: L, as many steps as the model looks back: ``model.past_len``.
+
+        Returns:
+            States (1, L, dx) and actions (1, L, du), at rest before the episode.
+        """
+        steps = len(self.episode(episode)[1])
+        at, end = torch.tensor([episode % len(self)]), torch.tensor([steps])
+        return self.windows(at, end, require_count("past_len", past_len), 0).past
+
     def window_counts(self, future_len: int, what: str) -> np.ndarray:
         """Windows of ``future_len`` steps in each episode (N,); a warning counts those left out."""
         return window_counts(
