@@ -16,6 +16,7 @@ from tsmlib.pretrained import ROOT
 NOTEBOOKS = ROOT / "notebooks"
 TOOLS = ("papermill", "ipykernel", "pandas", "ipywidgets", "imageio_ffmpeg")  # extra "study"
 Value = bool | int | float | str
+_SPELLED = {"true": True, "false": False}
 
 
 class RunError(RuntimeError):
@@ -62,7 +63,7 @@ def typed(notebook: Path, texts: Mapping[str, str]) -> dict[str, Value]:
         The values, each of the type of its default.
 
     Raises:
-        RunError: a parameter that the notebook does not have, or text of another type.
+        ValueError: a parameter that the notebook does not have, or text of another type.
     """
     known = defaults(notebook)
     values: dict[str, Value] = {}
@@ -70,14 +71,14 @@ def typed(notebook: Path, texts: Mapping[str, str]) -> dict[str, Value]:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"; the closest is {close[0]}" if close else ""
-            raise RunError(
+            raise ValueError(
                 f"{notebook.name} has no parameter {name!r:.80}{hint}; it has {', '.join(known)}."
             )
         kind = type(known[name])
         try:
-            values[name] = text.lower() == "true" if kind is bool else kind(text)
-        except ValueError:
-            raise RunError(
+            values[name] = _SPELLED[text.lower()] if kind is bool else kind(text)
+        except (ValueError, KeyError):
+            raise ValueError(
                 f"{name} is {text!r:.80}, expected {kind.__name__} as in {known[name]!r}."
             ) from None
     return values

@@ -44,7 +44,7 @@ def score_rows(run: Run, name: str, word: str) -> list[Row]:
     parts, _ = scored(run, name, word, horizon=10, starts=list(STARTS))
     spec = EnvSpec.parse(env_id(name))
     about = place(env_id(name)) | {"model": word, "planner": "none"}
-    rows = _rows(about | {"execution": OPEN}, whole, None) + _rows(
+    rows = summarised(about | {"execution": OPEN}, whole) + summarised(
         about | {"execution": SEGMENTS}, parts, None, steps=False
     )
     if spec.has_block and not spec.noise:
@@ -52,9 +52,9 @@ def score_rows(run: Run, name: str, word: str) -> list[Row]:
         since = cut(after_first(touching), (10,), whole.pit.shape[1])
         within = cut(touching, STARTS, parts.pit.shape[1]).any(1, keepdim=True)
         ever = within.expand(-1, parts.pit.shape[1])
-        rows += _rows(about | {"execution": OPEN, "subset": "contact"}, whole, since)
+        rows += summarised(about | {"execution": OPEN, "subset": "contact"}, whole, since)
         touched = about | {"execution": SEGMENTS, "subset": "contact"}
-        rows += _rows(touched, parts, ever, steps=False)
+        rows += summarised(touched, parts, ever, steps=False)
     likelihood = whole.values["ll_own"].mean(1).sort().values
     kept = likelihood[int(0.05 * len(likelihood)) :]
     outside = whole.outside.float()
@@ -100,7 +100,9 @@ class WithoutPastActions:
         return predict_segment(self.model, blind, actions, generator=generator)
 
 
-def _rows(about: Row, found: Scores, where: Tensor | None, *, steps: bool = True) -> list[Row]:
+def summarised(
+    about: Row, found: Scores, where: Tensor | None = None, *, steps: bool = True
+) -> list[Row]:
     """Means over all predicted steps, or those of ``where`` (N, T); and at HORIZONS."""
     chosen = torch.ones(found.pit.shape[:2], dtype=torch.bool) if where is None else where
     if not chosen.any():

@@ -131,4 +131,4 @@ def markdown(table: pd.DataFrame, form: str = "{:.3g}") -> str:
 
 
 def _empty(value: object) -> bool:
-    return value == "" or value is pd.NA or value != value
+    return value is pd.NA or value == "" or value != value

@@ -23,6 +23,7 @@ from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.storage import artifacts
 
+KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 PARAMETERS = 'scale = "laptop"\nseed = 0\nspeed = 1.5\nfast = False'
 
 
@@ -35,9 +36,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def notebook(path: Path, *cells: str) -> Path:
     """A notebook with a cell of parameters and these cells."""
-    made = nbformat.v4.new_notebook(
-        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}}
-    )
+    made = nbformat.v4.new_notebook(metadata={"kernelspec": KERNEL})
     first = nbformat.v4.new_code_cell(PARAMETERS, metadata={"tags": ["parameters"]})
     made.cells = [first, *map(nbformat.v4.new_code_cell, cells)]
     nbformat.write(made, path)

@@ -20,6 +20,7 @@ from tsmlib.pretrained import INSTALLED, ROOT
 
 SOURCES = ("tsmlib", "reproduction", "data", "notebooks", "pyproject.toml", "setup.py")
 SOURCES += ("MANIFEST.in", "README.md", "LICENSE")
+KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 LARGEST = 25e6  # bytes
 PLAIN = {k: v for k, v in os.environ.items() if not k.startswith(("TSM_", "PYTHON"))}
 
@@ -117,7 +118,7 @@ def test_the_command_copies_the_notebooks_out_and_runs_one_here(
     assert run(tmp_path, command, "notebooks", "mine").returncode == 0
     copies = {path.name: path.read_bytes() for path in (tmp_path / "mine").iterdir()}
     assert copies == {path.name: path.read_bytes() for path in (ROOT / "notebooks").glob("*.ipynb")}
-    own = nbformat.v4.new_notebook(metadata={"kernelspec": {"name": "python3", "display_name": ""}})
+    own = nbformat.v4.new_notebook(metadata={"kernelspec": KERNEL})
     first = nbformat.v4.new_code_cell('scale = "laptop"', metadata={"tags": ["parameters"]})
     own.cells = [first, nbformat.v4.new_code_cell("open('made.txt', 'w').write(scale)")]
     nbformat.write(own, tmp_path / "01_own.ipynb")

@@ -1,11 +1,15 @@
 """PETS by mbrl-lib 0.2.0, on the same data and under the same scores.
 
-mbrl-lib's ensemble (``GaussianMLP``: 5 members of 4 layers of 200 SiLU units), wrapper (``OneDTransitionRewardModel``)
-and trainer (``ModelTrainer``), with the settings of its own examples, trained for a budget of CPU seconds. What
-it is fed is what the models here are fed: cosine and sine of the angles, standardised velocities and positions, and the
-action; its target is the increment of the state in units of its standard deviation. README.md tells how to install it.
+mbrl-lib's ensemble (``GaussianMLP``: 5 members of 4 layers of 200 SiLU units), wrapper
+(``OneDTransitionRewardModel``)
+and trainer (``ModelTrainer``), with the settings of its own examples, trained for a budget of CPU
+seconds. What
+it is fed is what the models here are fed: cosine and sine of the angles, standardised velocities
+and positions, and the
+action; its target is the increment of the state in units of its standard deviation. README.md tells
+how to install it.
 
-    python benchmarks/peers/pets.py --env tsm/ReacherPush-v1 --form mse --seconds 2320
+    python benchmarks/peers/pets.py --arm ReacherPush --form mse --seconds 2320
 """
 
 from __future__ import annotations
@@ -16,23 +20,21 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
-from reproduction.results import prediction as prediction_results
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from reproduction import parameters, runs
-from tsmlib import study
+from reproduction import tables
+from reproduction.episodes import load_data
+from reproduction.runs import Run, env_id
+from reproduction.scores import OPEN, SEGMENTS, STARTS, summarised
 from tsmlib.contrib.mbrl_lib import transition_batch
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
-from tsmlib.envs.spec import ENV_IDS, EnvSpec
-from tsmlib.evaluation import prediction
+from tsmlib.envs.symmetry import symmetric
+from tsmlib.evaluation.prediction import score
 from tsmlib.models.features import Features
 from tsmlib.trajectory import Trajectories
 
@@ -43,7 +45,6 @@ BATCH, LEARNING_RATE, WEIGHT_DECAY = (
     1e-3,
     5e-5,
 )  # mbrl-lib's examples/conf/overrides/mbpo_pusher.yaml
-UNITS = {"train_seconds": "s", "transitions_per_second": "1/s"}
 PART = 250  # batches between two looks at the validation data, as often as the models here look
 
 Network = Callable[
@@ -51,11 +52,12 @@ Network = Callable[
 ]  # (M, R, features + du) -> mean, log variance (M, R, dx)
 
 
-# What goes in and what comes out -------------------------------------------------------------------------------------
+# What goes in and what comes out ------------------------------------------------------------------
 
 
 def unit_of(features: Features) -> Tensor:
-    """(dx,) what one unit of each state dimension is to mbrl-lib: its increments have unit variance.
+    """(dx,) what one unit of each state dimension is to mbrl-lib: its increments have unit
+    variance.
 
     A dimension that never changes keeps its own unit; its increment, and so its target, is zero.
     """
@@ -70,9 +72,11 @@ def transitions(data: Trajectories, unit: Tensor) -> tuple[np.ndarray, np.ndarra
 
 
 class Peer(OneStepEnsemble):
-    """An ensemble of one-step networks fed by ``Features``, by trajectory sampling with a fixed member (TS-inf).
+    """An ensemble of one-step networks fed by ``Features``, by trajectory sampling with a fixed
+    member (TS-inf).
 
-    network: mean and log variance of the increments in ``unit_of(features)``, log variance None where none is stated.
+    network: mean and log variance of the increments in ``unit_of(features)``, log variance None
+    where none is stated.
     """
 
     def __init__(self, network: Network, features: Features, *, members: int = MEMBERS) -> None:
@@ -85,13 +89,15 @@ class Peer(OneStepEnsemble):
 
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(M, R, dx), (M, R, du) -> mean and standard deviation of the increments (M, R, dx), physical units."""
+        """(M, R, dx), (M, R, du) -> mean and standard deviation of the increments (M, R, dx),
+        physical units.
+        """
         mean, log_variance = self.network(torch.cat([self.features(x), u], dim=-1))
         scale = self.unit * self.features.moving  # what never changes stays exactly as it is
         return scale * mean, None if log_variance is None else scale * (0.5 * log_variance).exp()
 
 
-# Theirs --------------------------------------------------------------------------------------------------------------
+# Theirs -------------------------------------------------------------------------------------------
 
 
 def wrapped(form: str, features: Features, action_dim: int) -> Any:
@@ -121,13 +127,17 @@ def wrapped(form: str, features: Features, action_dim: int) -> Any:
 
 def batch_of(data: Trajectories, features: Features) -> Any:
     """All transitions of ``data``, in units of their increments, as mbrl-lib takes them."""
-    return transition_batch(replace(data, states=data.states / unit_of(features).numpy()))
+    scaled = data.states / unit_of(features).numpy()
+    names = (data.env, data.dt, data.names, data.units, data.angles)
+    return transition_batch(Trajectories(scaled, data.actions, *names))
 
 
 def initialise(
     form: str, features: Features, data: Trajectories, *, seed: int, batch: int = BATCH
 ) -> tuple[Any, Any]:
-    """mbrl-lib's model with new weights and the statistics of ``data``, and batches of a bootstrap for every member."""
+    """mbrl-lib's model with new weights and the statistics of ``data``, and batches of a bootstrap
+    for every member.
+    """
     from mbrl.util.replay_buffer import BootstrapIterator
 
     model, whole = wrapped(form, features, data.actions.shape[2]), batch_of(data, features)
@@ -143,14 +153,18 @@ def initialise(
 
 
 def network_of(model: Any) -> Network:
-    """All members of mbrl-lib's model as one function, its own normalisation of the inputs included."""
+    """All members of mbrl-lib's model as one function, its own normalisation of the inputs
+    included.
+    """
     return lambda inputs: model.model(
         model.input_normalizer.normalize(inputs), use_propagation=False
     )
 
 
 class Parts:
-    """Loops over ``batches`` that are ``size`` long and go on where the last one ended, pass after pass."""
+    """Loops over ``batches`` that are ``size`` long and go on where the last one ended, pass after
+    pass.
+    """
 
     def __init__(self, batches: Iterable[Any], size: int) -> None:
         self.stream, self.size, self.drawn = (
@@ -178,11 +192,14 @@ def train(
     seconds: float,
     seed: int,
 ) -> tuple[Any, dict[str, float]]:
-    """mbrl-lib's model with its best weights on ``held_out`` after ``seconds``, and what training took.
+    """mbrl-lib's model with its best weights on ``held_out`` after ``seconds``, and what training
+    took.
 
-    seconds: of CPU time, validation included, so that whatever else a machine does costs this peer nothing.
+    seconds: of CPU time, validation included, so that whatever else a machine does costs this peer
+    nothing.
 
-    As in its examples, every member has a bootstrap of the transitions, and weights count as better where the squared
+    As in its examples, every member has a bootstrap of the transitions, and weights count as better
+    where the squared
     error of any member on the validation data falls by 1 %.
     """
     from mbrl.models import ModelTrainer
@@ -192,9 +209,7 @@ def train(
     model, bootstraps = initialise(form, features, data, seed=seed)
     parts = Parts(bootstraps, min(PART, len(bootstraps)))
     best: dict[str, Any] = {"score": None, "weights": None}
-    bar = tqdm(
-        total=round(seconds), desc=f"{EnvSpec.parse(data.env).name} {MODELS[form]}", unit="s"
-    )
+    bar = tqdm(total=round(seconds), desc=f"{data.env} {MODELS[form]}", unit="s")
     began = time.process_time()
 
     def after_part(
@@ -229,7 +244,9 @@ def train(
 
 
 def check(model: Any, peer: Peer, data: Trajectories) -> None:
-    """End with an error where ``peer`` does not do what mbrl-lib's own ``sample`` does, on one step of ``data``."""
+    """End with an error where ``peer`` does not do what mbrl-lib's own ``sample`` does, on one step
+    of ``data``.
+    """
     before, actions, _ = transitions(data, peer.unit)
     rows = torch.randperm(len(actions))[: 20 * MEMBERS]
     x, u = torch.from_numpy(before)[rows], torch.from_numpy(actions)[rows]
@@ -245,91 +262,35 @@ def check(model: Any, peer: Peer, data: Trajectories) -> None:
         )
 
 
-# Scores --------------------------------------------------------------------------------------------------------------
-
-
-def table(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write ``rows`` to ``path``, in place of those of the same model, environment and seed that it holds."""
-    key = ("env", "model", "seed")
-    new = {tuple(row[name] for name in key) for row in rows}
-    kept = pd.read_csv(path).to_dict("records") if path.exists() else []
-    others = [row for row in kept if tuple(row[name] for name in key) not in new]
-    pd.DataFrame([*others, *rows]).to_csv(path, index=False)
-
-
-def run_of(folder: Path) -> runs.Run:
-    """The run whose folder this is, ``.../<scale>/seed<k>``."""
-    scale, seed = folder.parent.name, folder.name.removeprefix("seed")
-    if scale not in parameters.SCALES or not seed.isdecimal():
-        raise SystemExit(
-            f"--run-dir is {folder}, expected the folder of a run, such as runs/paper/seed0"
-        )
-    return runs.Run("peers_pets", scale, int(seed), folder)
+# Scores -----------------------------------------------------------------------------------------
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--env", choices=ENV_IDS, default="tsm/ReacherPush-v1", help="default tsm/ReacherPush-v1"
-    )
-    parser.add_argument(
-        "--form", choices=MODELS, default="gaussian", help="what is trained (default gaussian)"
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=300, help="CPU seconds of training (default 300)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default 0)")
-    parser.add_argument(
-        "--samples", type=int, default=32, help="per trajectory (default 32, as 03_predict)"
-    )
-    parser.add_argument(
-        "--episodes", type=int, default=1000, help="of the test split (default 1000)"
-    )
-    parser.add_argument(
-        "--run-dir", type=Path, default=Path("runs/paper/seed0"), help="default runs/paper/seed0"
-    )
-    parser.add_argument(
-        "--out", type=Path, help="table to write (default: metrics/peers_pets.csv of the run)"
-    )
+    parser.add_argument("--arm", default="ReacherPush", help="default ReacherPush")
+    parser.add_argument("--form", choices=MODELS, default="gaussian", help="what is trained")
+    parser.add_argument("--seconds", type=float, default=300, help="CPU seconds of training")
+    parser.add_argument("--seed", type=int, default=0, help="of data, weights and batches")
+    parser.add_argument("--scale", default="paper", help="of the run that has the data")
     arguments = parser.parse_args()
-    run = run_of(arguments.run_dir.resolve())
-    data, validation, test = (study.dataset(run, arguments.env, split) for split in study.SPLITS)
-    test, word = test.take(slice(arguments.episodes)), MODELS[arguments.form]
-    features = Features(data.states.shape[2], data.angles).fit(torch.from_numpy(data.states))
-    copies, _ = study.training_data(run, arguments.env, "ensemble")
-    model, took = train(
-        arguments.form, features, copies, validation, seconds=arguments.seconds, seed=arguments.seed
-    )
+    run, arm, word = Run(arguments.scale, arguments.seed), arguments.arm, MODELS[arguments.form]
+    data, held_out, test = (load_data(run, arm, split) for split in ("train", "validation", "test"))
+    features = Features(data.states.shape[2], data.angles).fit(data)
+    how = {"seconds": arguments.seconds, "seed": arguments.seed}
+    model, took = train(arguments.form, features, symmetric(data), held_out, **how)
     peer = Peer(network_of(model), features)
     check(model, peer, test)
-    print(
-        f"{arguments.env}, {word}: "
-        + ", ".join(f"{name} {value:,.4g}" for name, value in took.items())
-    )
-    began = time.perf_counter()
-    splits, options = (test, validation), dict(samples=arguments.samples, seed=arguments.seed)
-    open_loop = prediction.score(peer, features, *splits, progress=f"{word}, open loop", **options)
-    options |= dict(starts=prediction_results.SEGMENTS, horizon=10)
-    segments = prediction.score(peer, features, *splits, progress=f"{word}, segments", **options)
-    print(
-        f"{arguments.samples} samples of {len(test)} trajectories scored in {time.perf_counter() - began:.0f} s"
-    )
-    for metric, curve in open_loop.against_horizon().items():
-        print(f"    {metric:18} at 10 steps {curve[9]:9.3f}   at 80 steps {curve[79]:9.3f}")
-    common = dict(seed=arguments.seed, scale=run.scale)
-    rows = prediction_results.rows(arguments.env, word, open_loop, segments, test, **common)
-    about = {
-        name: rows[0][name] for name in ("env", "sim", "model", "planner", "execution")
-    } | common
-    rows += [
-        dict(about, metric=name, value=value, unit=UNITS.get(name, ""))
-        for name, value in took.items()
-    ]
-    path = arguments.out or run.metrics / "peers_pets.csv"
-    table(path, rows)
-    print(path)
+    about = tables.place(env_id(arm)) | {"model": word, "planner": "none"}
+    about |= {"seed": run.seed, "scale": run.scale}
+    options = {"samples": 32, "seed": run.seed}
+    rows = [about | {"metric": name, "value": value} for name, value in took.items()]
+    whole = score(peer, features, test, held_out, horizon=90, **options)
+    rows += summarised(about | {"execution": OPEN}, whole)
+    parts = score(peer, features, test, held_out, horizon=10, starts=list(STARTS), **options)
+    rows += summarised(about | {"execution": SEGMENTS}, parts, steps=False)
+    print(tables.write(run.folder / "peers" / f"{arm}-{word}.csv", rows))
 
 
 if __name__ == "__main__":
