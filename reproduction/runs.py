@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -45,7 +46,7 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where it writes."""
-        return home() / "runs" / self.scale / f"seed{self.seed}"
+        return root() / self.scale / f"seed{self.seed}"
 
     def pick(self, smoke: T, laptop: T, paper: T) -> T:
         """The value for its scale."""
@@ -75,6 +76,11 @@ class Run:
 def home() -> Path:
     """The folder that ``runs`` lies in: the repository; of an installed package, where you are."""
     return Path.cwd() if INSTALLED else ROOT
+
+
+def root() -> Path:
+    """The folder of all runs: ``runs``, or what the variable TSM_RUN_DIR names."""
+    return Path(os.environ.get("TSM_RUN_DIR") or home() / "runs").absolute()
 
 
 def env_id(name: str) -> str:
