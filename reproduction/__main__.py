@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from reproduction import explorer, runner
 from reproduction.runs import SCALES, Run, home
@@ -65,6 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     pool.set_defaults(do=_pool)
     claims = commands.add_parser("claims", help="judge the claims, write docs/claims.md")
     claims.set_defaults(do=_claims)
+    pages = commands.add_parser("pages", help="fill marked tables of pages, draw figures again")
+    pages.add_argument("pages", nargs="*", type=Path, help="default: docs/results.md")
+    pages.add_argument("--figures", type=Path, help="a folder for the figures of the tables")
+    pages.set_defaults(do=_pages)
     explore = commands.add_parser("explore", help="serve the explorer, a page, on 127.0.0.1")
     explore.add_argument("--port", type=int, default=explorer.PORT, help="0 is any that is free")
     explore.add_argument("--open", action="store_true", help="open it in a browser")
@@ -108,6 +113,17 @@ def _claims(arguments: argparse.Namespace) -> int:
     from reproduction.claims import ledger
 
     print(*ledger.write(home() / "docs"), sep="\n")
+    return 0
+
+
+def _pages(arguments: argparse.Namespace) -> int:
+    from reproduction import figures, pages
+    from tsmlib import plots
+
+    for page in arguments.pages or [home() / "docs" / "results.md"]:
+        print(pages.fill(page))
+    for name, draw in figures.FIGURES.items() if arguments.figures else ():
+        print(plots.save(draw(), arguments.figures / f"{name}.png"))
     return 0
 
 
