@@ -28,17 +28,11 @@ def stepped(
 @pytest.mark.skipif(not hasattr(torch.optim, "Muon"), reason="this torch has no Muon")
 @pytest.mark.parametrize("shape", [(24, 6), (6, 24), (10, 10)])
 def test_it_is_torchs_but_for_bfloat16(shape: tuple[int, int]) -> None:
-    ours, theirs, free = (nn.Parameter(drawn(*shape)) for _ in range(3))
-    gradients, settings = (
-        [drawn(*shape, seed=1 + i) for i in range(5)],
-        dict(lr=0.02, weight_decay=0.1),
-    )
-    found = stepped(Muon([ours], **settings), ours, gradients)
-    expected = stepped(torch.optim.Muon([theirs], **settings), theirs, gradients)
-    moved = (expected - drawn(*shape)).norm()
-    assert (found - expected).norm() < 0.02 * moved
-    undecayed = stepped(Muon([free], lr=0.02), free, gradients)
-    assert (undecayed - expected).norm() > 0.05 * moved
+    ours, theirs = (nn.Parameter(drawn(*shape)) for _ in range(2))
+    gradients = [drawn(*shape, seed=1 + i) for i in range(5)]
+    found = stepped(Muon([ours], lr=0.02), ours, gradients)
+    expected = stepped(torch.optim.Muon([theirs], lr=0.02, weight_decay=0.0), theirs, gradients)
+    assert (found - expected).norm() < 0.02 * (expected - drawn(*shape)).norm()
 
 
 def test_an_update_has_singular_values_near_one_whatever_the_gradient() -> None:
@@ -55,12 +49,10 @@ def test_a_stack_is_its_matrices_one_by_one(inputs: int, outputs: int) -> None:
     stack = nn.Parameter(drawn(3, inputs, outputs))
     singles = [nn.Parameter(matrix.mT.contiguous().clone()) for matrix in stack.detach()]
     gradients = [drawn(3, inputs, outputs, seed=1 + i) for i in range(4)]
-    settings = dict(lr=0.02, weight_decay=0.1)
-    found = stepped(Muon([stack], **settings), stack, gradients)
+    found = stepped(Muon([stack], lr=0.02), stack, gradients)
     for m, single in enumerate(singles):
-        alone = stepped(
-            Muon([single], **settings), single, [gradient[m].mT for gradient in gradients]
-        )
+        turned = [gradient[m].mT for gradient in gradients]
+        alone = stepped(Muon([single], lr=0.02), single, turned)
         torch.testing.assert_close(found[m], alone.mT, rtol=1e-4, atol=1e-5)
 
 

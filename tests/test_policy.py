@@ -15,14 +15,15 @@ import torch
 from torch import Tensor
 from untrained import in_units
 
-import tsmlib.envs  # noqa: F401 - registers the environments
+import tsmlib.envs
+from reproduction import policies as study_policies
+from reproduction import runs
 from tsmlib import study
 from tsmlib.collection import collect
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import rollout, stepper
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
-from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.policies.learning import (
@@ -38,8 +39,6 @@ from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, SeparateNoise, standard_normal
 from tsmlib.storage import artifacts, files
-from reproduction import policies as study_policies
-from reproduction import runs
 from tsmlib.training.callbacks import CsvCallback, Progress
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
@@ -196,27 +195,8 @@ def test_noise_of_each_copy_is_its_own() -> None:
         assert torch.equal(rows, torch.randn(3, 2, generator=torch.Generator().manual_seed(seed)))
 
 
-@pytest.mark.parametrize("positions", [1, 3, 10])
-@pytest.mark.parametrize("dilations", [(1, 2, 4, 8, 4), (2, 1), (3,)])
-@pytest.mark.parametrize("state_skip", [0, 8])
-def test_the_last_position_alone_is_the_last_of_all(
-    positions: int, dilations: tuple[int, ...], state_skip: int
-) -> None:
-    torch.manual_seed(0)
-    decoder = CausalDecoder(
-        3, 2, 4, channels=8, dilations=dilations, state_skip=state_skip
-    ).double()
-    inputs, z = normal(5, positions, 3), normal(5, 4, seed=1)
-    torch.testing.assert_close(decoder.last(inputs, z), decoder(inputs, z)[:, -1])
 
 
-def test_a_decoder_that_was_asked_in_inference_mode_still_learns() -> None:
-    decoder = CausalDecoder(3, 2, 4, channels=8, dilations=(1, 3, 1))
-    inputs, z = normal(5, 7, 3).float(), normal(5, 4, seed=1).float()
-    with torch.inference_mode():
-        decoder.last(inputs, z)
-    decoder.last(inputs, z).sum().backward()
-    assert decoder.inlet.weight.grad is not None
 
 
 def test_the_first_action_of_a_decoded_segment_needs_no_other() -> None:

@@ -297,35 +297,7 @@ def test_trainings_that_follow_each_other_share_one_schedule() -> None:
     assert warm[600] == pytest.approx(second[0])
 
 
-class Matrix(nn.Module):
-    """One matrix, one bias: 10 times the sum of its weights."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight, self.bias = nn.Parameter(torch.ones(2, 2)), nn.Parameter(torch.ones(2))
-
-    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        return 0 * (self.weight.sum() + self.bias.sum())
-
-
-@pytest.mark.parametrize("muon", [0.0, 0.02])
-def test_weight_decay_is_of_matrices_alone_and_decoupled(muon: float) -> None:
-    """Gradients are zero: what remains is (1 - lr decay) at every step."""
-    model, plan = Matrix(), dict(steps=4, validate_every=4, warmup=0, lr=1e-2)
-    at_the_end = {}
-
-    def loss(window: Window, generator: torch.Generator) -> Tensor:
-        at_the_end.update(weights(model))  # the best weights are those of the first validation
-        return model.loss(window, generator)
-
-    train(model, loss, muon=muon, weight_decay=0.5, **plan)
-    rates = [schedule(step, 4, 1e-2, 1e-5, 0) * (muon / 1e-2 if muon else 1) for step in range(4)]
-    expected = math.prod(1 - 0.5 * rate for rate in rates)
-    torch.testing.assert_close(at_the_end["weight"], torch.full((2, 2), expected))
-    assert torch.equal(at_the_end["bias"], torch.ones(2))
-
-
-def test_without_muon_and_decay_it_is_adam() -> None:
+def test_without_muon_it_is_adam() -> None:
     model, plain, noise = new_tsm(), new_tsm(), torch.Generator()
     train(model, steps=5, validate_every=5, seed=2)
     optimizer = torch.optim.Adam(plain.parameters(), lr=1e-3, fused=True)
@@ -341,7 +313,7 @@ def test_without_muon_and_decay_it_is_adam() -> None:
 
 
 def test_muon_lowers_the_loss_and_leaves_adam_what_is_not_its_own() -> None:
-    made = optimizers(new_tsm(), TrainingOptions(**SIZES, muon=0.02, weight_decay=0.1))
+    made = optimizers(new_tsm(), TrainingOptions(**SIZES, muon=0.02))
     held = {
         name: [p for group in optimizer.param_groups for p in group["params"]]
         for name, optimizer in made.items()
@@ -349,7 +321,7 @@ def test_muon_lowers_the_loss_and_leaves_adam_what_is_not_its_own() -> None:
     assert held.keys() == {"adam", "muon"}
     assert len(held["adam"]) + len(held["muon"]) == len(list(new_tsm().parameters()))
     assert min(p.ndim for p in held["muon"]) == 2
-    curve = train(new_tsm(), steps=60, lr=1e-2, muon=0.1, weight_decay=0.01, validate_every=20)
+    curve = train(new_tsm(), steps=60, lr=1e-2, muon=0.1, validate_every=20)
     assert curve.validation[-1] < 0.7 * curve.validation[0]
 
 
@@ -374,9 +346,7 @@ GENERATIONS = {
 
 @pytest.mark.parametrize("new", [new_tsm, new_prior, new_rtsm])
 @pytest.mark.parametrize("at", GENERATIONS)
-@pytest.mark.parametrize(
-    "settings", [{}, {"muon": 0.02, "weight_decay": 0.1}, {"span": (0.6, 1.0)}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"muon": 0.02}, {"span": (0.6, 1.0)}], ids=str)
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     tmp_path: Path, new: Callable[..., Any], settings: dict[str, Any], at: int
 ) -> None:

@@ -166,14 +166,13 @@ CALLS = [
             lr_final=1e-5,
             warmup=1,
             muon=0.01,
-            weight_decay=0.1,
             span=(0.0, 1.0),
             clip=1.0,
             validate_every=2,
             patience=1,
         ),
         dict.fromkeys(("past_len", "future_len"), OPTIONAL)
-        | dict.fromkeys(("lr_final", "muon", "weight_decay"), NOT_NEGATIVE)
+        | dict.fromkeys(("lr_final", "muon"), NOT_NEGATIVE)
         | {"lr": POSITIVE, "clip": POSITIVE | {"infinite"}}
         | dict.fromkeys(("warmup", "patience"), COUNT_OR_ZERO | {"huge"})
         | dict.fromkeys(("steps", "batch_size", "validate_every"), frozenset({"huge"}))

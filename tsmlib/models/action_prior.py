@@ -128,7 +128,7 @@ class ActionPrior(Configured):
 
     def first(self, past_actions: Tensor, z: Tensor) -> Tensor:
         """The first action (B, du) of ``decode`` alone, by which a segment policy acts."""
-        step = self.decoder.last(past_actions / self.std, z)
+        step = self.decoder(past_actions / self.std, z, 1)[:, 0]
         return (past_actions[:, -1] + self.std * step).clamp(-1, 1)
 
     def plan(self, past_actions: Tensor, z: Tensor) -> Tensor:

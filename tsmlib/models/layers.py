@@ -4,7 +4,7 @@ Letters in shapes: B batch, M models side by side, P positions in time, C channe
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache, reduce
+from functools import reduce
 from itertools import pairwise
 
 import torch
@@ -42,27 +42,6 @@ def whole_segments(future: Tensor, segment_len: int) -> tuple[Tensor, ...]:
             f"segment_len={steps}"
         )
     return future.split(segment_len, dim=1)
-
-
-class BatchedLinear(nn.Module):
-    """M linear layers side by side, (M, B, in) -> (M, B, out), drawn as torch draws one."""
-
-    def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
-        super().__init__()
-        bound = inputs**-0.5 if inputs else 0.0  # no input: the target of a task without targets
-
-        def drawn(*shape: int) -> nn.Parameter:
-            return nn.Parameter(
-                torch.stack(
-                    [torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]
-                )
-            )
-
-        self.weight = drawn(inputs, outputs)  # (M, in, out)
-        self.bias = drawn(1, outputs)  # (M, 1, out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
 
 
 class GatedLayer(nn.Module):
@@ -170,18 +149,6 @@ class CausalDecoder(nn.Module):
         _, skips = self._parallel(inputs, z, inputs.shape[1] - first)
         return self._out(reduce(torch.add, skips), inputs[:, first:])
 
-    def last(self, inputs: Tensor, z: Tensor) -> Tensor:
-        """``forward`` at the last position alone, without what that does not see: (B, out)."""
-        s, skips = self.inlet(inputs), []
-        codes = self.codes(z)[:, None].chunk(len(self.layers), dim=-1)
-        taken = _owed_to_last(self.dilations, inputs.shape[1], s.device)
-        for layer, code, index in zip(self.layers, codes, taken, strict=True):
-            s = F.pad(s, (0, 0, 0, 1))  # zeros stand for what lies before the first position
-            earlier, now = s.index_select(1, index).chunk(2, dim=1)
-            s, skip = layer(earlier, now, code)
-            skips.append(skip[:, 0])
-        return self._out(reduce(torch.add, skips), inputs[:, -1])
-
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
         layer_inputs, _ = self._parallel(inputs, z, 0)
@@ -220,28 +187,6 @@ class CausalDecoder(nn.Module):
             layer_inputs.append(s)
             skips.append(skip[:, now - n :])
         return layer_inputs, skips
-
-
-@cache
-def _owed_to_last(
-    dilations: tuple[int, ...], n_positions: int, device: torch.device
-) -> tuple[Tensor, ...]:
-    """For each layer, what the last position sees of its inputs: indices at t - d, then at t.
-
-    ``owed``: the positions, counted back from the last, that are needed, from the last layer down.
-    """
-    owed = [[0]]
-    for dilation in reversed(dilations[1:]):
-        seen = {p for now in owed[0] for p in (now, now + dilation) if p < n_positions}
-        owed.insert(0, sorted(seen))
-    taken, held = list[Tensor](), list(reversed(range(n_positions)))
-    for dilation, positions in zip(dilations, owed, strict=True):
-        at = {p: i for i, p in enumerate(held)}
-        index = [at.get(p + dilation, len(held)) for p in positions] + [at[p] for p in positions]
-        with torch.inference_mode(False):  # they are kept for those who learn, too
-            taken.append(torch.tensor(index).to(device))
-        held = positions
-    return tuple(taken)
 
 
 class Encoder(nn.Module):

@@ -29,7 +29,7 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import Model
 from tsmlib.models.config import Configured
 from tsmlib.models.features import Features
-from tsmlib.models.layers import BatchedLinear, GatedLayer, advance, on_device_of
+from tsmlib.models.layers import GatedLayer, advance, on_device_of
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Segment
 
@@ -117,6 +117,27 @@ class Policy(Configured):
     def by_copy(self, rows: Tensor) -> Tensor:
         """(R, k) -> (M, B, k)."""
         return rows.unflatten(0, (self.copies, -1))
+
+
+class BatchedLinear(nn.Module):
+    """M linear layers side by side, (M, B, in) -> (M, B, out), drawn as torch draws one."""
+
+    def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__()
+        bound = inputs**-0.5 if inputs else 0.0  # no input: the target of a task without targets
+
+        def drawn(*shape: int) -> nn.Parameter:
+            return nn.Parameter(
+                torch.stack(
+                    [torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]
+                )
+            )
+
+        self.weight = drawn(inputs, outputs)  # (M, in, out)
+        self.bias = drawn(1, outputs)  # (M, 1, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.baddbmm(self.bias, x, self.weight)
 
 
 class OneStepPolicy(Policy):

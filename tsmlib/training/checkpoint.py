@@ -147,7 +147,7 @@ class TrainingState(Generic[C]):
         moments: dict[str, dict[int, dict[str, Tensor]]] = {name: {} for name in self.optimizers}
         groups: dict[str, dict[str, Tensor]] = {name: {} for name in ("model", "best", *moments)}
         try:
-            if differs := _differences(header["identity"], self.identity):
+            if differs := differing(header["identity"], self.identity):
                 raise StoreError(
                     f"{path} is the checkpoint of another run: {'; '.join(differs)}. {anew}"
                 )
@@ -195,15 +195,16 @@ class TrainingState(Generic[C]):
         return {**provenance(), "device": name}
 
 
-def _differences(stated: Mapping[str, Json], expected: Mapping[str, Json]) -> list[str]:
+def differing(stated: Mapping[str, Json], expected: Mapping[str, Json]) -> list[str]:
     """Both sides of what tells the run of a file from this one; numbers up to rounding."""
-    return [
-        f"{name} is {stated.get(name)!r:.200} in the file, expected {expected.get(name)!r:.200}"
-        for name in [*expected, *(stated.keys() - expected.keys())]
-        if name not in stated
-        or name not in expected
-        or not _alike(stated[name], encode_nonfinite(expected[name]))
-    ]
+    differences = []
+    for name in dict.fromkeys([*expected, *stated]):
+        found, wanted = stated.get(name), encode_nonfinite(expected.get(name))
+        if isinstance(found, dict) and isinstance(wanted, dict):
+            differences += [f"{name}.{difference}" for difference in differing(found, wanted)]
+        elif not (name in stated and name in expected and _alike(found, wanted)):
+            differences.append(f"{name} is {found!r:.200} in the file, expected {wanted!r:.200}")
+    return differences
 
 
 def _alike(found: Json, expected: Json) -> bool:
@@ -212,8 +213,6 @@ def _alike(found: Json, expected: Json) -> bool:
         return len(found) == len(expected) and all(map(_alike, found, expected))
     if isinstance(found, float) and isinstance(expected, float):
         return math.isclose(found, expected, rel_tol=1e-5, abs_tol=1e-12)
-    if isinstance(found, dict) and isinstance(expected, Mapping):
-        return found.keys() == expected.keys() and all(_alike(found[k], expected[k]) for k in found)
     return found == expected
 
 

@@ -258,17 +258,14 @@ def keep_freed_memory() -> None:
 
 def optimizers(model: nn.Module, o: TrainingOptions) -> dict[str, torch.optim.Optimizer]:
     """Adam, and Muon where it has a learning rate and the model a matrix, by their names."""
-    known = {id(weight) for weight in (matrices(model) if o.muon or o.weight_decay else [])}
-    inside = [weight for weight in model.parameters() if id(weight) in known]
+    inside = matrices(model) if o.muon else []
+    known = {id(weight) for weight in inside}
     others = [weight for weight in model.parameters() if id(weight) not in known]
-    groups = [{"params": others, "weight_decay": 0.0}]
-    if not o.muon:
-        groups.append({"params": inside, "weight_decay": o.weight_decay})
     made: dict[str, torch.optim.Optimizer] = {}
-    if groups := [group for group in groups if group["params"]]:
-        made["adam"] = torch.optim.AdamW(groups, lr=o.lr, fused=True)
-    if o.muon and inside:
-        made["muon"] = Muon(inside, lr=o.muon, weight_decay=o.weight_decay)
+    if others:
+        made["adam"] = torch.optim.Adam(others, lr=o.lr, fused=True)
+    if inside:
+        made["muon"] = Muon(inside, lr=o.muon)
     return made
 
 

@@ -58,25 +58,16 @@ class Muon(torch.optim.Optimizer):
     """Muon for weights (out, in), as of ``nn.Linear``, and stacks (M, in, out).
 
         M <- momentum M + (1 - momentum) G
-        W <- (1 - lr weight_decay) W
-             - lr sqrt(max(1, out / in)) orthogonalised(momentum M + (1 - momentum) G)
+        W <- W - lr sqrt(max(1, out / in)) orthogonalised(momentum M + (1 - momentum) G)
 
     Args:
         params: the weights.
         lr: learning rate.
         momentum: of the gradient G.
-        weight_decay: per unit of the learning rate.
     """
 
-    def __init__(
-        self,
-        params: Iterable[Tensor],
-        lr: float,
-        *,
-        momentum: float = 0.95,
-        weight_decay: float = 0.0,
-    ) -> None:
-        super().__init__(params, dict(lr=lr, momentum=momentum, weight_decay=weight_decay))
+    def __init__(self, params: Iterable[Tensor], lr: float, *, momentum: float = 0.95) -> None:
+        super().__init__(params, dict(lr=lr, momentum=momentum))
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -92,6 +83,4 @@ class Muon(torch.optim.Optimizer):
                 mean = state["momentum_buffer"].lerp_(weight.grad, 1 - momentum)
                 update = orthogonalised(weight.grad.lerp(mean, momentum))
                 outputs, inputs = (weight if weight.ndim == 2 else weight.mT).shape[-2:]
-                if group["weight_decay"]:
-                    weight.mul_(1 - lr * group["weight_decay"])
                 weight.add_(update, alpha=-lr * max(1.0, outputs / inputs) ** 0.5)

@@ -26,7 +26,6 @@ class TrainingOptions:
         warmup: updates in which the learning rates rise from zero.
         muon: peak learning rate of Muon for the weight matrices, beside Adam for all else; it
             follows the schedule of lr. 0: Adam for everything.
-        weight_decay: of the matrices, decoupled, per unit of their learning rate.
         span: the part of one schedule, from 0 to 1, that this training covers, where several follow
             each other; it warms up where it begins at 0.
         clip: largest norm of a gradient, since windows with contact have heavy tails; math.inf
@@ -43,7 +42,6 @@ class TrainingOptions:
     lr_final: float = 1e-5
     warmup: int = 100
     muon: float = 0.0
-    weight_decay: float = 0.0
     span: tuple[float, float] = (0.0, 1.0)
     clip: float = 1.0
     validate_every: int = 250
@@ -55,7 +53,7 @@ class TrainingOptions:
                 require_count(name, value)
         for name in ("warmup", "patience"):
             require_count(name, getattr(self, name), least=0)
-        for name in ("lr_final", "muon", "weight_decay"):
+        for name in ("lr_final", "muon"):
             require_number(name, getattr(self, name), 0)
         require_number("lr", self.lr, 0, above=True)
         if not isinstance(self.clip, float) or self.clip != math.inf:
