@@ -230,7 +230,8 @@ def stopped_at(checkpoint: Path, step: int) -> None:
         return model.loss(window, generator)
 
     with contextlib.suppress(Stop):
-        fit(model, loss, TRAIN, HELD_OUT, TrainingOptions(**SIZES), checkpoint=checkpoint)
+        options = TrainingOptions(**SIZES)
+        fit(model, TRAIN, HELD_OUT, options, loss, checkpoint=checkpoint, progress=False)
         raise AssertionError("it was not stopped")
 
 
@@ -365,9 +366,7 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
                 calls += 1
                 if calls == at + 1:  # noqa: B023
                     first = next(model.parameters())  # noqa: B023
-                    cliff = (
-                        (first - first.detach()).abs().sum().sqrt()
-                    )  # zero, with an infinite slope
+                    cliff = (first - first.detach()).abs().sum().sqrt()  # 0, an infinite slope
                     return value + cliff if in_gradient else value * math.nan  # noqa: B023
             return value
 
@@ -375,11 +374,12 @@ def losses_that_are_not_finite(trials: int) -> Outcome:
             work = partial(
                 fit,
                 model,
-                loss,
                 TRAIN,
                 HELD_OUT,
                 TrainingOptions(**SIZES),
+                loss,
                 checkpoint=place / "run",
+                progress=False,
             )
             said = refusal(work, TrainingStopped)
             kept = (load_generation(place / "run") is not None) is (at >= SIZES["validate_every"])
@@ -597,7 +597,7 @@ def memory(trials: int) -> Outcome:
                 "validate_every": max(1, trials // 20),
             }
         )
-        fit(model, loss, data, HELD_OUT, options, checkpoint=place / "run")
+        fit(model, data, HELD_OUT, options, loss, checkpoint=place / "run", progress=False)
         steps, megabytes = np.array(samples).T
         slope = 1000 * np.polyfit(steps, megabytes, 1)[0]
         found.count(slope <= 1.0, f"{slope:.2f} MB per 1,000 steps")
