@@ -336,7 +336,7 @@ def values_that_are_not_finite(trials: int) -> Outcome:
             word = data.names[column] if name == "states" else f"action {column}"
             said = refusal(lambda: artifacts.load_trajectories(path))
             found.count(
-                str(path) in said and f"episode {episode}, step {step}, field '{word}'" in said,
+                str(path) in said and f"({episode}, {step}, {column})" in said,
                 said,
             )
         weights = {name: tensor.clone() for name, tensor in new_model().state_dict().items()}
