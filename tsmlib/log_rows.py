@@ -229,11 +229,13 @@ def _seconds(name: str, column: np.ndarray) -> np.ndarray:
     if column.dtype.kind in "mM":
         start = column[0] if column.dtype.kind == "M" else np.timedelta64(0)
         seconds = (column - start) / np.timedelta64(1, "s")
-    elif column.dtype.kind in "OUT" and len(column) and "-" in str(column[0])[1:]:
+    elif len(column) and isinstance(column[0], str) and "-" in column[0][1:]:
         raise TrajectoryError(
             f"the time '{name}' is {column[0]!r:.40}; expected seconds or dates: "
             "pandas.to_datetime(...) makes dates of texts"
         )
+    elif len(column) and hasattr(column[0], "timestamp"):  # dates with a time zone
+        seconds = np.array([value.timestamp() for value in column], np.float64)
     else:
         seconds = _numbers(name, column)
     for row in np.flatnonzero(~np.isfinite(seconds))[:1]:

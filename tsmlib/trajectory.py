@@ -153,6 +153,14 @@ class Trajectories(FromLogs):
         """
         steps = np.asarray(casting.one_each("lengths", lengths, len(lengths), np.integer))
         ends = np.cumsum(steps)
+        if steps.min(initial=1) < 1 or [len(actions), len(states)] != [
+            ends[-1],
+            ends[-1] + len(ends),
+        ]:
+            raise TrajectoryError(
+                f"{len(ends)} episodes of {ends[-1]} steps in all, but {len(states)} rows of states "
+                f"and {len(actions)} of actions; expected one state more than actions in each"
+            )
         x = np.split(states, ends[:-1] + np.arange(1, len(ends)))
         u = np.split(actions, ends[:-1])
         about = (robot.env, robot.dt, robot.names, robot.units, robot.angles)
