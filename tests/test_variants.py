@@ -1,11 +1,10 @@
-"""Arms with other physics: what holds for the standard one holds for them, and a file of another one is refused."""
+"""Arms with other physics: what holds for the standard one holds for them too."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-import tsmlib as tsm
-from tsmlib import study
+import tsmlib
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import fingerprint, imperfect, variant
 from tsmlib.envs.geometry import (
@@ -38,11 +36,9 @@ from tsmlib.envs.spec import ENV_IDS, EnvSpec
 from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.exploitation import violations
 from tsmlib.planning.tasks import Task
+from tsmlib.pretrained import draw_task
 from tsmlib.storage.artifacts import load_trajectories, save_trajectories
 from tsmlib.storage.files import StoreError
-from reproduction.data import random_data
-from reproduction.results.table import place
-from reproduction.runs import Run
 
 REACH, PUSH, PYMUNK_PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 NAMED: dict[str, dict[str, Any]] = {
@@ -106,7 +102,7 @@ def depth(states: np.ndarray, env_id: str) -> np.ndarray:
     return np.maximum(-closest_gap(states, env_id), into_wall)
 
 
-# Names ---------------------------------------------------------------------------------------------------------------
+# Names ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", [PUSH, PYMUNK_PUSH])
@@ -238,7 +234,7 @@ def test_another_spelling_is_refused(name: str, message: str) -> None:
         EnvSpec.parse(name)
 
 
-# Physics -------------------------------------------------------------------------------------------------------------
+# Physics ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS[1:3] + ENV_IDS[4:])
@@ -363,7 +359,7 @@ def test_an_episode_replays_bit_for_bit(changes: dict[str, Any]) -> None:
     "changes", [{"mass": 2.0}, {"link_lengths": (0.12, 0.11)}, {"object_radius": 0.04}], ids=str
 )
 def test_symmetric_copies_stay_true_of_a_variant(env_id: str, changes: dict[str, Any]) -> None:
-    data = random_data(variant(env_id, **changes), 10, seed=3, horizon=40)
+    data = tsmlib.collect_random(variant(env_id, **changes), 10, seed=3, horizon=40)
     copies = symmetric(data)
     env, _ = arms(data.env, len(copies))
     env.reset(seed=0, options={"states": copies.states[:, 0].astype(float)})
@@ -380,19 +376,19 @@ def test_true_episodes_of_a_variant_violate_no_physics() -> None:
         {"link_lengths": (0.12, 0.11)},
         {"object_radius": 0.05},
     ):
-        data = random_data(variant(PUSH, **changes), 40, seed=1, horizon=60)
+        data = tsmlib.collect_random(variant(PUSH, **changes), 40, seed=1, horizon=60)
         assert violations(data.states, data.env)["violations"].mean() < 1e-3
     assert (
         violations(data.states, PUSH)["violations"].mean() > 0.1
     )  # a smaller object would have been left alone
-    heavy = random_data(variant(PUSH, mass=4.0), 60, seed=1, horizon=60)
+    heavy = tsmlib.collect_random(variant(PUSH, mass=4.0), 60, seed=1, horizon=60)
     assert (
         violations(heavy.states, heavy.env)["violations"].mean()
         < violations(heavy.states, PUSH)["violations"].mean()
     )
 
 
-# Pictures, tasks and files -------------------------------------------------------------------------------------------
+# Pictures, tasks and files ----------------------------------------------------------------------
 
 
 def test_a_picture_shows_the_lengths_and_the_radius() -> None:
@@ -423,7 +419,7 @@ def test_targets_are_drawn_and_allowed_as_far_as_the_variant_gets() -> None:
         for env_id in (PUSH, REACH):
             if env_id == REACH and "object_radius" in changes:
                 continue
-            task = study.draw_task(
+            task = draw_task(
                 variant(env_id, **changes), seed=0, n=50
             )  # Task checks that they are within reach
             inner, outer = target_ring(EnvSpec.parse(task.env))
@@ -438,16 +434,16 @@ def test_targets_are_drawn_and_allowed_as_far_as_the_variant_gets() -> None:
 
 
 def test_the_task_of_a_variant_with_the_same_shape_is_the_frozen_one() -> None:
-    standard = study.load_task(PUSH)
-    heavy = study.load_task(variant(PUSH, mass=2.0))
+    standard = tsmlib.load_task(PUSH)
+    heavy = tsmlib.load_task(variant(PUSH, mass=2.0))
     assert heavy.env == "tsm/ReacherPush-mass2-v1"
     np.testing.assert_array_equal(heavy.start, standard.start)
     assert torch.equal(heavy.target, standard.target)
-    large = study.load_task(variant(PUSH, object_radius=0.05))
+    large = tsmlib.load_task(variant(PUSH, object_radius=0.05))
     assert len(large) == 100
     assert closest_gap(large.start.astype(float), large.env).min() > 0
     trial, same = (
-        tsm.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3)))
+        tsmlib.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3)))
         for task in (heavy, standard)
     )
     assert not torch.equal(trial.states, same.states)
@@ -456,7 +452,7 @@ def test_the_task_of_a_variant_with_the_same_shape_is_the_frozen_one() -> None:
 def test_a_file_of_another_variant_is_refused_with_the_values_that_differ(tmp_path: Path) -> None:
     names = {word: variant(PUSH, **changes) for word, changes in NAMED.items()} | {"": PUSH}
     for word in ("", "mass2", "links0.12x0.11"):
-        data = random_data(names[word], 2, seed=0, horizon=5)
+        data = tsmlib.collect_random(names[word], 2, seed=0, horizon=5)
         assert data.env == names[word]
         path = tmp_path / f"{word or 'standard'}.safetensors"
         save_trajectories(path, data, {"fingerprint": fingerprint(data.env)})
@@ -481,21 +477,13 @@ def test_a_file_of_another_variant_is_refused_with_the_values_that_differ(tmp_pa
             load_trajectories(tmp_path / f"{held}.safetensors", expect=fingerprint(names[asked]))
 
 
-def test_values_of_ones_own_that_are_called_like_an_arms_are_left_alone(tmp_path: Path) -> None:
-    data = replace(random_data(REACH, 2, seed=0, horizon=5), env="my-cart")
-    save_trajectories(tmp_path / "cart.safetensors", data, {"fingerprint": {"mass": 30.0}})
-    assert (
-        load_trajectories(tmp_path / "cart.safetensors", expect={"env": "my-cart"}).env == "my-cart"
-    )
-
-
 def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
     program = (
         "import json, torch, tsmlib as tsm; from tsmlib.envs import fingerprint\n"
         "env = 'tsm/Reacher-damping2-v0'\n"
-        "assert tsm.collect_random(env, episodes=2, horizon=5, seed=0).env == env\n"
-        "task = tsm.load_task('tsm/Reacher-damping2-v0').take(2)\n"
-        "trial = tsm.execute(task, torch.full((2, 50, 2), 0.01))\n"
+        "assert tsmlib.collect_random(env, episodes=2, horizon=5, seed=0).env == env\n"
+        "task = tsmlib.load_task('tsm/Reacher-damping2-v0').take(2)\n"
+        "trial = tsmlib.execute(task, torch.full((2, 50, 2), 0.01))\n"
         "print(json.dumps([trial.states[:, -1, 0].tolist(), fingerprint(task.env)]))"
     )
     found = subprocess.run(
@@ -503,22 +491,10 @@ def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
     ).stdout
     states, printed = json.loads(found)
     name = variant(REACH, damping=2)
-    here = tsm.execute(tsm.load_task(name).take(2), torch.full((2, 50, 2), 0.01)).states
+    here = tsmlib.execute(tsmlib.load_task(name).take(2), torch.full((2, 50, 2), 0.01)).states
     assert states == here[:, -1, 0].tolist()
     assert printed == fingerprint(name)
     assert printed["damping"] == 2.0
-
-
-def test_the_study_collects_trains_and_plans_on_a_variant_by_its_id(tmp_path: Path) -> None:
-    run, env = Run("collect", "smoke", 0, tmp_path), "tsm/ReacherPush-mass2-v1"
-    data = study.dataset(run, env, "train")
-    assert (data.env, len(data)) == (env, 20)
-    assert (tmp_path / "data" / "ReacherPush-mass2" / "train.safetensors").exists()
-    trained = study.load_or_train(run, env, "onestep")
-    assert trained.header["fingerprint"]["mass"] == 2.0
-    assert study.load_or_train(run, env, "onestep").header == trained.header
-    row = place(imperfect(env, delay=5))
-    assert (row["env"], row["sim"], row["delay"]) == (env, "mujoco", 5)
 
 
 @pytest.mark.parametrize(
