@@ -283,6 +283,28 @@ class OtherMeanings(Cart):
         return self.x
 
 
+class OnTheClass(Cart):
+    """Copies that share what is under way."""
+
+    line: list[float] = []  # noqa: RUF012
+
+    def begin(self) -> None:
+        OnTheClass.line = [0.0]
+
+    def push(self, u: np.ndarray) -> float:
+        self.line.append(float(u[0]))
+        return self.line[-2]
+
+
+class Scalar(Cart):
+    action_space = Box(-1, 1, (), np.float16)
+
+
+class ResetWithoutOptions(Cart):
+    def reset(self, seed: int | None = None) -> Any:  # type: ignore[override]
+        return super().reset(seed=seed)
+
+
 class OldStep(Cart):
     def step(self, u: np.ndarray) -> Any:
         return super().step(u)[:4]
@@ -429,6 +451,9 @@ HOSTILE = {
         Images: {"fails": "observations of .* are images.*TransformObservation"},
         DiscreteInADict: {"fails": "are a Discrete, .*in 'mode'; supported are"},
         OtherMeanings: {},
+        OnTheClass: {"fails": "copies of .* share a state"},
+        Scalar: {},
+        ResetWithoutOptions: {"fails": "reset of .* expected reset"},
         OldStep: {"fails": "step of .* Gymnasium expects"},
         OldReset: {"fails": r"reset of .* Gymnasium expects \(observation, info\)"},
         ChangesItsAction: {},

@@ -114,8 +114,7 @@ def test_states_without_an_object_or_a_number_are_refused() -> None:
             violations(wrong, PUSH)
 
 
-# Actions
-# -------------------------------------------------------------------------------------------------------------
+# Actions ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps", [49, 50])

@@ -89,8 +89,7 @@ def test_a_senseless_wrapper_is_refused(wrap, message: str) -> None:
         wrap(gymnasium.make(ENV))
 
 
-# Many arms at once
-# ---------------------------------------------------------------------------------------------------
+# Many arms at once --------------------------------------------------------------------------------
 
 N, TAU = 3, 5
 bulk = pytest.mark.parametrize("env_id", ["tsm/ReacherPush-v1", ENV])

@@ -58,6 +58,8 @@ def collect(
             f"many, or horizon={steps}"
         )
     run: Simulation = simulation(env) if isinstance(env, VectorEnv) else env
+    if not hasattr(run, "rollout"):
+        raise TypeError(f"env is {env!s:.80}; expected gymnasium.make_vec(id, num_envs=N)")
     start = run.reset(seed=seed, states=states)
     past = initial_past(torch.from_numpy(start).float(), past_len, run.action_dim)
     seen, done, taken = [start[:, None]], [], 0

@@ -236,7 +236,8 @@ class ArmVectorEnv(VectorEnv, ABC):
         gap = closest_gap(states, self.env_id)
         if (gap < -MAX_OVERLAP).any():
             episode = int(np.argmax(gap < -MAX_OVERLAP))
-            reason = f"block and arm overlap by {-1000 * gap[episode]:.1f} mm, at most {1000 * MAX_OVERLAP:g} mm may"
+            reason = f"block and arm overlap by {-1000 * gap[episode]:.1f} mm"
+            reason += f", at most {1000 * MAX_OVERLAP:g} mm may"
             raise SimulationUnstable(self.env_id, episode, 0, reason)
 
     def _checked(self, given: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -308,7 +309,7 @@ class ArmEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """As `ArmVectorEnv.reset`, with ``options["states"]`` (dx,) and ``options["target"]`` (2,)."""
+        """As `ArmVectorEnv.reset`; ``options["states"]`` is (dx,), ``options["target"]`` (2,)."""
         super().reset(seed=seed)
         options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
         states, info = self.vector.reset(seed=seed, options=options)

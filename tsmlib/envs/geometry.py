@@ -28,8 +28,8 @@ BLOCK_MASS = (
     Physics.mass
 )  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
 BLOCK_DECAY = 0.05  # s; a free object slows down by a factor e in this time
-RESTITUTION = 0.4  # share of the normal speed kept when the object bounces off a wall (the arm's contact is dead)
-FRICTION = 0.0  # contacts are smooth: the arm is so strong that friction would wedge it against the obstacle
+RESTITUTION = 0.4  # share of the normal speed kept at a wall (the arm's contact is dead)
+FRICTION = 0.0  # the arm is so strong that friction would wedge it against the obstacle
 BLOCK_RING = (
     0.08,
     0.17,
@@ -43,7 +43,7 @@ START_ANGLES = {  # rad; shoulder and elbow are uniform within plus and minus th
     "obstacle": (0.1, 0.1),  # the reset distribution of Gymnasium's Reacher
     "push": (np.pi, 2.5),  # in every direction, and bent
 }
-TARGET_RING = {  # m from the shoulder, uniform over the area; nearer to it the first link is in the object's way
+TARGET_RING = {  # m from the shoulder, uniform over the area; nearer, link 1 is in the way
     "reach": (0.0, 0.2),
     "obstacle": (0.0, 0.2),
     "push": (0.05, 0.2),

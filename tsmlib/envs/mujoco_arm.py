@@ -199,7 +199,7 @@ def _add_walls(spec: mujoco.MjSpec) -> None:
 
 
 class MujocoArm(ArmVectorEnv):
-    """N arms in MuJoCo. ``threads`` simulate at once (default: the CPU cores there are, at most 8)."""
+    """N arms in MuJoCo. ``threads`` simulate at once (by default as many as CPU cores, up to 8)."""
 
     def __init__(
         self,
@@ -315,7 +315,8 @@ class MujocoArm(ArmVectorEnv):
                 mujoco.mj_step(self.model, data)
                 for kind, warning in enumerate(data.warning):
                     if warning.number:
-                        return f" (MuJoCo: {mujoco.mju_warningText(kind, warning.lastinfo).rstrip('.')})"
+                        text = mujoco.mju_warningText(kind, warning.lastinfo)
+                        return f" (MuJoCo: {text.rstrip('.')})"
         return ""
 
     def _check(

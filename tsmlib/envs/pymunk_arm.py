@@ -36,11 +36,13 @@ from tsmlib.envs.physics import Physics
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.unstable import SimulationUnstable
 
-SUBSTEPS = 10  # constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks the bodies
+# Constant: Chipmunk scales cached impulses by dt / previous dt, and a growing dt kicks bodies.
+SUBSTEPS = 10
 ITERATIONS = 20
 ARMATURE = 1.0  # kg m^2 and
 DAMPING = Physics.damping  # N m s / rad, both Reacher's
-ELBOW_MASS = 10.0  # kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together
+# kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together.
+ELBOW_MASS = 10.0
 ANCHOR_MASS = 1e9  # kg; nothing moves the first link off the shoulder, it only turns
 STIFF = 1e-60  # share of an overlap or joint error left after a second: a quarter is corrected in a substep
 SLOP = 1e-5  # m of overlap that Chipmunk tolerates so that contacts persist

@@ -1,4 +1,4 @@
-"""The scene drawn with matplotlib, for pymunk, for vector figures, and wherever OpenGL is missing."""
+"""The arms' scene drawn with matplotlib; it needs no OpenGL."""
 
 from __future__ import annotations
 

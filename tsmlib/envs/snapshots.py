@@ -48,9 +48,9 @@ def refusal(env: gymnasium.Env) -> str:
         if any(vars(kind).get("__slots__") for kind in type(layer).__mro__):
             return f"{name} keeps its state in __slots__"
         for attribute, value in vars(layer).items():
-            if attribute not in _CONSTANT and not _fixed(value):
-                if what := _odd(value, arrays, attribute):
-                    return f"its state is not all plain: {name}.{attribute} {what}"
+            kept = attribute in _CONSTANT or _fixed(value)
+            if not kept and (what := _odd(value, arrays, attribute)):
+                return f"its state is not all plain: {name}.{attribute} {what}"
     for i, (one, array) in enumerate(arrays):
         for other, another in arrays[:i]:
             if array is not another and np.may_share_memory(array, another):
@@ -75,7 +75,7 @@ def _fixed(value: Any) -> bool:
 
 def _odd(value: Any, arrays: list[tuple[str, np.ndarray]], attribute: str) -> str:
     """What keeps a value from being plain, or ''; the arrays in it are added to ``arrays``."""
-    if isinstance(value, np.ndarray) and value.dtype != object:
+    if type(value) is np.ndarray and value.dtype != object:
         owner = value
         while isinstance(owner, np.ndarray):
             owner = owner.base  # type: ignore[assignment]

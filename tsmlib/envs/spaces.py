@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -36,8 +37,7 @@ class UnsupportedEnvironment(ValueError):
     """An environment that cannot do what was asked of it; the message says what it would take."""
 
 
-# Names
-# ----------------------------------------------------------------------------------------------------------------
+# Names --------------------------------------------------------------------------------------------
 
 
 def find_spec(env_id: str) -> GymnasiumSpec:
@@ -50,15 +50,7 @@ def find_spec(env_id: str) -> GymnasiumSpec:
         UnsupportedEnvironment: the id says that no id can say how its environment is made.
         gymnasium.error.Error: Gymnasium does not know it.
     """
-    if "+" in env_id or env_id.endswith("(copies differ)"):
-        raise UnsupportedEnvironment(
-            f"{env_id} cannot be made from its id: its data came from wrapped copies, or from "
-            "copies "
-            "made with different arguments. Give the robot an id of its own: gymnasium.register("
-            "'Mine-v0', entry_point, kwargs={...}, "
-            "additional_wrappers=(Wrapper.wrapper_spec(...),))"
-        )
-    name, bracket, given = env_id.partition("(")
+    name, bracket, given = re.fullmatch(r"([^(+]*)([(+]?)(.*)", env_id, re.S).groups()
     module, colon, plain = name.partition(":")
     if colon:
         importlib.import_module(module)
@@ -77,9 +69,11 @@ def find_spec(env_id: str) -> GymnasiumSpec:
         arguments = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     except (SyntaxError, ValueError, AssertionError) as error:
         raise UnsupportedEnvironment(
-            f"the arguments of {env_id!r} cannot be read; expected numbers, texts, lists and the "
-            "like "
-            "by name, as in 'Pendulum-v1(g=1.0)'"
+            f"{env_id!r} cannot be made from its id. An id carries numbers, texts, lists and the "
+            "like by name, as 'Pendulum-v1(g=1.0)' does, and no wrappers, and data of copies made "
+            "differently belong to none. Give the robot an id of its own: gymnasium.register("
+            "'Mine-v0', entry_point, kwargs={...}, "
+            "additional_wrappers=(Wrapper.wrapper_spec(...),))"
         ) from error
     return replace(spec, kwargs={**spec.kwargs, **arguments})
 
@@ -193,8 +187,7 @@ def layers(env: Any) -> Iterator[Any]:
     yield env
 
 
-# Observations
-# ---------------------------------------------------------------------------------------------------------
+# Observations -------------------------------------------------------------------------------------
 
 
 def state_names(env_id: str, space: Space) -> tuple[str, ...]:
@@ -269,8 +262,7 @@ def _changed(env_id: str, name: str, found: str, expected: str) -> UnsupportedEn
     )
 
 
-# Actions
-# --------------------------------------------------------------------------------------------------------------
+# Actions ------------------------------------------------------------------------------------------
 
 
 def require_actions(env_id: str, space: Space) -> Box:
@@ -297,7 +289,7 @@ def within_bounds(actions: np.ndarray, space: Box) -> np.ndarray:
     """
     low, high = (side.astype(np.float64).reshape(-1) for side in (space.low, space.high))
     scaled = (low + high) / 2 + (high - low) / 2 * np.clip(np.asarray(actions, np.float64), -1, 1)
-    scaled = scaled.astype(space.dtype).reshape(*scaled.shape[:-1], *space.shape)
+    scaled = scaled.astype(space.dtype).reshape((*scaled.shape[:-1], *space.shape))
     return np.clip(scaled, space.low, space.high)
 
 
@@ -311,8 +303,7 @@ def idle_action(space: Box) -> np.ndarray:
     return (np.clip(idle, -1, 1) + 0.0).astype(np.float32)  # and not -0
 
 
-# What an environment says of itself
-# -----------------------------------------------------------------------------------
+# What an environment says of itself ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -334,6 +325,11 @@ class Description:
     idle: np.ndarray
 
 
+def said(env: Any, name: str) -> Any:
+    """An attribute of an environment, that of its outermost layer that has one; None without."""
+    return next((getattr(layer, name) for layer in layers(env) if hasattr(layer, name)), None)
+
+
 def describe(env_id: str, env: Any, observations: Space, actions: Space) -> Description:
     """The robot of ``env``, an environment with its wrappers.
 
@@ -343,21 +339,18 @@ def describe(env_id: str, env: Any, observations: Space, actions: Space) -> Desc
     names = state_names(env_id, observations)
     box = require_actions(env_id, actions)
 
-    def said(name: str) -> Any:
-        return next((getattr(layer, name) for layer in layers(env) if hasattr(layer, name)), None)
-
     def words(name: str) -> tuple[str, ...] | None:
-        value = said(name)
+        value = said(env, name)
         texts = isinstance(value, tuple | list) and all(isinstance(word, str) for word in value)
         return tuple(value) if texts and len(value) == len(names) else None
 
-    angles = said("angles")
+    angles = said(env, "angles")
     whole = isinstance(angles, tuple | list) and all(type(d) is int for d in angles)
     if not whole or not all(0 <= d < len(names) for d in angles) or len(set(angles)) < len(angles):
         angles = ()
     return Description(
         env_id,
-        _dt(env_id, said("dt"), (getattr(env, "metadata", None) or {}).get("render_fps")),
+        _dt(env_id, said(env, "dt"), (getattr(env, "metadata", None) or {}).get("render_fps")),
         words("names") or names,
         words("units") or ("",) * len(names),
         tuple(angles),

@@ -55,8 +55,8 @@ class EnvSpec:
         arm, changed, noise, delay, version = _parts(env_id)
         if f"{arm}-v{version}" not in _PLAIN:
             raise ValueError(
-                f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of them, "
-                "nor a variant()"
+                f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor what imperfect() calls one of "
+                "them, nor a variant()"
             )
         spec = replace(
             _PLAIN[f"{arm}-v{version}"], noise=float(noise or 0.0), delay=int(delay or 0)

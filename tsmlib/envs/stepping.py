@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import secrets
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from typing import Any, Protocol
 
 import gymnasium
@@ -32,6 +32,7 @@ from tsmlib.envs.spaces import (
     flat,
     idle_action,
     layers,
+    said,
     within_bounds,
 )
 from tsmlib.envs.unstable import SimulationUnstable, import_mujoco, without_log
@@ -149,7 +150,7 @@ def make(env_id: str, *, render_mode: str | None = None) -> gymnasium.Env:
 
 
 class Arms:
-    """The arms, and what else of ours simulates whole sequences by a ``rollout``; they never end."""
+    """The arms, and what else of ours simulates whole sequences by ``rollout``; they never end."""
 
     def __init__(self, env: VectorEnv) -> None:
         arms: Any = env.unwrapped
@@ -177,7 +178,7 @@ class Arms:
 
 
 class _Episodes:
-    """What is the same however an environment is stepped: its description, and the episodes so far."""
+    """What is the same however an environment is stepped: its description, and its episodes."""
 
     def __init__(self, robot: Description, n: int) -> None:
         self.robot, self.num_envs = robot, n
@@ -203,8 +204,9 @@ class _Episodes:
             )
         if seed is None:
             seed = secrets.randbits(31)
-        if isinstance(seed, int | np.integer):
-            seed = [int(seed) + i for i in range(self.num_envs)]
+        if np.ndim(seed) == 0:
+            first = require_count("seed", seed, least=0)
+            seed = range(first, first + self.num_envs)
         seeds = [require_count("a seed", s, least=0) for s in seed]
         if len(seeds) != self.num_envs:
             raise ValueError(
@@ -245,34 +247,67 @@ class _Episodes:
         self.ended[i] = self.terminated[i] or bool(_number(self.id, "truncated", late))
         self.last[i] = state
 
-    def _examine(self, another: Callable[[], Any], envs: Sequence[Any] = ()) -> None:
-        """Try another copy, before the first episode, unless it is one of ``envs``.
+    def _examine(
+        self, another: Callable[[], Any], *, beside: bool, envs: Sequence[Any] = ()
+    ) -> None:
+        """Try two other copies, before the first episode, unless these are among ``envs``.
 
-        It is said aloud where it does not begin again where it began, and dt is the time that
-        passed, where its clocks know.
+        It is said aloud where one does not begin again where it began, and refused where one moves
+        as another is stepped, if they run ``beside`` each other. dt is the time that passed, where
+        the clocks know.
         """
-        made, seed = another(), 0
-        if any(made.unwrapped is env.unwrapped for env in envs):
-            return
-        with closing(made) as env:
-            first = self._state(_reset(self.id, env, seed))
-            before, taken, over = _clocks(env), 0, False
+        with closing(another()) as one, closing(another()) as two:
+            if any(one.unwrapped is env.unwrapped for env in (two, *envs)):
+                return
+            first, ratio = self._tried(one)
+            again, _ = self._tried(one)
+            if not np.array_equal(first[0], again[0], equal_nan=True):
+                d = int(np.argmax(np.abs(first[0] - again[0])))
+                warnings.warn(
+                    f"{self.id} does not begin again where it began: two resets with seed 0 gave "
+                    f"{self.names[d]} = {first[0][d]:g} and {again[0][d]:g}. Its episodes cannot "
+                    "be repeated, so plans are executed from elsewhere than they were made for. Let "
+                    "its reset draw from self.np_random after super().reset(seed=seed), and leave "
+                    "out wrappers that remember",
+                    stacklevel=5,
+                )
+            same = np.array_equal(first, again, equal_nan=True)
+            beside = beside and same
+            if beside and not np.array_equal(first, self._tried(one, two)[0], equal_nan=True):
+                raise UnsupportedEnvironment(
+                    f"copies of {self.id} share a state: one moves elsewhere while another is "
+                    "stepped. Keep what changes on self, not on the class, in the module or on a "
+                    "space; or give each copy a process: gymnasium.make_vec(id, num_envs=N, "
+                    "vectorization_mode='async')"
+                )
+        self.dt *= ratio
+
+    def _tried(
+        self, env: gymnasium.Env, other: gymnasium.Env | None = None
+    ) -> tuple[list[np.ndarray], float]:
+        """What an episode of random actions comes to, while ``other`` has one of its own.
+
+        Also how many times as long as dt its steps took.
+        """
+        states = [self._state(_reset(self.id, env, 0))]
+        clock, running = _clock(env), [env]
+        if other is not None:
+            _reset(self.id, other, 1)
+            running = [other, env]
+        with _counted(env) as calls:
             for u in np.random.default_rng(0).uniform(-1, 1, (TRIED, self.action_dim)):
-                if not over:
-                    result = _step(self.id, env, within_bounds(u, self.robot.actions))
-                    taken, over = taken + 1, bool(np.any(result[2]) or np.any(result[3]))
-            self.dt *= _repeats(env, before, self.dt * taken, taken)
-            again = self._state(_reset(self.id, env, seed))
-        if not np.array_equal(first, again, equal_nan=True):
-            d = int(np.argmax(np.abs(first - again)))
-            warnings.warn(
-                f"{self.id} does not begin again where it began: two resets with seed {seed} gave "
-                f"{self.names[d]} = {first[d]:g} and {again[d]:g}. Its episodes cannot be repeated, "
-                "so plans are executed from elsewhere than they were made for. Let its reset draw "
-                "from self.np_random after super().reset(seed=seed), and leave out wrappers that "
-                "remember",
-                stacklevel=5,
-            )
+                for one in tuple(running):
+                    command = within_bounds(-u if one is other else u, self.robot.actions)
+                    result = _step(self.id, one, command)
+                    if one is env:
+                        states.append(self._state(result[0]))
+                    if np.any(result[2]) or np.any(result[3]):
+                        running.remove(one)
+                if env not in running:
+                    break
+        taken, passed = len(states) - 1, _clock(env) - clock
+        ratio = passed / (self.dt * taken) if passed > 0 else len(calls) / taken
+        return states, 1.0 if abs(ratio - 1) < 0.01 else ratio
 
 
 class Stepping(_Episodes):
@@ -287,8 +322,7 @@ class Stepping(_Episodes):
         """envs: the copies. another: makes one more, to try things on. env_id: by default what the
         first says.
         """
-        ids = {env_id} if env_id else {environment_id(env) for env in envs}
-        env_id = ids.pop() if len(ids) == 1 else _mixed(ids)
+        env_id = env_id or common_id(envs)
         if len({id(env.unwrapped) for env in envs}) < len(envs):
             raise UnsupportedEnvironment(
                 f"the {len(envs)} copies of {env_id} are one and the same object; make a new one "
@@ -303,7 +337,7 @@ class Stepping(_Episodes):
         )
         self.envs = envs
         if another is not None:
-            self._examine(another, envs)
+            self._examine(another, beside=True, envs=envs)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
         seeds = self._seeds(seed, states)
@@ -338,8 +372,11 @@ class Vectorised(_Episodes):
         self.env, self.metadata = env, env.metadata or {}
         makers = getattr(env.unwrapped, "env_fns", None)
         *wrappers, _ = layers(env)
-        with closing(makers[0]()) if makers else nullcontext(env) as one:
-            env_id = environment_id(one)
+        unlike = list({id(maker): maker for maker in makers or ()}.values())[1:]
+        with ExitStack() as opened:
+            one = opened.enter_context(closing(makers[0]())) if makers else env
+            others = [opened.enter_context(closing(maker())) for maker in unlike]
+            env_id = common_id([one, *others])
             if makers:
                 words = [type(layer).__name__ for layer in wrappers]
                 env_id += "".join(f"+{word}" for word in words if word not in spaces.HARMLESS)
@@ -348,7 +385,7 @@ class Vectorised(_Episodes):
             robot = describe(env_id, one, env.single_observation_space, env.single_action_space)
         super().__init__(robot, env.num_envs)
         if makers and not wrappers:
-            self._examine(makers[0])
+            self._examine(makers[0], beside=False)
         self.batch = batch_space(env.single_observation_space, env.num_envs)
 
     def reset(self, *, seed: Seeds = None, states: np.ndarray | None = None) -> np.ndarray:
@@ -436,12 +473,32 @@ class Vectorised(_Episodes):
                 )
 
 
-def _mixed(ids: set[str]) -> str:
-    return f"{min(ids).partition('(')[0]}(copies differ)"
+def common_id(envs: Sequence[Any]) -> str:
+    """The id of all copies; UnsupportedEnvironment where their steps or actions differ."""
+    for env in envs[1:]:
+        for what, one, other in (
+            ("dt", said(envs[0], "dt"), said(env, "dt")),
+            ("action_space", envs[0].action_space, env.action_space),
+        ):
+            if one is not other and repr(one) != repr(other):
+                raise UnsupportedEnvironment(
+                    f"copies of {environment_id(env)} differ in {what}, {one!s:.60} and "
+                    f"{other!s:.60}; collect from each kind by itself"
+                )
+    ids = {environment_id(env) for env in envs}
+    return ids.pop() if len(ids) == 1 else f"{min(ids).partition('(')[0]}(copies differ)"
 
 
 def _reset(env_id: str, env: gymnasium.Env, seed: int) -> Any:
-    result = env.reset(seed=seed)
+    try:
+        result = env.reset(seed=seed)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise UnsupportedEnvironment(
+            f"reset of {env_id} does not take what Gymnasium gives it, {error}; expected "
+            "reset(self, *, seed=None, options=None)"
+        ) from error
     if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
         raise UnsupportedEnvironment(
             f"reset of {env_id} returned {result!s:.80}; Gymnasium expects (observation, info)"
@@ -484,25 +541,24 @@ def _require_steady(env_id: str, env: Any) -> None:
         )
 
 
-def _clocks(env: gymnasium.Env) -> tuple[int | None, float | None]:
-    """Steps that the limit of time has counted, and MuJoCo's seconds."""
-    counts = [getattr(layer, "_elapsed_steps", None) for layer in layers(env)]
-    data = getattr(env.unwrapped, "data", None)
-    time = float(data.time) if type(data).__name__ == "MjData" else None  # type: ignore[union-attr]
-    return next((count for count in counts if count is not None), None), time
+def _clock(env: gymnasium.Env) -> float:
+    """MuJoCo's seconds; 0 without it."""
+    data: Any = getattr(env.unwrapped, "data", None)
+    return float(data.time) if type(data).__name__ == "MjData" else 0.0
 
 
-def _repeats(
-    env: gymnasium.Env, before: tuple[int | None, float | None], seconds: float, taken: int
-) -> float:
-    """How many times as long as ``seconds`` the steps since ``before`` took, by the clocks."""
-    (begun, start), (steps, time) = before, _clocks(env)
-    if time is not None and start is not None and time > start:
-        ratio = (time - start) / seconds
-        return 1.0 if abs(ratio - 1) < 0.01 else ratio
-    for layer in layers(env):
-        if hasattr(layer, "dt"):
-            return 1.0  # said by a wrapper outside of the limit of time
-        if getattr(layer, "_elapsed_steps", None) is not None:
-            break
-    return 1.0 if steps is None or begun is None or steps < begun else (steps - begun) / taken
+@contextmanager
+def _counted(env: gymnasium.Env) -> Iterator[list[None]]:
+    """Within, an entry for every step of the layer that says dt, which wrappers may repeat."""
+    layer: Any = next((layer for layer in layers(env) if hasattr(layer, "dt")), env.unwrapped)
+    calls, step = list[None](), layer.step
+
+    def counted(action: Any) -> Any:
+        calls.append(None)
+        return step(action)
+
+    layer.step = counted
+    try:
+        yield calls
+    finally:
+        del layer.step

@@ -50,7 +50,7 @@ def import_mujoco() -> None:
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
-        import mujoco  # noqa: F401
+        import mujoco
     except (ImportError, AttributeError, OSError, RuntimeError):
         os.environ["MUJOCO_GL"] = "disabled"
         import mujoco  # noqa: F401

@@ -28,6 +28,7 @@ from tsmlib.checks import (
 )
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import hole, room
+from tsmlib.envs.spaces import find_spec
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
 from tsmlib.rewards import Reward, require_reward, rewarded
@@ -241,7 +242,7 @@ class Task:
     @property
     def robot(self) -> Robot:
         """What the numbers of states and actions mean."""
-        return _robot(self.env)
+        return _robot(self.env, find_spec(self.env).entry_point)
 
     @property
     def begins_by_seed(self) -> bool:
@@ -355,7 +356,7 @@ class Task:
         seeds = tuple(self.seeds[i] for i in indices) if self.seeds else ()
         return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
 
-    def require_robot(self, robot: Robot | None, what: str) -> None:
+    def require_robot(self, robot: Robot | None, what: str, find_spec(self, robot: Robot | None, what: str).entry_point) -> None:
         """TrajectoryError unless ``robot`` is this task's, where it is known; a warning names ids.
 
         A model of the standard arm may plan for a variant: the id alone is no error.
@@ -395,9 +396,9 @@ def warn_of_other_env(one: Robot | None, other: Robot, what: str) -> None:
 
 
 @cache
-def _robot(env: str) -> Robot:
+def _robot(env: str, made_by: object) -> Robot:
+    """The robot of an id, until something else is registered under it."""
     with closing(make_simulation(env, 1)) as run:
-        run.reset(seed=0)  # before it, dt is what the environment says
         return Robot(run.id, run.dt, run.names, run.units, run.angles, run.action_dim)
 
 
