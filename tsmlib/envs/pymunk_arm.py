@@ -41,10 +41,10 @@ SUBSTEPS = 10
 ITERATIONS = 20
 ARMATURE = 1.0  # kg m^2 and
 DAMPING = Physics.damping  # N m s / rad, both Reacher's
-# kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together.
+# In kg; adds 0.1 kg m^2 at the shoulder, heavy enough for the solver to hold the elbow together.
 ELBOW_MASS = 10.0
 ANCHOR_MASS = 1e9  # kg; nothing moves the first link off the shoulder, it only turns
-STIFF = 1e-60  # share of an overlap or joint error left after a second: a quarter is corrected in a substep
+STIFF = 1e-60  # share of an overlap left after a second: a quarter is corrected in a substep
 SLOP = 1e-5  # m of overlap that Chipmunk tolerates so that contacts persist
 FAR = 1e6  # m
 MAX_ANGLE = 1e6  # rad; beyond it, floats no longer resolve the fingertip well

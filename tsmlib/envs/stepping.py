@@ -264,11 +264,11 @@ class _Episodes:
             if not np.array_equal(first[0], again[0], equal_nan=True):
                 d = int(np.argmax(np.abs(first[0] - again[0])))
                 warnings.warn(
-                    f"{self.id} does not begin again where it began: two resets with seed 0 gave "
-                    f"{self.names[d]} = {first[0][d]:g} and {again[0][d]:g}. Its episodes cannot "
-                    "be repeated, so plans are executed from elsewhere than they were made for. Let "
-                    "its reset draw from self.np_random after super().reset(seed=seed), and leave "
-                    "out wrappers that remember",
+                    f"{self.id} does not begin again where it began: two resets with seed 0 "
+                    f"gave {self.names[d]} = {first[0][d]:g} and {again[0][d]:g}. Its episodes "
+                    "cannot be repeated, so plans are executed from elsewhere than they were made "
+                    "for. Let its reset draw from self.np_random after super().reset(seed=seed), "
+                    "and leave out wrappers that remember",
                     stacklevel=5,
                 )
             same = np.array_equal(first, again, equal_nan=True)

@@ -356,7 +356,7 @@ class Task:
         seeds = tuple(self.seeds[i] for i in indices) if self.seeds else ()
         return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
 
-    def require_robot(self, robot: Robot | None, what: str, find_spec(self, robot: Robot | None, what: str).entry_point) -> None:
+    def require_robot(self, robot: Robot | None, what: str) -> None:
         """TrajectoryError unless ``robot`` is this task's, where it is known; a warning names ids.
 
         A model of the standard arm may plan for a variant: the id alone is no error.
