@@ -1,6 +1,6 @@
 """Latent codes of a segment model (section 5.3.4).
 
-At test time codes are drawn from N(0, I), and from the encoder where the future is known.
+At test time codes are drawn from the model's prior, and from the encoder where the future is known.
 Deviations and errors are in units of the training data's deviation (the feature space of
 ``evaluation.prediction``).
 
@@ -16,40 +16,42 @@ from tsmlib.evaluation import prediction, scoring
 from tsmlib.evaluation.futures import Coded, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
-from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
+from tsmlib.models.layers import kl_divergence, sample_posterior
 from tsmlib.models.tsm import TSM
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
 
-ACTIVE = (
-    0.01  # variance of a unit's posterior mean above which it counts as active (Burda et al., 2016)
-)
+# Variance of a unit's posterior mean above which it counts as active (Burda et al., 2016).
+ACTIVE = 0.01
 
 
-def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """KL(Q(Z_i | X+) || N(0, 1)) in nats (N, dz), for mean and log variance (N, dz)."""
-    return kl_from_standard_normal(mean[..., None], log_variance[..., None])
+def kl_by_dimension(mean: Tensor, log_variance: Tensor, *prior: Tensor) -> Tensor:
+    """KL(Q(Z_i) || P(Z_i)) in nats of each code dimension and segment, (N, dz).
+
+    Args:
+        mean: (N, dz), of the encoder.
+        log_variance: (N, dz).
+        prior: the same two of ``TSM.prior``; none for N(0, I).
+    """
+    m, log_v = prior or (torch.zeros_like(mean), torch.zeros_like(mean))
+    return kl_divergence(*(part[..., None] for part in (mean, log_variance, m, log_v)))
 
 
 def active_units(mean: Tensor) -> Tensor:
-    """(dz,) bool: dimensions whose posterior mean (N, dz) varies over segments with more than
-    ACTIVE.
-    """
+    """(dz,) bool: dimensions whose posterior mean (N, dz) varies by more than ACTIVE."""
     return mean.var(0) > ACTIVE
 
 
 @torch.no_grad()
 def total_effects(model: Coded, window: Window, generator: torch.Generator) -> Tensor:
-    """Total effect of each dimension of the code on the next segment, (dz,), in deviations of the
-    data.
+    """Total effect of each code dimension on the next segment, (dz,), in deviations of the data.
 
     The root of E[(f(z) - f(z with z_i drawn anew))^2] / 2, mean over features, steps and windows.
-    Says what the decoder does with a code however it was trained; the encoder has no part in it.
+    Says what the decoder does with a code of the prior however it was trained; the encoder has no
+    part in it.
     """
     past, actions = window.past, window.future.actions[:, : model.code_len]
-    z, again = (
-        standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2)
-    )
+    z, again = (_drawn(model, past, actions, generator) for _ in range(2))
     states = model.decode(past, actions, z)
     moved = []
     for i in range(model.latent_dim):
@@ -61,18 +63,16 @@ def total_effects(model: Coded, window: Window, generator: torch.Generator) -> T
 
 @torch.no_grad()
 def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> dict[str, Tensor]:
-    """Error (N,) of the next segment, root mean square over features and steps, by where its code
-    comes from.
+    """Error (N,) of the next segment, root mean square over features and steps, by its code.
 
-    ``posterior``: drawn from Q(Z | X+), which has seen the segment; ``prior``: drawn from N(0, I);
-    ``zero``: z = 0.
+    ``posterior``: drawn from Q, which has seen the segment; ``prior``: drawn from the prior;
+    ``zero``: the prior's mean, which is z = 0 of N(0, I).
     """
     future = Segment(*(part[:, : model.code_len] for part in window.future))
-    mean, log_variance = model.encode(future.states)
     codes = {
-        "posterior": sample_posterior(mean, log_variance, generator),
-        "prior": standard_normal(mean.shape, generator, mean),
-        "zero": torch.zeros_like(mean),
+        "posterior": sample_posterior(*model.posterior(window.past, future), generator),
+        "prior": model.draw(window.past, future.actions, generator=generator),
+        "zero": model.draw(window.past, future.actions),
     }
     errors = {}
     for word, z in codes.items():
@@ -81,6 +81,13 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
         )
         errors[word] = difference.square().mean((1, 2)).sqrt()
     return errors
+
+
+def _drawn(model: Coded, past: Segment, actions: Tensor, generator: torch.Generator) -> Tensor:
+    """Codes (N, dz) of the model's prior."""
+    if isinstance(model, TSM):
+        return model.draw(past, actions, generator=generator)
+    return standard_normal((len(actions), model.latent_dim), generator, actions)
 
 
 def deviations(seen: SampledFutures, features: Features) -> tuple[Tensor, Tensor]:

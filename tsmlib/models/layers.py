@@ -215,4 +215,60 @@ def sample_posterior(mean: Tensor, log_variance: Tensor, generator: Noise) -> Te
 
 def kl_from_standard_normal(mean: Tensor, log_variance: Tensor) -> Tensor:
     """KL(N(mean, variance) || N(0, I)) in nats, summed over the last dimension."""
-    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
+    return kl_divergence(mean, log_variance, torch.zeros_like(mean), torch.zeros_like(mean))
+
+
+def kl_divergence(mean: Tensor, log_variance: Tensor, m: Tensor, log_v: Tensor) -> Tensor:
+    """KL(N(mean, variance) || N(m, v)) in nats, of diagonal Gaussians, over the last dimension."""
+    square = (mean - m).square() + log_variance.exp()
+    return 0.5 * (square / log_v.exp() - 1 + log_v - log_variance).sum(-1)
+
+
+class CodePrior(nn.Module):
+    """P(Z | X-, U-, u_t .. u_{t+k-1}): what a code may be before its segment was seen.
+
+    A small network of the past and the first k of H planned actions, k from 0 to H. Not in the
+    paper, whose prior is N(0, I); that is what an untrained one is.
+
+    Args:
+        past_dim: inputs of one step of the past, features and actions.
+        action_dim: du.
+        segment_len: H, steps of the past and most of the plan.
+        latent_dim: dz.
+        width: of its two layers.
+    """
+
+    def __init__(
+        self,
+        past_dim: int,
+        action_dim: int,
+        segment_len: int,
+        latent_dim: int,
+        *,
+        width: int = 128,
+    ) -> None:
+        super().__init__()
+        self.segment_len = segment_len
+        inputs = segment_len * (past_dim + action_dim + 1)
+        self.hidden = nn.Sequential(
+            nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+        )
+        self.project = nn.Linear(width, 2 * latent_dim)
+        for weight in self.project.parameters():
+            nn.init.zeros_(weight)
+
+    def forward(
+        self, past: Tensor, planned: Tensor, k: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Past (B, H, .), planned (B, K <= H, du), of which k (B, 1) are shown, or all.
+
+        Mean and log variance of Z, (B, dz) each.
+        """
+        shown = torch.ones_like(planned[..., :1])
+        if k is not None:
+            shown = (torch.arange(planned.shape[1], device=k.device) < k).to(planned)[..., None]
+        plan = torch.cat([planned * shown, shown], dim=-1)
+        plan = F.pad(plan, (0, 0, 0, self.segment_len - plan.shape[1]))
+        seen = torch.cat([past.flatten(1), plan.flatten(1)], dim=1)
+        mean, log_variance = self.project(self.hidden(seen)).chunk(2, dim=-1)
+        return mean, log_variance

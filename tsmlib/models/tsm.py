@@ -2,34 +2,39 @@
 
     encoder   Q(Z | X+)                     1-D convolutions over the future segment
     decoder   P(X+ | X-, U-, U+, Z)         gated dilated causal layers, autoregressive
-    prior     P(Z) = N(0, I)
+    prior     P(Z) = N(0, I), or P(Z | X-, U-, U+), a small network; the second not in the paper
 
     Eq. 1     tanh(W_f * s + V_f^T z) . sigmoid(W_g * s + V_g^T z)         models.layers.GatedLayer
-    A.1       sum |f(x) - f(x^)|^2 + beta KL(Q(Z | X+) || N(0, I))         TSM.loss
+    A.1       sum |f(x) - f(x^)|^2 + beta KL(Q(Z | X+) || P(Z))            TSM.loss
 
 All that is uncertain about a segment lives in its code z. The decoder predicts increments of the
-physical state x; f are its standardised features.
+physical state x; f are its standardised features. Up to a factor of 2 sigma^2 = beta, A.1 is the
+negative evidence bound of a Gaussian of variance sigma^2 around f(x^): beta = 1 says that features
+deviate by 0.7 from what the code tells, so that few codes are worth their nats (sigma-VAE, Rybkin
+et al., 2021); a smaller beta makes codes carry more. The distance |f(x) - f(x^)| in place of its
+square is the bound of a density with heavier tails, exp(-distance / beta).
 """
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
 
-from tsmlib.checks import require_counts, require_flag, require_number
+from tsmlib.checks import require_choice, require_counts, require_flag, require_number
 from tsmlib.models.base import Step
 from tsmlib.models.energy import energy_score
 from tsmlib.models.layers import (
     CausalDecoder,
+    CodePrior,
     Encoder,
     chunked,
-    kl_from_standard_normal,
+    kl_divergence,
     sample_posterior,
     whole_segments,
 )
 from tsmlib.models.state_model import StateModel
-from tsmlib.sampling import Noise, standard_normal
+from tsmlib.sampling import Noise, random_indices
 from tsmlib.trajectory import Segment, Window
 
 
@@ -46,8 +51,13 @@ class TSM(StateModel):
             and sine.
         segment_len: H, steps of a segment, and of the past that it reads; 10 in section 5.1.
         latent_dim: dz, dimensions of a code z; 8 in section 5.1.
+        prior: of the codes; "normal" for N(0, I), the paper's, or "learned" for a network of the
+            past and the planned actions, which goes with full_encoder, a smaller beta and
+            residual="distance" (``zoo``, "tsm+prior").
         beta: weight of the KL divergence (nats) against the squared error in units of the
-            training data's deviation; 1 is the plain sum of section 3.1.
+            training data's deviation, 2 sigma^2; 1 is the plain sum of section 3.1.
+        residual: of a segment in the loss; "square", the paper's, or "distance", which few wild
+            segments move less.
         full_encoder: Q(Z | X+, X-, U-, U+) in place of Q(Z | X+), which section 3.1 finds as good.
         channels: C of every gated layer; 32, and 64 where there are contacts (A.1).
         head_channels: of the extra 1x1 layer before the last; 0 for none, 128 where there are
@@ -68,7 +78,9 @@ class TSM(StateModel):
         angles: Sequence[int] = (),
         segment_len: int = 10,
         latent_dim: int = 8,
+        prior: Literal["normal", "learned"] = "normal",
         beta: float = 1.0,
+        residual: Literal["square", "distance"] = "square",
         full_encoder: bool = False,
         channels: int = 32,
         head_channels: int = 0,
@@ -83,6 +95,10 @@ class TSM(StateModel):
         self.full_encoder = require_flag("full_encoder", full_encoder)
         seen = self.features.dim + (action_dim if full_encoder else 0)
         self.encoder = Encoder(seen, segment_len * (2 if full_encoder else 1), latent_dim)
+        require_choice("prior", prior, ("normal", "learned"))
+        self.residual = require_choice("residual", residual, ("square", "distance"))
+        sizes = (self.features.dim + action_dim, action_dim, segment_len, latent_dim)
+        self.code_prior = CodePrior(*sizes) if prior == "learned" else None
         self.decoder = CausalDecoder(
             self.features.dim + action_dim,
             state_dim,
@@ -104,19 +120,71 @@ class TSM(StateModel):
         """The last layer of the encoder."""
         return self.encoder.project
 
-    def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read the past (B, L, .), with one code for the segment: z = 0, or drawn from N(0, I)."""
-        return self._begin(past, self._code(past, generator))
+    def begin(
+        self, past: Segment, *, planned: Tensor | None = None, generator: Noise | None = None
+    ) -> Step:
+        """Read the past (B, L, .), with one code for the segment: the prior's mean, or a draw.
+
+        Args:
+            past: states and actions, H steps or more.
+            planned: (B, k, du), the first k actions of the segment, as far as they are known. A
+                learned prior reads them; without them its code may not suit what will be done.
+            generator: None for the mode.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to.
+        """
+        return self._begin(past, self.draw(past, planned, generator=generator))
 
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
-        return self.decode(past, actions, self._code(past, generator))
+        """The states (B, K, dx) that ``begin`` steps through with all of its actions planned."""
+        return self.decode(past, actions, self.draw(past, actions, generator=generator))
+
+    def prior(
+        self, past: Segment, planned: Tensor | None = None, *, k: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """P(Z): mean and log variance of the code of the segment that follows, (B, dz) each.
+
+        Args:
+            past: states and actions (B, L, .), H steps or more.
+            planned: (B, K, du), the first K <= H actions of the segment; None, none are known.
+            k: (B, 1), how many of them a learned prior is shown; None, all.
+        """
+        if self.code_prior is None:
+            zeros = past.states.new_zeros(len(past.states), self.latent_dim)
+            return zeros, zeros
+        seen = past.last(self.segment_len)
+        planned = past.actions[:, :0] if planned is None else planned
+        return self.code_prior(self.inputs(seen.states, seen.actions), planned, k)
+
+    def draw(
+        self, past: Segment, planned: Tensor | None = None, *, generator: Noise | None = None
+    ) -> Tensor:
+        """A code (B, dz) of the ``prior``; its mean without a generator."""
+        mean, log_variance = self.prior(past, planned)
+        return mean if generator is None else sample_posterior(mean, log_variance, generator)
 
     def encode(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Q(Z | X+): (B, H, dx) -> mean and log variance of Z, (B, dz) each."""
+        """Q(Z | X+): (B, H, dx) -> mean and log variance of Z, (B, dz) each.
+
+        Raises:
+            ValueError: the encoder sees past and actions as well; ``posterior`` gives it both.
+        """
+        if self.full_encoder:
+            raise ValueError(
+                "this model has full_encoder, Q(Z | X+, X-, U-, U+), which states alone do not "
+                "tell; call model.posterior(past, future)"
+            )
         return self.encoder(self.features(states))
+
+    def posterior(self, past: Segment, future: Segment) -> tuple[Tensor, Tensor]:
+        """Q(Z | X+), or Q(Z | X+, X-, U-, U+): mean and log variance of Z, (B, dz) each."""
+        if not self.full_encoder:
+            return self.encode(future.states)
+        whole = past.last(self.segment_len).then(future)
+        return self.encoder(self.inputs(whole.states, whole.actions))
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
         """P(X+ | X-, U-, U+, z), free-running: each state from the predicted one before it."""
@@ -134,8 +202,8 @@ class TSM(StateModel):
         increments = self.decoder(self.inputs(before, actions), z, n)
         return before[:, -n:] + self.features.step_std * increments
 
-    def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error plus beta KL of each segment, free-running through the window (A.1).
+    def loss(self, window: Window, generator: torch.Generator) -> Tensor:
+        """Residual plus beta KL of each segment, free-running through the window (A.1).
 
         The future is a chain of K = n H steps. Each segment's code comes from its own true states,
         its past from the model's own prediction of the segment before, so that training meets the
@@ -146,18 +214,18 @@ class TSM(StateModel):
             z, kl = self._posterior_code(past, future, generator)
             predicted = self.decode(past, future.actions, z)
             error = self.features.difference(predicted, future.states)
-            loss = loss + (error.square().sum((1, 2)) + self.beta * kl).mean()
+            loss = loss + (self._misfit(error) + self.beta * kl).mean()
             past = past.then(Segment(predicted, future.actions)).last(self.past_len)
         return loss
 
-    def teacher_forced_loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error of one-step increments plus beta KL, with true states as inputs."""
+    def teacher_forced_loss(self, window: Window, generator: torch.Generator) -> Tensor:
+        """Residual of one-step increments plus beta KL, with true states as inputs."""
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
             z, kl = self._posterior_code(past, future, generator)
             predicted = self.decode_teacher_forced(Window(past, future), z)
             error = self.features.increments(predicted, future.states)
-            loss = loss + (error.square().sum((1, 2)) + self.beta * kl).mean()
+            loss = loss + (self._misfit(error) + self.beta * kl).mean()
             past = past.then(future).last(self.past_len)
         return loss
 
@@ -176,23 +244,24 @@ class TSM(StateModel):
         return cast(Tensor, loss)
 
     def _posterior_code(
-        self, past: Segment, future: Segment, generator: Noise
+        self, past: Segment, future: Segment, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """z ~ Q(Z | X+), or Q(Z | X+, X-, U-, U+), (B, dz), and its KL from N(0, I), (B,)."""
-        if self.full_encoder:
-            whole = past.last(self.segment_len).then(future)
-            mean, log_variance = self.encoder(self.inputs(whole.states, whole.actions))
-        else:
-            mean, log_variance = self.encode(future.states)
-        z = sample_posterior(mean, log_variance, generator)
-        return z, kl_from_standard_normal(mean, log_variance)
+        """z ~ Q, (B, dz), and KL(Q || P), (B,).
 
-    def _code(self, past: Segment, generator: Noise | None) -> Tensor:
-        """z (B, dz) of the prior: its mode without a generator."""
-        shape, like = (len(past.states), self.latent_dim), past.states
-        return (
-            like.new_zeros(shape) if generator is None else standard_normal(shape, generator, like)
-        )
+        A learned prior meets Q a second time with a part of the plan, of which Q learns nothing.
+        """
+        mean, log_variance = self.posterior(past, future)
+        kl = kl_divergence(mean, log_variance, *self.prior(past, future.actions))
+        if self.code_prior is not None:
+            k = random_indices(self.segment_len, (len(kl), 1), generator, kl.device)
+            part = self.prior(past, future.actions, k=k)
+            kl = kl + kl_divergence(mean.detach(), log_variance.detach(), *part)
+        return sample_posterior(mean, log_variance, generator), kl
+
+    def _misfit(self, error: Tensor) -> Tensor:
+        """What segments' errors (B, H, .) cost: (B,)."""
+        square = error.square().sum((1, 2))
+        return square if self.residual == "square" else (square + 1e-4).sqrt()
 
     def _begin(self, past: Segment, z: Tensor) -> Step:
         x, codes = past.states[:, -1], self.decoder.codes(z)
