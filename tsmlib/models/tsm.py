@@ -234,14 +234,15 @@ class TSM(StateModel):
 
         The sum over segments, see ``models.energy``. The encoder is not used.
         """
-        past, loss = Segment(*(torch.cat([part, part]) for part in window.past)), 0.0
+        past = Segment(*(torch.cat([part, part]) for part in window.past))
+        loss = past.states.new_zeros(())
         for future in self._segments(window.future):
             actions = torch.cat([future.actions, future.actions])
             states = self.predict_segment(past, actions, generator=generator)
             samples = self.features(states).unflatten(0, (2, -1))  # (2, B, H, .)
             loss = loss + energy_score(samples, self.features(future.states))
             past = past.then(Segment(states, actions)).last(self.past_len)
-        return cast(Tensor, loss)
+        return loss
 
     def _posterior_code(
         self, past: Segment, future: Segment, generator: torch.Generator
