@@ -38,8 +38,8 @@ class Case:
     losses: its loss methods, each with the prefixes of the parameters that it leaves alone.
     stochastic: whether a generator makes a difference. recall: (model, window) -> its best account
     of a future that it has seen.
-    foresees: whether codes are drawn for a whole plan, so that an action moves earlier states of its
-    segment.
+    foresees: whether codes are drawn for a whole plan, so that an action moves earlier states of
+    its segment.
     """
 
     build: Callable[[int], Any]

@@ -11,7 +11,7 @@ from torch import Tensor
 from tsmlib import TSM
 from tsmlib.evaluation import latent
 from tsmlib.models.base import rollout, stepper
-from tsmlib.models.layers import CodePrior, kl_divergence, kl_from_standard_normal
+from tsmlib.models.layers import kl_divergence, kl_from_standard_normal
 from tsmlib.trajectory import Segment, Window
 
 H, DX, DU, N = 4, 3, 2, 6
@@ -126,7 +126,7 @@ def coins(n: int, seed: int) -> Window:
 
 
 def test_a_code_carries_what_nobody_can_know_and_no_more() -> None:
-    """Of a coin that the plan shows, nothing; of one that only the world has thrown, its one bit."""
+    """Of a coin that the plan shows nothing; of one that only the world has thrown its one bit."""
     torch.manual_seed(0)
     options = dict(segment_len=H, latent_dim=1, channels=16, full_encoder=True, beta=0.05)
     net = TSM(2, 1, prior="learned", dilations=(1, 2), **options)
