@@ -416,7 +416,7 @@ def harmless(
 
 OTHERWISE: dict[str, Any] = {
     "dt": 0.01,
-    "names": ["x"] * 6,
+    "names": [f"x{i}" for i in range(6)],
     "units": ["cm"] * 6,
     "angles": [0],
     "noise": 0.25,
