@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tsmlib import zoo
 from tsmlib.envs import geometry, mujoco_arm
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.action_prior import ActionPrior
@@ -30,11 +31,9 @@ from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.tasks import HORIZON, TOLERANCE
+from tsmlib.pretrained import draw_task, load_pretrained
 from tsmlib.storage import files
 from tsmlib.storage.files import Json
-from tsmlib import zoo
-from reproduction.models import load_pretrained
-from reproduction.tasks import draw_task
 
 FORMAT = 3  # of the manifest and of the files that it names; src/files.js asks for the same
 PAST_LEN = 10

@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from reproduction import explorer
 from tsmlib import statistics
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
@@ -37,10 +38,8 @@ from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
+from tsmlib.pretrained import draw_task, load_pretrained, load_task
 from tsmlib.storage import files
-from reproduction import explorer
-from reproduction.models import load_pretrained
-from reproduction.tasks import draw_task, load_task
 
 HERE = Path(__file__).parent
 MEASURED = HERE / "measured.json"

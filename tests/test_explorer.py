@@ -24,6 +24,8 @@ import numpy as np
 import pytest
 import torch
 
+from reproduction import explorer
+from reproduction.runs import ROOT, RunError
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import HALF_RANGE
 from tsmlib.models.base import rollout
@@ -34,10 +36,7 @@ from tsmlib.planning.planners import cem, evaluate
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import LatentActions
 from tsmlib.planning.tasks import Task
-from reproduction import explorer
-from reproduction.models import load_pretrained
-from reproduction.runs import ROOT, RunError
-from reproduction.tasks import load_task
+from tsmlib.pretrained import load_pretrained, load_task
 from tsmlib.trajectory import Segment
 
 NODE, BROWSER = shutil.which("node"), shutil.which("chromium") or shutil.which("google-chrome")
