@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from tsmlib.checks import described
 from tsmlib.robot import Robot, TrajectoryError
 
 Arrays = np.ndarray | Tensor | Sequence[np.ndarray] | Sequence[Tensor]
@@ -16,7 +18,12 @@ Arrays = np.ndarray | Tensor | Sequence[np.ndarray] | Sequence[Tensor]
 def episodes(name: str, values: Arrays) -> list[np.ndarray]:
     """Each episode as an array (T, d) of numbers, d the same in all."""
     if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
+        values = _array(values)
+    one = isinstance(values, str | Mapping) or getattr(values, "ndim", 1) == 0
+    if one or not isinstance(values, Iterable):
+        raise TrajectoryError(
+            f"{name} is {described(values)}; expected an array (N, T, d), or a list of (T, d)"
+        )
     parts = [_numbers(f"{name} of episode {i}", part) for i, part in enumerate(values)]
     if not parts:
         raise TrajectoryError(f"there are no {name}; expected at least one episode")
@@ -30,9 +37,14 @@ def episodes(name: str, values: Arrays) -> list[np.ndarray]:
     return parts
 
 
+def _array(tensor: Tensor) -> np.ndarray:
+    whole = tensor.detach().cpu().to_dense()
+    return (whole.float() if whole.dtype == torch.bfloat16 else whole).numpy()
+
+
 def _numbers(what: str, values: object) -> np.ndarray:
     if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
+        values = _array(values)
     try:
         array = np.asarray(values)
     except ValueError as error:
@@ -75,14 +87,13 @@ def float32(name: str, episodes: list[np.ndarray], columns: tuple[str, ...]) -> 
             f"step {row - begins[episode]}, field '{columns[column]}': {exact[row, column]}. "
             "Expected finite numbers: mend or leave out what holds them"
         )
-    if exact.dtype.itemsize > 4:
-        exact = exact.astype(np.float64)
-        means = np.add.reduceat(exact, begins) / lengths[:, None]
-        spread = np.sqrt(np.square(exact - np.repeat(means, lengths, axis=0)).mean(0))
-        size = np.abs(exact).max(0)
-        lost = (np.square(exact - flat).mean(0) > np.square(1e-3 * spread)) & (
-            spread > 1e-12 * size
-        )
+    whole = exact.dtype.kind in "iu"  # of floats, what varies by their own rounding is constant
+    if exact.dtype.itemsize > 4 or (whole and exact.dtype.itemsize == 4):
+        change = exact.astype(np.longdouble) - np.repeat(exact[begins], lengths, axis=0)
+        spread = np.sqrt(np.square(change).mean(0).astype(np.float64))
+        size = np.abs(exact.astype(np.float64)).max(0)
+        rounding = np.sqrt(np.square(exact.astype(np.longdouble) - flat).mean(0)).astype(np.float64)
+        lost = (rounding > 1e-3 * spread) & (spread > (0 if whole else 1e-12) * size)
         for column in np.flatnonzero(lost)[:1]:
             kept = np.spacing(np.float32(size[column]))
             raise TrajectoryError(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass, fields
 
 import numpy as np
 
-from tsmlib.checks import require_count, require_number
+from tsmlib.checks import require_count, require_number, require_type
 
 
 class TrajectoryError(ValueError):
@@ -71,6 +71,7 @@ class Robot:
         Raises:
             TrajectoryError: they differ; it names both sides of every field that does.
         """
+        require_type("other", other, Robot, "a Robot, such as data.robot or model.robot")
         differing = []
         for name in (field.name for field in fields(Robot) if field.name not in but):
             ours, theirs = getattr(self, name), getattr(other, name)
@@ -85,18 +86,23 @@ class Robot:
 
 
 def _words(field: str, words: object) -> tuple[str, ...]:
-    listed = tuple(words) if isinstance(words, Sequence | np.ndarray) else ()
-    if isinstance(words, str) or not all(isinstance(word, str) for word in listed) or not listed:
+    ordered = isinstance(words, Iterable) and not isinstance(words, str | Set | Mapping)
+    listed: tuple[object, ...] = tuple(words) if ordered else ()  # type: ignore[arg-type]
+    if not listed or not all(isinstance(word, str) for word in listed):
         raise TrajectoryError(f"{field} is {words!r:.80}; expected a text per state dimension")
     return tuple(map(str, listed))
 
 
 def columns_of(angles: object, names: tuple[str, ...]) -> tuple[int, ...]:
     """Angles, each an index or a name, as sorted indices."""
-    listed = [] if isinstance(angles, str) else list(np.asarray(angles, object).ravel())
+    listed = [] if isinstance(angles, str | Set) else list(np.asarray(angles, object).ravel())
     known = {name: d for d, name in enumerate(names)} | {d: d for d in range(len(names))}
-    found = [known.get(a) for a in listed if not isinstance(a, bool | float)]
-    if isinstance(angles, str) or None in found or len(set(found)) < len(listed):
+    found = [
+        known.get(a)
+        for a in listed
+        if type(a) is not bool and isinstance(a, int | np.integer | str)
+    ]
+    if isinstance(angles, str | Set) or None in found or len(set(found)) < len(listed):
         raise TrajectoryError(
             f"angles are {angles!r:.80}; expected a tuple of some of 0 to {len(names) - 1}, or of "
             f"{', '.join(names):.200}"

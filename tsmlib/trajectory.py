@@ -25,7 +25,7 @@ from torch import Tensor
 
 from tsmlib import casting
 from tsmlib.casting import Arrays
-from tsmlib.checks import require_count, require_number
+from tsmlib.checks import require_count, require_number, require_type
 from tsmlib.logs import FromLogs
 from tsmlib.robot import Robot as Robot
 from tsmlib.robot import TrajectoryError as TrajectoryError
@@ -158,8 +158,8 @@ class Trajectories(FromLogs):
             ends[-1] + len(ends),
         ]:
             raise TrajectoryError(
-                f"{len(ends)} episodes of {ends[-1]} steps in all, but {len(states)} rows of states "
-                f"and {len(actions)} of actions; expected one state more than actions in each"
+                f"{len(ends)} episodes of {ends[-1]} steps in all, but {len(states)} rows of "
+                f"states and {len(actions)} of actions; expected one state more than actions in each"
             )
         x = np.split(states, ends[:-1] + np.arange(1, len(ends)))
         u = np.split(actions, ends[:-1])
@@ -269,7 +269,7 @@ class Trajectories(FromLogs):
                 f"{len(self)} episode(s) cannot be split with a share of {share:g}; expected two "
                 "or more episodes, and a share below 1. data.pieces(steps) cuts long episodes"
             )
-        order = np.random.default_rng(seed).permutation(len(self))
+        order = np.random.default_rng(require_count("seed", seed, least=0)).permutation(len(self))
         n = min(len(self) - 1, max(1, round(share * len(self))))
         return self.take(np.sort(order[:n])), self.take(np.sort(order[n:]))
 
@@ -291,6 +291,7 @@ class Trajectories(FromLogs):
 
     def joined(self, other: Trajectories) -> Trajectories:
         """The episodes of both; TrajectoryError where they are not of one robot."""
+        require_type("other", other, Trajectories, "Trajectories")
         self.robot.require_same(other.robot, "the episodes to be joined")
         return object.__new__(Trajectories)._fill(
             self.robot,
@@ -304,12 +305,14 @@ class Trajectories(FromLogs):
         """States (N, T + 1, dx) and actions (N, T, du) of one length: the last state repeats.
 
         Args:
-            horizon: steps T; those of the longest episode by default.
+            horizon: steps T, no fewer than the longest episode has, which is the default.
 
         Returns:
             States, and actions, which are zero after the end of an episode.
         """
-        horizon = self.horizon if horizon is None else horizon
+        if horizon is None:
+            horizon = self.horizon
+        require_count("horizon", horizon, least=self.horizon)
         at, ends = np.arange(horizon + 1), self.steps[:, None]
         states = self.flat_states[self.offsets[:, None] + np.minimum(at, ends)]
         first = (self.offsets - np.arange(len(self)))[:, None]
@@ -348,6 +351,11 @@ class Trajectories(FromLogs):
         Returns:
             The past (B, L, .) and the future (B, K, .).
         """
+        for name, length in (("past_len", past_len), ("future_len", future_len)):
+            require_count(name, length, least=0)
+        episodes, starts = _indices("episodes", episodes), _indices("starts", starts)
+        if not bool(((episodes >= 0) & (episodes < len(self))).all()):
+            raise TrajectoryError(f"episodes are {episodes!s:.80}; expected 0 to {len(self) - 1}")
         lengths = torch.from_numpy(self.steps)[episodes]
         if not bool(((starts >= 0) & (starts + future_len <= lengths)).all()):
             raise TrajectoryError(
@@ -384,3 +392,10 @@ class Trajectories(FromLogs):
                 f"{min(self.lengths)} to {self.horizon} steps. data.cut(steps) takes the beginning "
                 "of those that are long enough, data.episode(i) gives one, data.padded() pads them"
             )
+
+
+def _indices(name: str, values: Tensor) -> Tensor:
+    indices = torch.as_tensor(values)
+    if indices.ndim != 1 or indices.dtype.is_floating_point or indices.dtype.is_complex:
+        raise TrajectoryError(f"{name} are {values!s:.80}; expected whole numbers (B,)")
+    return indices.long()

@@ -176,6 +176,8 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
             "units": [""] * dx,
             "angles": [],
         }
+    if not isinstance(about["env"], str):
+        raise ValueError(f"env is {about['env']!r:.80}, expected a text")
     lists = {name: tuple(about[name]) for name in ("names", "units", "angles")}
     return {"env": about["env"], "dt": about["dt"]} | lists
 
