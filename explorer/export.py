@@ -1,9 +1,10 @@
-"""Export of what the page needs into a folder: physics as MJCF, networks as float32, and ``manifest.json`` over both.
+"""Export what the page needs into a folder: MJCF, float32 networks, and ``manifest.json``.
 
     python explorer/export.py explorer/dist
 
-From the shipped safetensors, whose checksums are verified when they are loaded. Weights are matrices (inputs,
-outputs) row by row, outputs padded with zeros to a multiple of 8, the last layer scaled to the units of a step.
+From the shipped safetensors, whose checksums are verified when they are loaded. Weights are
+matrices (inputs, outputs) row by row, outputs padded with zeros to a multiple of 8, the last layer
+scaled to the units of a step.
 """
 
 from __future__ import annotations
@@ -61,10 +62,10 @@ def of_layer(name: str, layer: nn.Module, scale: Tensor | None = None) -> Arrays
 
 
 def of_stack(decoder: CausalDecoder, scale: Tensor) -> Arrays:
-    """A stack of gated layers (Eq. 1) with its head: ReLU, and a hidden layer where there is one."""
+    """A stack of gated layers (Eq. 1) with its head: ReLU, and perhaps a hidden layer."""
     if decoder.state_skip or not all(layer.residual for layer in list(decoder.layers)[:-1]):
         raise ValueError(
-            "the page knows stacks with residual connections and no state skip; export another model"
+            "the page knows stacks with residual connections and no state skip; export another"
         )
     channels, found = decoder.inlet.out_features, of_layer("inlet", decoder.inlet)
     for i, (layer, code) in enumerate(
@@ -93,7 +94,7 @@ def statistics(features: Features) -> Arrays:
 
 @torch.no_grad()
 def network(model: nn.Module) -> tuple[dict[str, Json], Arrays]:
-    """What the page is told of a model, and its arrays. ValueError for a class that the page does not know."""
+    """What the page is told of a model, and its arrays; ValueError for an unknown class."""
     match model:
         case ActionPrior():
             shape: dict[str, Json] = {
@@ -139,13 +140,13 @@ def network(model: nn.Module) -> tuple[dict[str, Json], Arrays]:
                 statistics(model.features) | arrays
             )
     raise ValueError(
-        f"the page cannot run a {type(model).__name__}; it knows the segment models and their baselines"
+        f"the page cannot run a {type(model).__name__}; it knows segment models and baselines"
     )
 
 
 @torch.no_grad()
 def strongest_codes(model: DynamicsModel, env: str, n: int = 2) -> list[int]:
-    """The dimensions of the code that move the end of a rollout most, z = -2 to 2, over 20 starts of validation."""
+    """The dimensions of the code that move the end of a rollout most, over 20 starts."""
     if not isinstance(model, TSM | RecurrentTSM):
         return []
     task = draw_task(env, seed=1_000_003, n=20)
@@ -180,7 +181,7 @@ def write_network(folder: Path, name: str, model: nn.Module) -> dict[str, Json]:
 
 
 def write_physics(folder: Path, name: str, env: str) -> dict[str, Json]:
-    """Write the arm of ``env`` as MJCF, and the numbers of the compiled model that its six digits do not give."""
+    """Write the arm of ``env`` as MJCF, and the numbers that its six digits do not give."""
     model, spec = mujoco_arm.load_model(env), mujoco.MjSpec.from_file(str(mujoco_arm.ASSET))
     task = EnvSpec.parse(env).task
     if task != "reach":

@@ -2,12 +2,12 @@
 
     python explorer/measure.py [--targets 100] [parity] [plans] [closed] [page] [table]
 
-parity: largest differences of the page from Python, over the 100 frozen starts of pushing, and CPU time of a try.
-plans: returns of open-loop plans for the frozen targets, in the page and in Python with the same settings.
+parity: largest differences of the page from Python, over 100 frozen starts, and CPU time of a try.
+plans: returns of open-loop plans for the frozen targets, in the page and in Python.
 closed: success of closed loops over random scenes.
 page: times, sizes and accessibility in Chromium, by test/measure.mjs.
 
-Each is kept in measured.json, from which ``table`` writes. The page must be built; all but ``page`` ask it in node.
+Each is kept in measured.json, from which ``table`` writes. The page must be built.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def of_pushing() -> tuple[RecurrentTSM, ActionPrior]:
 
 
 def parity() -> dict[str, Any]:
-    """Largest absolute differences: states of `rtsm` after 50 steps of torques, and of MuJoCo after 100."""
+    """Largest differences: states of `rtsm` after 50 steps, and of MuJoCo after 100."""
     task, (model, _) = load_task(ENV), of_pushing()
     actions = smooth_torques(len(task), 100, generator=torch.Generator().manual_seed(5))
     env: Any = gymnasium.make_vec(ENV, num_envs=len(task)).unwrapped
@@ -112,7 +112,7 @@ def plans(targets: int) -> dict[str, Any]:
 
 
 def closed(targets: int) -> list[dict[str, Any]]:
-    """A run by page and by Python with each search and seed, kept as soon as it is done; none is repeated.
+    """A run by page and by Python with each search and seed, kept as soon as it is done.
 
     Fewer targets are the first ones of more.
     """
@@ -145,7 +145,7 @@ def closed_in_python(task: Task, again: dict[str, int], seed: int) -> dict[str, 
 
 
 def in_page(task: Task, **asked: Any) -> dict[str, float]:
-    """Means over the targets of a task, planned and executed in the page's own code with a full search."""
+    """Means over the targets of a task, planned and executed in the page's own code."""
     asked |= {"what": "plan", "task": "push", "model": "rtsm", "space": "latent"}
     (found,) = ask(
         asked | {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()}
@@ -165,7 +165,7 @@ def said(trial: Trial) -> dict[str, float]:
 
 
 def page() -> dict[str, Any]:
-    """Where the machine is busy, times by the clock stay those of the measurement before, with the load of then."""
+    """Where the machine is busy, times by the clock stay those of the measurement before."""
     with explorer.server(port=0) as running:
         thread = threading.Thread(target=running.serve_forever)
         thread.start()
@@ -220,7 +220,7 @@ def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
             (
                 "open-loop plan, 64 candidates x 6",
                 "1.0 s",
-                f"{seconds['plan_ms']} (median of {seen['plans']}, the fastest {seconds['plan_least_ms']})",
+                f"{seconds['plan_ms']} (median of {seen['plans']}; {seconds['plan_least_ms']})",
             ),
             (
                 "CPU time of an open-loop try, the busiest worker",
@@ -235,7 +235,8 @@ def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
             (
                 "later plan, for 0.2 s of arm time",
                 "0.2 s, else a smaller search",
-                f"{seconds['replan_ms']} (median of {seen['replans']}, {seen['replan_within_200_ms']:.0%} within 0.2 s), "
+                f"{seconds['replan_ms']} (median of {seen['replans']}, "
+                f"{seen['replan_within_200_ms']:.0%} within 0.2 s), "
                 f"candidates x iterations chosen: {seen['replan_searches']}",
             ),
             (
@@ -290,7 +291,7 @@ def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def loop_rows(runs: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """Means over planner seeds of closed loops, most scenes first; the page's beside Python's with the same search."""
+    """Means over planner seeds of closed loops; the page's beside Python's."""
     groups: dict[tuple[int, str, str], list[dict[str, Any]]] = {}
     for run in sorted(runs, key=lambda run: (-run["n"], run["search"], run["by"])):
         groups.setdefault((run["n"], run["search"], run["by"]), []).append(run)

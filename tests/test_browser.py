@@ -1,4 +1,4 @@
-"""A film moves in JupyterLab, in a notebook that it does not trust; seen in a browser, where there is one."""
+"""A film moves in JupyterLab, in a notebook that it does not trust."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from tsmlib import plots as figures
+from tsmlib import plots
 
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
@@ -104,10 +104,10 @@ def write_notebook(path: Path) -> None:
     for step in range(30):
         frames[step, :, 2 * step : 2 * step + 20] = 250
     video = base64.b64encode(
-        figures.save_video(frames, path.with_suffix(".mp4")).read_bytes()
+        plots.save_video(frames, path.with_suffix(".mp4")).read_bytes()
     ).decode()
     source = f'<source src="data:video/mp4;base64,{video}" type="video/mp4">'
-    data = {"image/png": base64.b64encode(figures.embed(frames, fps=10).data).decode()}
+    data = {"image/png": base64.b64encode(plots.embed(frames, fps=10).data).decode()}
     markup = {"text/html": f"<video controls>{source}</video>"}
     cell = nbformat.v4.new_code_cell("1", execution_count=1)
     cell.outputs = [nbformat.v4.new_output("display_data", each) for each in (data, markup)]
