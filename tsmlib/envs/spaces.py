@@ -50,7 +50,7 @@ def find_spec(env_id: str) -> GymnasiumSpec:
         UnsupportedEnvironment: the id says that no id can say how its environment is made.
         gymnasium.error.Error: Gymnasium does not know it.
     """
-    name, bracket, given = re.fullmatch(r"([^(+]*)([(+]?)(.*)", env_id, re.S).groups()
+    name, bracket, given = (*re.split(r"([(+])", env_id, maxsplit=1), "", "")[:3]
     module, colon, plain = name.partition(":")
     if colon:
         importlib.import_module(module)

@@ -1,7 +1,7 @@
 """Imperfect sensors and actuators, as ordinary Gymnasium wrappers (section 5.3.3)."""
 
 from collections import deque
-from typing import Unpack
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -167,7 +167,7 @@ def imperfect_arm(
 
 
 def imperfect_arms(
-    num_envs: int, env_id: str, noise: float, delay: int, **options: object
+    num_envs: int, env_id: str, noise: float, delay: int, **options: Any
 ) -> ImperfectArms:
     """N arms with both, as Gymnasium makes them; other options are those of `ArmVectorEnv`."""
     arms = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
