@@ -10,17 +10,19 @@ import sys
 import time
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import nbformat
 import pandas as pd
 import pytest
 
 import tsmlib
-from reproduction import runner, runs, tables, targets
+from reproduction import figures, pages, runner, runs, tables, targets
 from reproduction.papermill_plugin import completed
 from reproduction.plans import How
 from reproduction.runs import Missing, Run, env_id
 from tsmlib.__main__ import main
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
+from tsmlib.pretrained import ROOT
 from tsmlib.storage import artifacts
 
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
@@ -204,6 +206,34 @@ def test_markdown_leaves_out_what_is_missing() -> None:
     shown = tables.markdown(pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]}))
     assert "1.23" in shown
     assert "nan" not in shown
+
+
+def test_marked_places_are_filled_and_the_rest_is_left_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# Mine\n\n<!-- table: plans -->\nold\n<!-- end -->\n\nProse.\n")
+    once = pages.fill(page).read_text()
+    assert once.startswith("# Mine\n")
+    assert once.endswith("<!-- end -->\n\nProse.\n")
+    assert "| pushing, within 5 cm" in once
+    assert "old" not in once
+    assert pages.fill(page).read_text() == once
+    page.write_text("<!-- table: colours -->\n<!-- end -->")
+    with pytest.raises(ValueError, match="'colours'; there are predictions, plans"):
+        pages.fill(page)
+
+
+def test_the_tables_of_the_results_page_are_those_of_the_rows(tmp_path: Path) -> None:
+    page = ROOT / "docs" / "results.md"
+    copy = tmp_path / "results.md"
+    copy.write_text(page.read_text())
+    assert pages.fill(copy).read_text() == page.read_text(), "type: python -m tsmlib pages"
+
+
+@pytest.mark.parametrize("name", figures.FIGURES)
+def test_a_figure_is_drawn_of_the_published_rows(name: str) -> None:
+    figure = figures.FIGURES[name]()
+    assert len(figure.axes) > 1
+    plt.close(figure)
 
 
 # Notebooks ------------------------------------------------------------------------------------
