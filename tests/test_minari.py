@@ -265,8 +265,8 @@ def test_ours_comes_back_as_it_was(recwarn: pytest.WarningsRecorder) -> None:
     again = load_minari(folder)
     for name in ("env", "dt", "names", "units", "angles", "lengths", "terminated"):
         assert getattr(again, name) == getattr(data, name), name
-    np.testing.assert_array_equal(again.states, data.states)
-    np.testing.assert_array_equal(again.actions, data.actions)
+    np.testing.assert_array_equal(again.flat_states, data.flat_states)
+    np.testing.assert_array_equal(again.flat_actions, data.flat_actions)
     theirs = list(minari.load_dataset("made/cart-v0").iterate_episodes())
     assert [episode.rewards.tolist() for episode in theirs] == [[0, 1, 2, 3], [*range(9, 18)], [18]]
     assert [(episode.terminations[-1], episode.truncations[-1]) for episode in theirs] == [

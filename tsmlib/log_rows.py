@@ -20,6 +20,7 @@ Missing = Literal["split", "interpolate", "refuse"]
 Bounds = tuple[float, float] | Mapping[str, tuple[float, float]] | Literal["data"]
 FilePath = str | os.PathLike[str]
 FILLED = 5  # missing rows, one after the other, that "interpolate" fills in at most
+SLOW = 10  # s; a longer step is taken for a time in other units unless dt says so
 EMPTY = ("", "na", "n/a", "nan", "null", "none", "<na>")  # cells of a CSV that hold nothing
 
 
@@ -90,7 +91,17 @@ class Log:
         if dt is None:
             dt = median
             self.notes.append(f"dt is {dt:g} s, the median step of '{self.time}'")
+            if dt > SLOW:
+                raise TrajectoryError(
+                    f"the median step of '{self.time}' is {dt:g} s; expected seconds: divide a "
+                    f"time in milliseconds by 1e3, in nanoseconds by 1e9, or give dt={dt:g} if it is so"
+                )
         dt = require_number("dt", dt, 0, above=True)
+        if abs(median - dt) > 0.05 * dt:
+            raise TrajectoryError(
+                f"dt is {dt:g} s, but the median step of '{self.time}' is {median:g}; expected "
+                "both alike and in seconds: convert the time, or leave dt out"
+            )
         follows = within & (np.abs(steps - dt) <= 0.5 * dt)
         if follows.sum() < 0.7 * within.sum():
             raise TrajectoryError(
@@ -169,7 +180,7 @@ class Log:
 
 
 def names_of(field_: str, names: Sequence[str]) -> tuple[str, ...]:
-    listed = (names,) if isinstance(names, str) else tuple(names)
+    listed = (names,) if isinstance(names, str) else tuple(names or ())
     if not listed or not all(isinstance(name, str) for name in listed):
         raise TrajectoryError(f"{field_} is {names!r:.80}; expected names of columns")
     return listed
@@ -231,7 +242,7 @@ def _seconds(name: str, column: np.ndarray) -> np.ndarray:
         seconds = (column - start) / np.timedelta64(1, "s")
     elif len(column) and isinstance(column[0], str) and "-" in column[0][1:]:
         raise TrajectoryError(
-            f"the time '{name}' is {column[0]!r:.40}; expected seconds or dates: "
+            f"the time '{name}' is '{column[0]!s:.40}'; expected seconds or dates: "
             "pandas.to_datetime(...) makes dates of texts"
         )
     elif len(column) and hasattr(column[0], "timestamp"):  # dates with a time zone
@@ -251,7 +262,10 @@ def _codes(name: str, column: np.ndarray) -> np.ndarray:
     for row, value in enumerate(values):
         if value is None or value != value or str(value).strip().lower() in EMPTY:
             raise TrajectoryError(f"column '{name}' names no episode in row {row} of the table")
-    numbers = {value: code for code, value in enumerate(dict.fromkeys(values))}
+    try:
+        numbers = {value: code for code, value in enumerate(dict.fromkeys(values))}
+    except TypeError as error:
+        raise TrajectoryError(f"column '{name}' names no episodes: {error}") from error
     return np.array([numbers[value] for value in values], np.int64)
 
 
