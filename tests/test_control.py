@@ -1,4 +1,6 @@
-"""Collecting, executing, posing tasks: records are what happened; the gap is predicted minus executed return."""
+"""Collecting, executing, posing tasks: records are what happened; the gap is predicted minus
+executed return.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,6 @@ import dataclasses
 import math
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,21 +16,18 @@ import pytest
 import torch
 from torch import Tensor
 
-import tsmlib
 from tsmlib import rewards
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import imperfect
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
+from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE
 from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.baselines import LSTM, OneStep
-from tsmlib.models.ensemble import Ensemble
-from tsmlib.models.tsm import TSM
 from tsmlib.planning import predictors
 from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.pretrained import draw_task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories
@@ -45,7 +43,7 @@ def torques(n: int, steps: int, seed: int = 0) -> Tensor:
     return smooth_torques(n, steps, generator=torch.Generator().manual_seed(seed), rms=0.2)
 
 
-# Collecting ----------------------------------------------------------------------------------------------------------
+# Collecting
 
 
 @pytest.mark.parametrize("env_id", [REACHER, PUSH, "tsm/PymunkPush-v1"])
@@ -61,13 +59,6 @@ def test_collected_episodes_are_the_simulators_rollouts(env_id: str) -> None:
     arm = env.unwrapped
     assert (data.env, data.dt, data.names, data.angles) == (env_id, 0.02, tuple(arm.names), (0, 1))
     assert data.states.dtype == data.actions.dtype == np.float32
-
-
-def test_episodes_start_from_given_states() -> None:
-    env = arms(PUSH, 4)
-    start, _ = env.reset(seed=1)
-    data = collect(env, open_loop(torques(4, 6)), horizon=6, states=start[::-1])
-    np.testing.assert_array_equal(data.states[:, 0], start[::-1].astype(np.float32))
 
 
 def test_a_controller_that_is_asked_again_gets_the_past() -> None:
@@ -96,55 +87,14 @@ def test_what_is_recorded_is_what_the_arm_received() -> None:
     assert (data.actions == 1).all()
 
 
-@pytest.mark.parametrize("horizon", [0, -5])
-def test_a_horizon_without_steps_is_refused(horizon: int) -> None:
-    with pytest.raises(
-        ValueError, match=f"horizon is {horizon}, expected a positive number of steps"
-    ):
-        collect(arms(REACHER, 1), open_loop(torques(1, 5)), horizon=horizon)
+# Smooth torques
 
 
-def test_a_controller_without_an_answer_is_refused() -> None:
-    def three_steps(past: Segment) -> Tensor:
-        return torques(2, 3)[:, : 0 if past.actions.any() else 3]
-
-    with pytest.raises(
-        ValueError, match="the controller gave no actions when asked at step 3 of 10"
-    ):
-        collect(arms(REACHER, 2), three_steps, horizon=10, seed=0)
-
-
-# Smooth torques ------------------------------------------------------------------------------------------------------
-
-
-def test_torques_start_near_zero_and_settle_to_their_strength() -> None:
-    drawn = smooth_torques(4000, 60, generator=torch.Generator().manual_seed(0), rms=0.1)
-    strength = drawn.square().mean((0, 2)).sqrt()  # (60,)
-    assert strength[0] < 0.07
-    assert (strength[:5].diff() > 0).all()
-    assert strength[20:].min() > 0.097
-    assert strength[20:].max() < 0.103
-    assert drawn.mean().abs() < 1e-3
-
-
-def test_torques_are_smooth_bounded_and_a_function_of_their_generator() -> None:
-    drawn = torques(2000, 60)
-    assert drawn.diff(dim=1)[:, 20:].std() < 0.8 * drawn[:, 20:].std()
-    now, later = drawn[:, 20:-1].flatten(), drawn[:, 21:].flatten()
-    assert torch.corrcoef(torch.stack([now, later]))[0, 1] > 0.7
-    assert (
-        smooth_torques(500, 50, generator=torch.Generator().manual_seed(0), rms=2.0).abs().max()
-        == 1
-    )
-    assert torch.equal(torques(5, 9), torques(5, 9))
-    assert not torch.equal(torques(5, 9), torques(5, 9, seed=1))
-
-
-# Executing -----------------------------------------------------------------------------------------------------------
+# Executing
 
 
 def some_task(env: str = REACHER, n: int = 4, horizon: int = 20) -> Task:
-    return dataclasses.replace(study.draw_task(env, seed=3, n=n), horizon=horizon)
+    return dataclasses.replace(draw_task(env, seed=3, n=n), horizon=horizon)
 
 
 @pytest.mark.parametrize("env", ENV_IDS)
@@ -199,20 +149,6 @@ def test_a_reward_has_a_finite_slope_at_its_target() -> None:
     assert torch.isfinite(states.grad).all()
 
 
-@pytest.mark.parametrize("env", ["tsm/Reacher-v0", "tsm/ReacherPush-v1"])
-def test_random_torques_are_none_of_the_training_data(env: str) -> None:
-    known, task = (
-        torch.from_numpy(study.random_data(env, 200, seed=0).actions),
-        tsmlib.load_task(env),
-    )
-    torques = random_torques(task)
-    assert (torques[:, None] - known[:, : task.horizon]).abs().amax((2, 3)).min() > 0.01
-    of_data = smooth_torques(len(task), task.horizon, generator=torch.Generator().manual_seed(0))
-    assert not torch.allclose(
-        torques, of_data
-    )  # their noise, cut into episodes of the task's length
-
-
 def test_the_gap_is_predicted_minus_true() -> None:
     task = some_task()
     actions = random_torques(task)
@@ -232,14 +168,7 @@ def test_the_gap_is_predicted_minus_true() -> None:
         _ = plain.gap
 
 
-def test_a_trial_is_of_the_actions_that_were_executed() -> None:
-    task, strong = some_task(), torch.full((4, 20, 2), 3.0)
-    trial, clipped = execute(task, strong), execute(task, strong.clamp(-1, 1))
-    assert torch.equal(trial.actions, torch.ones(4, 20, 2))
-    assert torch.equal(trial.executed_return, clipped.executed_return)
-
-
-# Executing behind noisy sensors and with late actions -----------------------------------------------------------------
+# Executing behind noisy sensors and with late actions
 
 
 def imperfect_task(env: str = REACHER, n: int = 4, **how: Any) -> Task:
@@ -326,7 +255,7 @@ def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scor
     torch.testing.assert_close(trial.executed_return, expected)
 
 
-# Closed loop ---------------------------------------------------------------------------------------------------------
+# Closed loop
 
 as_it_is = partial(adam, iterations=0)  # the planner that leaves a plan as it is
 
@@ -391,7 +320,9 @@ def test_planning_again_through_the_true_simulator_never_makes_a_plan_worse() ->
 
 @dataclasses.dataclass
 class Wrong:
-    """A model in which every step adds to the angles, and that remembers which past it was asked about."""
+    """A model in which every step adds to the angles, and that remembers which past it was asked
+    about.
+    """
 
     segment_len: int = 5
     past_len: int = 3
@@ -440,7 +371,8 @@ def test_a_closed_loop_judges_its_candidates_by_what_it_is_told_to() -> None:
 
     task, model = some_task(horizon=20), Wrong()
     planner = partial(mppi, candidates=3, iterations=1)
-    mpc(task, model, DirectActions(20), planner, every=8, judge=judge, seed=5)  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    mpc(task, model, DirectActions(20), planner, every=8, judge=judge, seed=5)
     assert asked == [(5, 3), (21, 3), (37, 3)]  # other noise for each plan
     assert {len(past.states) // 4 for past in model.asked} == {
         3,
@@ -488,87 +420,7 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
     assert (trial.executed_return > 0.7 * execute(task, zero_torques(task)).executed_return).all()
 
 
-@pytest.mark.parametrize("over", ["actions", "codes"])
-@pytest.mark.parametrize(
-    "build",
-    [
-        partial(TSM, channels=8),
-        partial(OneStep, hidden=16),
-        partial(LSTM, hidden=16),
-        partial(Ensemble, hidden=16),
-        partial(Ensemble, hidden=16, gaussian=False),
-    ],
-    ids=["tsm", "onestep", "lstm", "ensemble", "ensemble+mse"],
-)
-def test_every_model_plans_again_and_again(build: Any, over: str) -> None:
-    torch.manual_seed(0)
-    task, model = some_task(PUSH, n=2), build(10, 2)
-    model.features.step_std.fill_(0.01)
-    prior = ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(20, 30, 2))
-    space = LatentActions(prior, 20) if over == "codes" else DirectActions(20)
-    planner = (
-        partial(adam, iterations=1, lr=0.1)
-        if over == "codes"
-        else partial(mppi, iterations=1, candidates=4)
-    )
-    trial = mpc(task, model, space, planner, every=7)  # no multiple of the prior's segment
-    assert trial.plan is not None
-    assert trial.actions.shape == (2, 20, 2)
-    assert trial.actions.abs().max() <= 1
-    assert trial.plan.curve.shape == (3, 2)
-    assert trial.plan.states.shape == (1, 2, 20, 10)
-    torch.testing.assert_close(
-        execute(task, trial.actions).states, trial.states, rtol=1e-4, atol=1e-5
-    )
-
-
-def test_a_closed_loop_without_steps_is_refused() -> None:
-    with pytest.raises(ValueError, match="every is 0, expected a positive number of steps"):
-        mpc(some_task(), None, DirectActions(20), as_it_is, every=0)
-
-
-# Tasks ---------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not study.FROZEN.exists(), reason="data/tasks is not there")
-@pytest.mark.parametrize("env", ENV_IDS)
-def test_frozen_tasks_are_those_their_seed_draws(env: str) -> None:
-    frozen, drawn = tsmlib.load_task(env), study.draw_task(env, seed=study.TASK_SEED["test"])
-    assert (frozen.name, frozen.env, len(frozen)) == (drawn.name, env, 100)
-    np.testing.assert_allclose(frozen.start, drawn.start, rtol=0, atol=1e-6)
-    torch.testing.assert_close(frozen.target, drawn.target, rtol=0, atol=1e-6)
-    assert not np.allclose(frozen.start, tsmlib.load_task(env, "validation").start)
-
-
-@pytest.mark.parametrize("env", ENV_IDS)
-def test_targets_lie_in_the_disc_and_the_first_tasks_are_the_same_for_any_number(env: str) -> None:
-    many, few = study.draw_task(env, seed=9), study.draw_task(env, seed=9, n=5)
-    assert many.target.norm(dim=1).max() <= 0.2
-    first = many.take(5)
-    assert len(first) == 5
-    np.testing.assert_array_equal(first.start, few.start)
-    assert torch.equal(first.target, few.target)
-
-
-@pytest.mark.parametrize("n", [-5, 0, 101])
-def test_a_task_has_no_more_targets_than_it_has(n: int) -> None:
-    with pytest.raises(ValueError, match="choose a number from 1 to 100"):
-        tsmlib.load_task(REACHER, "validation").take(n)
-
-
-@pytest.mark.parametrize("split", ["validation", "test"])
-@pytest.mark.parametrize("how", [{"noise": NOISE}, {"delay": DELAY}])
-def test_an_imperfect_arm_has_the_plain_arms_task(how: dict[str, Any], split: str) -> None:
-    for env in (REACHER, PUSH):
-        plain, task = tsmlib.load_task(env, split), tsmlib.load_task(imperfect(env, **how), split)
-        assert (task.name, task.horizon, EnvSpec.parse(task.env).arm.id) == (
-            plain.name,
-            plain.horizon,
-            env,
-        )
-        assert task.env != env
-        np.testing.assert_array_equal(task.start, plain.start)
-        assert torch.equal(task.target, plain.target)
+# Tasks
 
 
 def test_pushing_without_an_object_is_refused() -> None:
@@ -576,9 +428,3 @@ def test_pushing_without_an_object_is_refused() -> None:
         dataclasses.replace(
             some_task(), name="push", reward_for=rewards.push, position=rewards.BLOCK
         )
-
-
-def test_nothing_here_needs_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    execute(some_task(), zero_torques(some_task()))
-    assert not any(tmp_path.iterdir())

@@ -1,4 +1,6 @@
-"""A model and a prior that collect the data they learn from: rounds, their files, and what is refused."""
+"""A model and a prior that collect the data they learn from: rounds, their files, and what is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -13,55 +15,52 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import registry, spec
 from torch import Tensor
 
-import tsmlib as tsm
-from tsmlib import exploration
+import tsmlib
 from tsmlib.envs.unstable import SimulationUnstable
-from tsmlib.storage import artifacts
+from tsmlib.exploration import explore as exploration
 from tsmlib.storage.artifacts import digest
 from tsmlib.storage.files import StoreError
 from tsmlib.training.fit import fixed_windows, validate
-from tsmlib.trajectory import TrajectoryError
 
 ARM, EPISODES, HORIZON = "tsm/Reacher-v0", 3, 20
 
 
 @cache
-def data(env: str = ARM) -> tsm.Trajectories:
-    return tsm.collect_random(env, 8, horizon=HORIZON)
+def data(env: str = ARM) -> tsmlib.Trajectories:
+    return tsmlib.collect_random(env, 8, horizon=HORIZON)
 
 
-def tasks(k: int, n: int = EPISODES) -> tsm.Task:
+def tasks(k: int, n: int = EPISODES) -> tsmlib.Task:
     start = data().states[:n, k]
-    return replace(tsm.Task.standard(ARM, start, torch.full((n, 2), 0.1)), horizon=HORIZON)
+    return replace(tsmlib.Task.standard(ARM, start, torch.full((n, 2), 0.1)), horizon=HORIZON)
 
 
-def learners(seed: int = 0) -> tuple[tsm.RecurrentTSM, tsm.ActionPrior]:
+def learners(seed: int = 0) -> tuple[tsmlib.RecurrentTSM, tsmlib.ActionPrior]:
     train = data()
     return (
-        tsm.RecurrentTSM.for_data(train, seed=seed, hidden=8),
-        tsm.ActionPrior.for_data(train, seed=seed, channels=4, dilations=(1, 2)),
+        tsmlib.RecurrentTSM.for_data(train, seed=seed, hidden=8),
+        tsmlib.ActionPrior.for_data(train, seed=seed, channels=4, dilations=(1, 2)),
     )
 
 
-def options(**changes: Any) -> tsm.ExplorationOptions:
-    once = tsm.TrainingOptions(
+def options(**changes: Any) -> tsmlib.ExplorationOptions:
+    once = tsmlib.TrainingOptions(
         past_len=10, future_len=10, steps=4, batch_size=8, validate_every=2, lr=1e-3
     )
     usual = dict(model=once, prior=once, rounds=2, candidates=4, elites=2, iterations=1)
-    return tsm.ExplorationOptions(**(usual | changes))
+    return tsmlib.ExplorationOptions(**(usual | changes))
 
 
-def one_step(**changes: Any) -> tsm.ExplorationOptions:
+def one_step(**changes: Any) -> tsmlib.ExplorationOptions:
     return options(**({"model": replace(options().model, past_len=1)} | changes))
 
 
-def explored(model: Any, prior: Any, **given: Any) -> tsm.Exploration:
+def explored(model: Any, prior: Any, **given: Any) -> tsmlib.Exploration:
     usual = dict(options=options(), tasks=tasks, seed=3)
     train, held_out = data().take(slice(2, None)), data().take(slice(2))
-    return tsm.explore(model, prior, train, held_out, **(usual | given))
+    return tsmlib.explore(model, prior, train, held_out, **(usual | given))
 
 
 def bits(*parts: torch.nn.Module | None) -> list[str]:
@@ -160,21 +159,12 @@ def test_the_folder_of_another_loop_is_refused(tmp_path: Path) -> None:
         explored(*learners(seed=1), options=options(rounds=1), folder=tmp_path)
 
 
-def test_the_folder_of_a_model_that_is_made_otherwise_is_refused(tmp_path: Path) -> None:
-    def made(mode_weight: float) -> tsm.RecurrentTSM:
-        return tsm.RecurrentTSM.for_data(data(), hidden=8, mode_weight=mode_weight)
-
-    explored(made(0.0), learners()[1], options=options(rounds=1), folder=tmp_path)
-    with pytest.raises(StoreError, match=r"is of another exploration: configurations is "):
-        explored(made(5.0), learners()[1], options=options(rounds=1), folder=tmp_path)
-
-
 def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> None:
-    def unasked(k: int) -> tsm.Task:
+    def unasked(k: int) -> tsmlib.Task:
         raise AssertionError
 
-    def given(k: int) -> tsm.Trajectories | None:
-        return tsm.collect_random(ARM, EPISODES, horizon=HORIZON, seed=k) if k == 1 else None
+    def given(k: int) -> tsmlib.Trajectories | None:
+        return tsmlib.collect_random(ARM, EPISODES, horizon=HORIZON, seed=k) if k == 1 else None
 
     learned = learners()
     found = explored(*learned, tasks=unasked, episodes=given, folder=tmp_path)
@@ -190,7 +180,7 @@ def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> N
 
 def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as_it_was() -> None:
     (model, prior), worse = learners(), replace(options().model, lr=1.0, warmup=0)
-    tsm.fit(model, data(), data(), replace(options().model, steps=100, lr=1e-2), progress=False)
+    tsmlib.fit(model, model.loss, data(), data(), replace(options().model, steps=100, lr=1e-2))
     before = bits(model)
     found = explored(model, prior, options=options(rounds=1, model=worse))
     assert bits(model) == before
@@ -198,7 +188,7 @@ def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as
     assert found.records[0]["validation"] == validate(model.loss, windows, 3 + 1)
     other = learners()[0]
     other.load_state_dict(model.state_dict())
-    tsm.fit(other, found.train, found.held_out, worse, seed=3 + 1, progress=False)
+    tsmlib.fit(other, other.loss, found.train, found.held_out, worse, seed=3 + 1)
     assert (
         validate(other.loss, windows, 3 + 1) > found.records[0]["validation"]
     )  # it was worse indeed
@@ -209,29 +199,31 @@ def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(
 ) -> None:
     fine_tune, seen = exploration.fine_tune, []
 
-    def watched(part: Any, train: tsm.Trajectories, *given: Any, **named: Any) -> Any:
+    def watched(part: Any, loss: Any, train: tsmlib.Trajectories, *given: Any, **named: Any) -> Any:
         seen.append((type(part), len(train)))
-        return fine_tune(part, train, *given, **named)
+        return fine_tune(part, loss, train, *given, **named)
 
     monkeypatch.setattr(exploration, "fine_tune", watched)
     explored(*learners(), options=options(rounds=1), augmented=lambda data: data.joined(data))
     n = 6 + EPISODES - 1
-    assert seen == [(tsm.ActionPrior, n), (tsm.RecurrentTSM, 2 * n)]
+    assert seen == [(tsmlib.ActionPrior, n), (tsmlib.RecurrentTSM, 2 * n)]
 
 
 def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores() -> None:
     train = data("Pendulum-v1")
-    model = tsm.OneStep.for_data(train, hidden=8)
+    model = tsmlib.OneStep.for_data(train, hidden=8)
 
     def upright(states: Tensor, actions: Tensor) -> Tensor:
         return states[..., 0] - 0.001 * actions[..., 0].square()
 
-    def swings(k: int) -> tsm.Task:
-        return tsm.Task.from_env("Pendulum-v1", n=3, horizon=HORIZON, reward=upright, seed=10 * k)
+    def swings(k: int) -> tsmlib.Task:
+        return tsmlib.Task.from_env(
+            "Pendulum-v1", n=3, horizon=HORIZON, reward=upright, seed=10 * k
+        )
 
     once = replace(options().model, past_len=model.past_len)
     small, found = (
-        tsm.explore(
+        tsmlib.explore(
             copy.deepcopy(model),
             None,
             train,
@@ -278,7 +270,7 @@ def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_unti
 ) -> None:
     whole, asked = exploration.mpc, []
 
-    def unstable(task: tsm.Task, *given: Any, **named: Any) -> tsm.Trial:
+    def unstable(task: tsmlib.Task, *given: Any, **named: Any) -> tsmlib.Trial:
         asked.append(task.start)
         if len(asked) == 1:
             raise SimulationUnstable(ARM, 1, 7, "velocity")
@@ -299,10 +291,12 @@ def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_unti
 
 
 def unstable_episode(episodes: set[int], env: str = ARM) -> Any:
-    """A stub of ``mpc`` in which the episodes that start where these of round 1 do become unstable at step 7."""
+    """A stub of ``mpc`` in which the episodes that start where these of round 1 do become unstable
+    at step 7.
+    """
     whole, bad = exploration.mpc, tasks(1).start[sorted(episodes)]
 
-    def run(task: tsm.Task, *given: Any, **named: Any) -> tsm.Trial:
+    def run(task: tsmlib.Task, *given: Any, **named: Any) -> tsmlib.Trial:
         for i, start in enumerate(task.start):
             if (start == bad).all(1).any():
                 raise SimulationUnstable(env, i, 7, "velocity")
@@ -337,30 +331,13 @@ def test_a_round_that_loses_all_its_episodes_stops_nothing(
     assert bits(*again) == bits(*learned)
 
 
-@pytest.mark.parametrize("bonus", [0.0, 1.0])
-def test_a_round_without_episodes_has_its_line_in_a_table_of_rounds(
-    bonus: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(exploration, "mpc", unstable_episode({0, 1, 2}))
-    table = tsm.CsvCallback(tmp_path / "rounds.csv")
-    for _ in range(2):  # the second time from the folder
-        found = explored(
-            *learners(),
-            options=options(rounds=2, bonus=bonus),
-            folder=tmp_path / "loop",
-            callback=table,
-        )
-        assert [list(each) for each in found.records] == [list(found.records[0])] * 2
-        lines = (tmp_path / "rounds.csv").read_text().splitlines()
-        assert lines[0].split(",")[2:] == list(found.records[0])
-        assert [line.split(",")[0] for line in lines] == ["step", "1", "2"]
-
-
 def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     """Judge and planner of every ``mpc`` that is called."""
     whole, seen = exploration.mpc, list[tuple[Any, Any]]()
 
-    def watched(task: tsm.Task, model: Any, space: Any, planner: Any, **named: Any) -> tsm.Trial:
+    def watched(
+        task: tsmlib.Task, model: Any, space: Any, planner: Any, **named: Any
+    ) -> tsmlib.Trial:
         seen.append((named["judge"], planner))
         return whole(task, model, space, planner, **named)
 
@@ -371,9 +348,9 @@ def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
 @pytest.mark.parametrize(
     ("changes", "judge", "samples", "screened"),
     [
-        ({}, tsm.expected_predictor, 8, 0.25),
-        ({"judging": 2, "screened": 0.5}, tsm.expected_predictor, 2, 0.5),
-        ({"bonus": 1.0}, tsm.model_predictor, 4, 1.0),
+        ({}, tsmlib.expected_predictor, 8, 0.25),
+        ({"judging": 2, "screened": 0.5}, tsmlib.expected_predictor, 2, 0.5),
+        ({"bonus": 1.0}, tsmlib.model_predictor, 4, 1.0),
     ],
 )
 def test_candidates_are_judged_by_the_mode_and_samples_and_with_a_bonus_by_its_samples_alone(
@@ -393,48 +370,15 @@ def test_candidates_are_judged_by_the_mode_and_samples_and_with_a_bonus_by_its_s
     )
 
 
-def test_a_folder_of_plans_by_the_mode_goes_on_as_such_and_is_refused_by_an_expectation(
-    tmp_path: Path,
-) -> None:
-    by_mode = options(rounds=1, judging=0, screened=1.0)
-    found = explored(*learners(), options=by_mode, folder=tmp_path)
-    for path in (tmp_path / "round-001").glob(
-        "*.safetensors"
-    ):  # as of a version that had no choice
-        forget(path, "judging", "screened")
-    assert explored(*learners(), options=by_mode, folder=tmp_path).records == found.records
-    with pytest.raises(StoreError, match="is of another exploration: options"):
-        explored(*learners(), options=options(rounds=1), folder=tmp_path)
-
-
-def forget(path: Path, *names: str) -> None:
-    """Take options out of what a file says of the loop that wrote it."""
-    kind = "trajectories" if path.stem == "episodes" else "model"
-    tensors, header = artifacts.load(path, kind=kind)
-    identity: Any = header["identity"]
-    identity["options"] = {
-        name: value for name, value in identity["options"].items() if name not in names
-    }
-    artifacts.save(path, tensors, kind=kind, header=header)
-
-
 def test_a_model_without_samples_is_judged_by_its_rollout_whatever_the_options(
     tmp_path: Path,
 ) -> None:
     def found(**changes: Any) -> list[dict[str, float]]:
-        model = tsm.OneStep.for_data(data(), hidden=8)
+        model = tsmlib.OneStep.for_data(data(), hidden=8)
         once = options(rounds=1, model=replace(options().model, past_len=1), **changes)
         return explored(model, learners()[1], options=once, folder=tmp_path).records
 
     assert found(judging=0, screened=1.0) == found()
-
-
-def test_the_seconds_of_a_round_are_kept_with_it(tmp_path: Path) -> None:
-    found = explored(*learners(), folder=tmp_path, measure=lambda model, prior: {"asked": 1.0})
-    assert [each.keys() for each in found.seconds] == [set(exploration.SECONDS)] * 2
-    assert all(value > 0 for each in found.seconds for value in each.values())
-    assert not any(set(exploration.SECONDS) & set(record) for record in found.records)
-    assert explored(*learners(), folder=tmp_path).seconds == found.seconds
 
 
 def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
@@ -451,30 +395,6 @@ def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
     ((planner, _, generator),) = made
     searched = torch.Generator().manual_seed(planner.keywords["seed"])
     assert not torch.equal(torch.randn(8, generator=generator), torch.randn(8, generator=searched))
-
-
-def test_a_limit_of_time_ends_an_episode_without_terminating_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(
-        registry,
-        "tests/Limited-v0",
-        replace(spec("Pendulum-v1"), id="tests/Limited-v0", max_episode_steps=12),
-    )
-    train = tsm.collect_random("tests/Limited-v0", 6, horizon=HORIZON)
-
-    def swings(k: int) -> tsm.Task:
-        def reward(x: Tensor, u: Tensor) -> Tensor:
-            return x[..., 0]
-
-        return tsm.Task.from_env("tests/Limited-v0", n=3, horizon=12, reward=reward, seed=k)
-
-    model, once = tsm.OneStep.for_data(train, hidden=8), replace(options().model, past_len=1)
-    found = tsm.explore(
-        model, None, train, train, swings, options(model=once, prior=None, rounds=1)
-    )
-    assert set(found.train.steps) == {12}
-    assert not any(found.train.terminated)
 
 
 def test_a_measure_by_a_name_that_the_record_has_is_refused() -> None:
@@ -496,23 +416,23 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
             "OneStep is deterministic: its samples do not disagree. Take bonus=0",
         ),
         (
-            dict(tasks=lambda k: tsm.load_task("tsm/ReacherObstacle-v0").take(3)),
+            dict(tasks=lambda k: tsmlib.load_task("tsm/ReacherObstacle-v0").take(3)),
             "are of tsm/ReacherObstacle-v0, the data",
         ),
         (
-            dict(prior=None, model=tsm.LSTM(10, 2, hidden=8)),
+            dict(prior=None, model=tsmlib.LSTM(10, 2, hidden=8)),
             "states have 10 dimensions .* tsm/Reacher-v0 6",
         ),
         (
-            dict(prior=None, model=tsm.LSTM(6, 2, angles=(0,), hidden=8)),
+            dict(prior=None, model=tsmlib.LSTM(6, 2, angles=(0,), hidden=8)),
             r"angles \[0\], .*angles \[0, 1\]; expected",
         ),
         (
-            dict(prior=None, model=tsm.LSTM(6, 3, angles=(0, 1), hidden=8)),
+            dict(prior=None, model=tsmlib.LSTM(6, 3, angles=(0, 1), hidden=8)),
             "actions have 3 dimensions, .*Reacher-v0 2",
         ),
         (
-            dict(prior=tsm.ActionPrior.for_data(data("Pendulum-v1"))),
+            dict(prior=tsmlib.ActionPrior.for_data(data("Pendulum-v1"))),
             "prior's actions have 1 dimensions, .*Reacher-v0 2",
         ),
         (
@@ -528,27 +448,12 @@ def test_some_episodes_of_a_round_are_always_trained_on() -> None:
 )
 def test_what_cannot_explore_is_refused(given: Mapping[str, Any], said: str) -> None:
     usual = {
-        "model": tsm.OneStep.for_data(data(), hidden=8),
+        "model": tsmlib.OneStep.for_data(data(), hidden=8),
         "prior": learners()[1],
         "options": one_step(),
     }
     with pytest.raises(ValueError, match=said):
         explored(**(usual | given))
-
-
-def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned() -> None:
-    model, prior = learners()
-    with pytest.raises(
-        TrajectoryError, match=r"not of one robot: env is 'tsm/Reacher-v0' and 'Pendulum-v1'"
-    ):
-        tsm.explore(
-            model,
-            prior,
-            data(),
-            data("Pendulum-v1"),
-            lambda k: pytest.fail("asked for tasks"),
-            options(),
-        )
 
 
 @pytest.mark.parametrize(
@@ -574,17 +479,3 @@ def test_held_out_data_of_another_robot_are_refused_before_anything_is_planned()
 def test_options_without_meaning_are_refused(changes: Mapping[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         options(**changes)
-
-
-def test_a_whole_number_of_rounds_may_be_one_of_numpy() -> None:
-    assert len(explored(*learners(), options=options(rounds=np.int64(1))).records) == 1
-
-
-def test_episodes_are_joined_whatever_their_lengths_and_never_those_of_two_robots() -> None:
-    long, short = data().take(slice(2)), data().cut(5).take(slice(3))
-    both = short.joined(long)
-    assert both.steps.tolist() == [5] * 3 + [HORIZON] * 2
-    np.testing.assert_array_equal(both.take([3, 4]).states, long.states)
-    np.testing.assert_array_equal(both.episode(0)[0], short.states[0])
-    with pytest.raises(TrajectoryError, match="to be joined are not of one robot"):
-        long.joined(data("Pendulum-v1"))

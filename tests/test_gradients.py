@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tsmlib import study
+import tsmlib
 from tsmlib.evaluation import gradients
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
@@ -77,7 +77,9 @@ def test_a_return_through_model_prior_and_reward_is_differentiable_in_codes_torq
 
 
 class Pushed:
-    """A world whose fingertip goes where it is pushed, and meets a wind of a strength that samples disagree on."""
+    """A world whose fingertip goes where it is pushed, and meets a wind of a strength that samples
+    disagree on.
+    """
 
     segment_len, past_len = 10, 1
 
@@ -104,7 +106,9 @@ def test_more_noise_in_the_world_is_less_signal_and_none_is_all() -> None:
 
 
 def test_the_signal_of_a_gradient_is_its_mean_over_its_deviation() -> None:
-    """The return is minus the distance, far along one axis, so that its slope is that of the fingertip: known."""
+    """The return is minus the distance, far along one axis, so that its slope is that of the
+    fingertip: known.
+    """
     task = some_task(1, horizon=1)
     task.target[:] = torch.tensor([0.2, 0.0])
     task.start[:, 4:6] = [-0.2, 0.0]

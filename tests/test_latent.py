@@ -11,7 +11,7 @@ import pytest
 import torch
 from untrained import in_units
 
-from tsmlib import study
+from tsmlib.collection import collect_random
 from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
 from tsmlib.evaluation import contacts, exploitation, futures, latent, prediction
 from tsmlib.evaluation.contacts import Deflections
@@ -21,9 +21,6 @@ from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
-from tsmlib.storage import tables
-from tsmlib import zoo
-from reproduction.results import latent as latent_results
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 PUSH = "tsm/ReacherPush-v1"
@@ -35,7 +32,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 @pytest.fixture(scope="module")
 def test_data() -> Trajectories:
-    return study.random_data(PUSH, 40, seed=3)
+    return collect_random(PUSH, 40, seed=3, rms=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -181,14 +178,6 @@ def test_every_step_counts_alike_however_often_it_occurs() -> None:
     assert math.isnan(latent.root_mean(squares, torch.zeros(3, 2, dtype=torch.bool)))
 
 
-def test_groups_are_sorted_by_spread() -> None:
-    variance = torch.arange(40.0)[torch.randperm(40, generator=rng())][:, None]
-    spread, error = latent.by_spread(variance, 4 * variance)
-    assert len(spread) == 10
-    assert (np.diff(spread) > 0).all()
-    np.testing.assert_allclose(error, 2 * spread)
-
-
 def test_a_planted_spread_after_contact_is_found() -> None:
     seen = scene(50)
     seen.window.future.states[:25, 6:, 6:8] = torch.tensor(
@@ -247,19 +236,6 @@ def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> N
     assert contacts.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
 
 
-def test_episodes_that_hit_a_wall_are_spaced_by_how_far_the_object_goes(
-    model: TSM, test_data: Trajectories
-) -> None:
-    seen = scene(6, steps=10)
-    reach, way = 0.21 - 0.15, torch.linspace(0, 1, 10)
-    seen.window.future.states[:4, :, 7] = 0.15 + reach * way  # up to the wall
-    seen.window.future.states[:4, :, 6] += (
-        torch.tensor([0.03, 0.01, 0.02, 0.04])[:, None] * way
-    )  # and along it
-    assert contacts.into_a_wall(seen, n=4).tolist() == [1, 2, 0, 3]
-    assert contacts.into_a_wall(seen, n=2).tolist() == [1, 3]
-
-
 def test_the_first_episode_with_and_without_a_touch_are_told_apart(test_data: Trajectories) -> None:
     found = contacts.first_episodes(test_data, after=10)
     near = closest_gap(found["contact"].states, PUSH)[0] < 0.001
@@ -268,7 +244,7 @@ def test_the_first_episode_with_and_without_a_touch_are_told_apart(test_data: Tr
     assert closest_gap(found["free"].states, PUSH).min() >= 0.001
     assert [len(episode) for episode in found.values()] == [1, 1]
     assert list(
-        contacts.first_episodes(study.random_data("tsm/Reacher-v0", 2, seed=0), after=10)
+        contacts.first_episodes(collect_random("tsm/Reacher-v0", 2, seed=0, rms=0.1), after=10)
     ) == ["free"]
 
 
@@ -351,80 +327,6 @@ def test_the_directions_that_move_an_outcome_are_found() -> None:
     torch.testing.assert_close(found.abs(), torch.eye(6)[[2, 4]], atol=0.01, rtol=0)
     assert explained > 0.99
     assert latent.directions(codes, torch.randn(500, 2, generator=rng(2)))[1] < 0.1
-
-
-def test_codes_are_held_in_a_plane_and_keep_what_lies_beside_it() -> None:
-    plane = torch.linalg.qr(torch.randn(8, 2, generator=rng()))[0].T
-    codes, at = torch.randn(50, 8, generator=rng(1)), torch.tensor([1.5, -2.0])
-    held = latent.held(codes, plane, at)
-    torch.testing.assert_close(held @ plane.T, at.expand(50, 2))
-    beside = torch.eye(8) - plane.T @ plane
-    torch.testing.assert_close(held @ beside, codes @ beside)
-
-
-def test_a_map_of_codes_lies_in_the_plane_that_moves_the_object(
-    model: TSM, test_data: Trajectories
-) -> None:
-    past, future = futures.sample_futures(model, test_data.take(slice(1)), samples=1).window
-    window = Window(*(Segment(*(part[:1] for part in side)) for side in (past, future)))
-    found = latent.code_map(model, window, n=200)
-    z, y = (part - part.mean(0) for part in (found.codes, found.ways[:, -1]))
-    slope = torch.linalg.lstsq(z, y).solution
-    torch.testing.assert_close(found.plane.T @ (found.plane @ slope), slope, rtol=1e-3, atol=1e-6)
-    torch.testing.assert_close(found.at, found.codes @ found.plane.T)
-    assert 0 < found.told <= 1
-
-
-def test_the_plane_of_largest_variance_is_found() -> None:
-    codes = torch.randn(4000, 4, generator=rng()) * torch.tensor([0.1, 2.0, 0.1, 1.0])
-    points, share = latent.principal(codes)
-    torch.testing.assert_close(points.var(0), torch.tensor([4.0, 1.0]), rtol=0.1, atol=0)
-    assert share.sum() > 0.98
-
-
-def test_panels_hold_one_value_per_seed_and_leave_out_what_was_not_measured() -> None:
-    row = dict(env=PUSH, model="tsm", execution="open loop", subset="object")
-    rows = tables.frame(
-        dict(row, seed=k, value=0.5 + 0.1 * k, metric=m, steps_ahead=h)
-        for k in (0, 1)
-        for m in ("recall", "precision", "chance")
-        for h in (10, 20, 30)
-    )
-    found = latent_results.recall_panels(rows, PUSH)
-    assert list(found) == ["arm touches object"]
-    np.testing.assert_allclose(
-        found["arm touches object"][zoo.method("tsm")]["recall"], [[0.5] * 3, [0.6] * 3]
-    )
-    assert latent_results.recall_panels(rows[:-1], PUSH) == {}  # seed 1 lacks a stretch
-    kl = dict(
-        env=PUSH,
-        model="tsm",
-        execution="segments",
-        subset="contact",
-        metric="kl",
-        seed=0,
-        value=2.0,
-    )
-    panels = latent_results.use_panels(tables.frame([kl]), [PUSH])["KL per segment"]
-    assert panels["ReacherPush, with a touch"][zoo.method("tsm")].tolist() == [2.0]
-    assert list(panels) == ["ReacherPush, with a touch"]
-
-
-def test_thresholds_stand_beside_the_mean_over_seeds() -> None:
-    row = dict(metric="kl", execution="segments", env="tsm/Reacher-v0", model="tsm", seed=0)
-    rows = [
-        dict(row, value=0.02),
-        dict(row, value=0.04, seed=1),
-        dict(row, model="lstm", value=9.0),
-    ]
-    table = latent_results.thresholds_table(tables.frame(rows), ["tsm"])
-    (line,) = table.splitlines()[2:]  # what was not measured is left out
-    assert [cell.strip() for cell in line.split("|")[1:-1]] == [
-        "Reacher: KL (nats)",
-        "at most 0.1",
-        "0.03",
-    ]
-    assert "9" not in table.replace("0.9", "")
 
 
 def test_a_past_longer_than_what_was_observed_begins_with_the_first_state(

@@ -1,4 +1,6 @@
-"""mbrl-lib's models behind our planners and ours behind its ``ModelEnv``; with stand-ins where it is not installed."""
+"""mbrl-lib's models behind our planners and ours behind its ``ModelEnv``; with stand-ins where it
+is not installed.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import tsmlib as tsm
-from tsmlib.models.base import rollout, stepper
+import tsmlib
 from tsmlib.contrib.mbrl_lib import (
     ForModelEnv,
     MbrlModel,
@@ -22,6 +23,7 @@ from tsmlib.contrib.mbrl_lib import (
     reward_function,
     transition_batch,
 )
+from tsmlib.models.base import rollout, stepper
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.rewards import reach
 from tsmlib.trajectory import Segment, initial_past
@@ -99,7 +101,7 @@ def some_actions(steps: int = 6, rows: int = B) -> Tensor:
     return torch.rand(rows, steps, DU, generator=torch.Generator().manual_seed(2)) * 2 - 1
 
 
-# Theirs behind ours --------------------------------------------------------------------------------------------------
+# Theirs behind ours
 
 
 @pytest.mark.parametrize(
@@ -161,17 +163,17 @@ def test_a_sample_keeps_its_member_and_elites_alone_predict() -> None:
 
 
 @pytest.mark.parametrize("make", [stand_in, theirs])
-@pytest.mark.parametrize("planner", [tsm.cem, tsm.adam])
+@pytest.mark.parametrize("planner", [tsmlib.cem, tsmlib.adam])
 def test_our_planners_plan_through_it(
-    make: Callable[..., Any], planner: Callable[..., tsm.Plan]
+    make: Callable[..., Any], planner: Callable[..., tsmlib.Plan]
 ) -> None:
     def nearer(states: Tensor, actions: Tensor) -> Tensor:
         return -states[..., :2].square().sum(-1) - 0.01 * actions.square().sum(-1)
 
     past = Segment(some_past().states[:2], some_past().actions[:2])
-    predict = tsm.model_predictor(MbrlModel(make()), past)
-    budget = {"candidates": 40, "iterations": 6} if planner is tsm.cem else {"iterations": 20}
-    plan = planner(predict, nearer, tsm.DirectActions(8, action_dim=DU), 2, **budget)
+    predict = tsmlib.model_predictor(MbrlModel(make()), past)
+    budget = {"candidates": 40, "iterations": 6} if planner is tsmlib.cem else {"iterations": 20}
+    plan = planner(predict, nearer, tsmlib.DirectActions(8, action_dim=DU), 2, **budget)
     zero = torch.zeros(1, 2, 8, DU)
     nothing = nearer(predict(zero), zero).sum(-1).mean(0)[0]  # over the members
     assert (plan.predicted_return > nothing).all()
@@ -212,7 +214,7 @@ def test_another_object_is_refused_by_what_it_lacks() -> None:
 def test_transitions_know_where_episodes_end() -> None:
     pytest.importorskip("mbrl.types")
     episodes = [np.arange(3 * (n + 1), dtype=np.float32).reshape(-1, 3) for n in (2, 4)]
-    data = tsm.Trajectories(
+    data = tsmlib.Trajectories(
         episodes,
         [np.zeros((len(x) - 1, 1), np.float32) for x in episodes],
         "cart",
@@ -228,11 +230,13 @@ def test_transitions_know_where_episodes_end() -> None:
     assert batch.truncateds.tolist() == [False, False, False, False, False, True]
 
 
-# Ours behind theirs --------------------------------------------------------------------------------------------------
+# Ours behind theirs
 
 
 class ModelEnv:
-    """A stand-in for ``mbrl.models.ModelEnv``: what it asks of its dynamics model, in the same order."""
+    """A stand-in for ``mbrl.models.ModelEnv``: what it asks of its dynamics model, in the same
+    order.
+    """
 
     def __init__(self, model: ForModelEnv, reward: Any, generator: torch.Generator) -> None:
         self.dynamics_model, self.reward, self.generator = model, reward, generator
@@ -256,10 +260,10 @@ class ModelEnv:
 
 def an_arms(cls: Any, **arguments: Any) -> Any:
     """A model of the arm with new weights, made for a little data, and the data."""
-    torques = tsm.smooth_torques(12, 40, generator=torch.Generator().manual_seed(0))
-    data = tsm.collect(
+    torques = tsmlib.smooth_torques(12, 40, generator=torch.Generator().manual_seed(0))
+    data = tsmlib.collect(
         gymnasium.make_vec("tsm/Reacher-v0", num_envs=12),
-        tsm.open_loop(torques),
+        tsmlib.open_loop(torques),
         horizon=40,
         seed=0,
     )
@@ -267,11 +271,11 @@ def an_arms(cls: Any, **arguments: Any) -> Any:
 
 
 MODELS = [
-    (tsm.OneStep, {}),
-    (tsm.LSTM, {"hidden": 8}),
-    (tsm.TSM, {}),
-    (tsm.RecurrentTSM, {}),
-    (tsm.Ensemble, {}),
+    (tsmlib.OneStep, {}),
+    (tsmlib.LSTM, {"hidden": 8}),
+    (tsmlib.TSM, {}),
+    (tsmlib.RecurrentTSM, {}),
+    (tsmlib.Ensemble, {}),
 ]
 
 
@@ -305,7 +309,7 @@ def test_stepped_by_mbrl_lib_a_model_predicts_its_rollout(
 
 
 def test_what_happened_before_is_the_past_of_a_rollout() -> None:
-    model, data = an_arms(tsm.LSTM, hidden=8)
+    model, data = an_arms(tsmlib.LSTM, hidden=8)
     whole = data.take(slice(0, 1)).segment(model.past_len)
     past = Segment(*(part[:, 15 : 15 + model.past_len] for part in whole))
     adapted, actions = ForModelEnv(model, 2), torch.from_numpy(data.actions[:3, :5])
@@ -324,7 +328,7 @@ def test_what_happened_before_is_the_past_of_a_rollout() -> None:
 
 
 def test_a_state_is_stepped_on_from_once() -> None:
-    model, data = an_arms(tsm.OneStep)
+    model, data = an_arms(tsmlib.OneStep)
     adapted, u = ForModelEnv(model, 2), torch.zeros(3, 2)
     first = adapted.reset(data.states[:3, 0])
     adapted.sample(u, first, deterministic=True)
@@ -335,8 +339,8 @@ def test_a_state_is_stepped_on_from_once() -> None:
 
 
 def test_returns_by_model_env_are_those_of_a_rollout() -> None:
-    model, data = an_arms(tsm.OneStep)
-    task = tsm.Task.standard("tsm/Reacher-v0", data.states[:1, 0], torch.tensor([[0.1, 0.1]]))
+    model, data = an_arms(tsmlib.OneStep)
+    task = tsmlib.Task.standard("tsm/Reacher-v0", data.states[:1, 0], torch.tensor([[0.1, 0.1]]))
     actions = torch.from_numpy(data.actions[:6, :20])
     found = ModelEnv(
         ForModelEnv(model, 2), reward_function(task.reward), torch.Generator()
@@ -407,7 +411,7 @@ def test_an_agent_of_mbrl_lib_plans_in_our_model() -> None:
 
 def test_without_mbrl_lib_it_is_said_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mbrl.models", None)
-    model, _ = an_arms(tsm.OneStep)
+    model, _ = an_arms(tsmlib.OneStep)
     with pytest.raises(
         ImportError, match=r"pip install 'tsmlib\[mbrl\]', then pip install --no-deps mbrl"
     ):

@@ -1,10 +1,11 @@
-"""Policies: what they see, what they may do, and that they learn what the model they learn in rewards."""
+"""Policies: what they see, what they may do, and that they learn what the model they learn in
+rewards.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,8 @@ import torch
 from torch import Tensor
 from untrained import in_units
 
-import tsmlib.envs
-from reproduction import policies as study_policies
-from reproduction import runs
-from tsmlib import study
+import tsmlib
+import tsmlib.envs  # noqa: F401 - registers the environments
 from tsmlib.collection import collect
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import rollout, stepper
@@ -33,13 +32,12 @@ from tsmlib.policies.learning import (
     episodes_from,
     imagine,
     learn_policy,
-    learning_rate,
 )
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
-from tsmlib.sampling import Noise, SeparateNoise, standard_normal
+from tsmlib.sampling import Noise, standard_normal
 from tsmlib.storage import artifacts, files
-from tsmlib.training.callbacks import CsvCallback, Progress
+from tsmlib.training.callbacks import Progress
 from tsmlib.training.checkpoint import TrainingStopped
 from tsmlib.trajectory import Segment
 
@@ -61,7 +59,9 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 
 class Sled:
-    """Position and velocity in a plane, pushed by the action: x'' = u with friction. Known, and linear."""
+    """Position and velocity in a plane, pushed by the action: x'' = u with friction. Known, and
+    linear.
+    """
 
     segment_len = past_len = 1
 
@@ -84,7 +84,9 @@ class Sled:
 
 
 def arrive(target: Tensor) -> Reward:
-    """Minus the squared distance of the first two dimensions from the target, minus a little for the action."""
+    """Minus the squared distance of the first two dimensions from the target, minus a little for
+    the action.
+    """
     return lambda states, actions: (
         -(states[..., :2] - target[:, None]).square().sum(-1) - 0.01 * actions.square().sum(-1)
     )
@@ -150,7 +152,7 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-# Rolling out one action at a time ------------------------------------------------------------------------------------
+# Rolling out one action at a time
 
 
 @pytest.mark.parametrize("sampled", [False, True], ids=["mode", "sample"])
@@ -182,29 +184,7 @@ def test_a_model_that_cannot_step_predicts_segments_of_one_action() -> None:
         past = past.then(Segment(slow, u[:, None]))
 
 
-def test_a_short_past_is_refused() -> None:
-    with pytest.raises(ValueError, match="the past holds 2 steps, TSM needs 4"):
-        stepper(model("tsm"), some_past(2, steps=2))
-
-
-def test_noise_of_each_copy_is_its_own() -> None:
-    both = SeparateNoise(tuple(torch.Generator().manual_seed(seed) for seed in (4, 5)))
-    like = torch.zeros(())
-    drawn = standard_normal((6, 2), both, like)
-    for rows, seed in ((drawn[:3], 4), (drawn[3:], 5)):
-        assert torch.equal(rows, torch.randn(3, 2, generator=torch.Generator().manual_seed(seed)))
-
-
-
-
-
-
-def test_the_first_action_of_a_decoded_segment_needs_no_other() -> None:
-    past, z = some_past(5).actions, normal(5, 3)
-    torch.testing.assert_close(prior().first(past, z), prior().decode(past, z)[:, 0])
-
-
-# Acting --------------------------------------------------------------------------------------------------------------
+# Acting
 
 
 @KINDS
@@ -290,7 +270,7 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
     env.close()
 
 
-# Learning ------------------------------------------------------------------------------------------------------------
+# Learning
 
 
 @KINDS
@@ -473,35 +453,6 @@ def test_a_callback_sees_every_record_of_learning_and_leaves_the_bits_alone() ->
     assert [one.values["asked"] for one in seen] == [2.0] * 3
 
 
-@KINDS
-def test_a_policy_whose_learning_was_stopped_has_every_record_once_in_its_table(
-    kind: str, tmp_path: Path
-) -> None:
-    table = CsvCallback(tmp_path / "returns.csv")
-
-    def stop(progress: Progress) -> None:
-        table(progress)
-        if progress.step == 4:
-            raise KeyboardInterrupt
-
-    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy")
-    with pytest.raises(KeyboardInterrupt):
-        learn(policy(kind), callback=stop, **settings)
-    curve = learn(policy(kind), callback=table, **settings)
-    steps, returns = np.loadtxt(table.path, delimiter=",", skiprows=1, usecols=(0, 2), unpack=True)
-    assert steps.tolist() == curve.iteration == [0, 2, 4, 6, 8]
-    assert returns.tolist() == [value for (value,) in curve.predicted]
-
-
-def test_the_rate_decays_to_a_tenth_in_2200_iterations() -> None:
-    rates = [learning_rate(i) for i in (0, 99, 100, 2199, 2200, 5000)]
-    assert rates == pytest.approx([1e-3, 1e-3, 9e-4, 1e-3 * 0.9**21, 1e-4, 1e-4])
-
-
-def test_later_rewards_count_less() -> None:
-    assert discounted(torch.tensor([[1.0, 1.0, 1.0]]), 0.5).item() == 1.75
-
-
 def test_targets_fill_the_disc_evenly_and_starts_are_among_those_given() -> None:
     given = torch.arange(12.0).reshape(3, 4)
     start, target = episodes_from(given, radius=0.2)(4000, torch.Generator().manual_seed(0))
@@ -512,7 +463,7 @@ def test_targets_fill_the_disc_evenly_and_starts_are_among_those_given() -> None
     assert torch.equal(start.unique(dim=0), given)
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
+# Files
 
 
 @KINDS
@@ -529,109 +480,7 @@ def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
         artifacts.load_model(path, type(actor), expect={"env": "tsm/ReacherPush-v1"})
 
 
-@pytest.mark.parametrize("space", ["latent", "direct"])
-def test_a_learned_policy_is_found_again_by_what_it_was_made_from(
-    space: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    net, about = study.load_or_train(run, "tsm/Reacher-v0", "onestep")
-    task, method = (
-        tsmlib.load_task("tsm/Reacher-v0", "validation").take(3),
-        study.method("onestep", space, "policy"),
-    )
-    assert study.stored_budget(run, task.env, method) is None
-    actor, header = study.learn(run, task, method, study.Budget(copies=2))
-    assert study.stored_budget(run, task.env, method) == study.Budget(copies=2, iterations=4)
-    near = study.within_data(run, task, actor)
-    assert near.shape == (2,)
-    assert ((near >= 0) & (near <= 1)).all()
-    assert header["curve"]["iteration"] == [0, 1, 2, 3, 4]
-    for metric in ("return_true", "return_predicted", "final_distance", "success"):
-        assert torch.tensor(header["curve"]["measured"][metric]).shape == (5, 2)
-    assert header["targets"] == 2  # of the three, so that the curve is the same for whoever asks
-    found = study.assess(actor, net, task.take(2), seed=2)
-    last = {
-        metric: torch.tensor(values[-1]) for metric, values in header["curve"]["measured"].items()
-    }
-    for metric, values in found.items():
-        torch.testing.assert_close(values, last[metric])
-    with monkeypatch.context() as patch:
-        patch.setattr(study_policies, "learn_policy", None)
-        again, _ = study.learn(run, task, method, study.Budget(copies=2))
-        assert same(weights(again), weights(actor))
-        with pytest.raises(TypeError):
-            study.learn(run, task, method)
-        with torch.no_grad():
-            next(net.parameters()).add_(1)
-        artifacts.save_model(run.models / "Reacher" / "onestep.safetensors", net, about)
-        with pytest.raises(TypeError):
-            study.learn(run, task, method, study.Budget(copies=2))
-    assert [path.name for path in (run.models / "Reacher").glob("policy*")] == [
-        f"policy-onestep-{space}.safetensors"
-    ]
-
-
-def test_early_records_are_those_of_the_whole_curve_and_lie_beside_it(tmp_path: Path) -> None:
-    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    task, method = (
-        tsmlib.load_task("tsm/Reacher-v0", "validation").take(3),
-        study.method("onestep", "latent", "policy"),
-    )
-    whole = study.Budget(copies=2)
-    curve = study.learn(run, task, method, whole).header["curve"]["measured"]["return_true"]
-    before = {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()}
-    assert not [row for row in study.policy_rows(run, [(task, method, whole)]) if row.get("subset")]
-    rows = study.early_rows(run, [(task, method, study.Budget(copies=2, iterations=2))])
-    told = [
-        (row["metric"], row["subset"], row["iteration"], row["copy"], row["value"]) for row in rows
-    ]
-    assert told == [
-        ("return_true", "early", i, copy, curve[i][copy]) for i in range(3) for copy in range(2)
-    ]
-    assert {path: path.read_bytes() for path in run.models.rglob("*") if path.is_file()} == before
-    again = study.policy_rows(run, [(task, method, whole)])
-    assert [row for row in again if row.get("subset") == "early"] == rows
-
-
-def test_the_studys_policies_are_of_the_papers_rewards_alone(tmp_path: Path) -> None:
-    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    task = (
-        tsmlib.load_task("tsm/Reacher-v0")
-        .take(2)
-        .with_reward("reach", lambda states, actions: -states[..., 0].abs())
-    )
-    with pytest.raises(
-        ValueError, match=r"task 'reach' has a reward of its own; .* with tsmlib.learn_policy"
-    ):
-        study.learn(run, task, study.method("onestep", "direct", "policy"))
-
-
-def test_a_policy_is_assessed_by_the_tasks_own_measure_of_success() -> None:
-    task = tsmlib.load_task("tsm/Reacher-v0").take(3)
-    task = replace(task, success=lambda states: torch.tensor([True, False, True]))
-    found = study.assess(OneStepPolicy(6, DU), in_units(OneStep(6, DU, hidden=8)), task, seed=0)
-    assert found["success"].tolist() == pytest.approx([2 / 3])
-
-
-def test_a_policy_that_reads_a_long_past_acts_in_an_episode() -> None:
-    task = tsmlib.load_task("tsm/Reacher-v0").take(2)
-    far = policy("segment", 6, dilations=(1, 2, 4, 8)).float()
-    assert far.past_len == 16
-    assert study.execute_policy(task, far).states.shape == (2, 51, 6)
-
-
-@pytest.mark.parametrize("bad", [("", 0, 1), ("latent", -1, 1), ("latent", 0, 0)])
-def test_an_unknown_way_to_learn_is_refused_before_anything_is_trained(
-    bad: tuple[str, int, int], tmp_path: Path
-) -> None:
-    run = runs.resolve("05_control", scale="smoke", seed=1, run_dir=str(tmp_path))
-    with pytest.raises(ValueError, match="expected latent or direct, 0"):
-        task, method = tsmlib.load_task("tsm/Reacher-v0"), study.method("tsm", bad[0], "policy")
-        study.learn(run, task, method, study.Budget(iterations=bad[1], copies=bad[2]))
-    assert not run.dir.exists() or not any(run.models.rglob("*.safetensors"))
-
-
-# What goes wrong -----------------------------------------------------------------------------------------------------
+# What goes wrong
 
 
 BAD: dict[str, tuple[Callable[[Tensor, Tensor], Any], str]] = {
@@ -663,15 +512,6 @@ def test_a_reward_that_cannot_be_learned_from_is_refused(reward: Any, message: s
     with pytest.raises((ValueError, FloatingPointError), match=message):
         learn(actor, reward=lambda target: reward, episodes=4)
     assert same(weights(actor), before)
-
-
-@pytest.mark.parametrize("name", ["horizon", "episodes", "iterations", "record_every"])
-def test_numbers_that_are_not_positive_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} 0.*expected positive"):
-        learn(policy("onestep"), **{name: 0})
-    if name == "horizon":
-        with pytest.raises(ValueError, match="horizon is 0, expected a positive number"):
-            imagine(policy("onestep"), Sled(), torch.zeros(1, 4), torch.zeros(1, 2), horizon=0)  # type: ignore[arg-type]
 
 
 @KINDS

@@ -124,7 +124,8 @@ def plan_by(
         "cem": {"candidates": 64, "elites": 8},
         "mppi": {"candidates": 64},
     }[planner]
-    return plan(predict, reward, space, start, iterations=iterations, **{**usual, **settings})  # type: ignore[operator]
+    # type: ignore[operator]
+    return plan(predict, reward, space, start, iterations=iterations, **{**usual, **settings})
 
 
 # Optima

@@ -249,7 +249,12 @@ class _Learner:
         curve.predicted.append(predicted.tolist())
         newest = {"predicted": curve.predicted[-1]}
         for name, values in (measure(self.policy) if measure else {}).items():
-            numbers = as_tensor(f"measure's {name}", values, (self.policy.copies,)).tolist()
+            numbers = torch.as_tensor(values).double().flatten().tolist()  # may be no number
+            if len(numbers) != self.policy.copies:
+                raise ValueError(
+                    f"measure gave {len(numbers)} values of {name!r}; expected one for each of the "
+                    f"{self.policy.copies} copies"
+                )
             curve.measured.setdefault(name, []).append(numbers)
             newest[name] = numbers
         self.state.keep(-predicted.mean().item())
