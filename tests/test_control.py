@@ -26,7 +26,7 @@ from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.planning.execution import execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.planning.tasks import Task, random_torques, zero_torques
+from tsmlib.planning.tasks import Task, random_torques
 from tsmlib.pretrained import draw_task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise
@@ -100,7 +100,7 @@ def some_task(env: str = REACHER, n: int = 4, horizon: int = 20) -> Task:
 @pytest.mark.parametrize("env", ENV_IDS)
 def test_without_torque_the_return_is_that_of_staying_put(env: str) -> None:
     task = some_task(env)
-    trial = execute(task, zero_torques(task))
+    trial = execute(task, task.idle_actions())
     distance = np.linalg.norm(task.start[:, task.position] - task.target.numpy(), axis=1)
     assert trial.states.shape == (4, 21, task.start.shape[1])
     np.testing.assert_allclose(
@@ -246,7 +246,7 @@ def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scor
     None
 ):
     task, model = imperfect_task(noise=NOISE), Wrong()
-    trial = mpc(task, model, DirectActions(20), as_it_is, every=10)  # type: ignore[arg-type]
+    trial = mpc(task, model, DirectActions(20, rms=0.1), as_it_is, every=10)  # type: ignore[arg-type]
     assert trial.observed is not None
     told = {past.states[:4, -1].contiguous().numpy().tobytes() for past in model.asked}
     for now in (0, 10):
@@ -372,7 +372,7 @@ def test_a_closed_loop_judges_its_candidates_by_what_it_is_told_to() -> None:
     task, model = some_task(horizon=20), Wrong()
     planner = partial(mppi, candidates=3, iterations=1)
     # type: ignore[arg-type]
-    mpc(task, model, DirectActions(20), planner, every=8, judge=judge, seed=5)
+    mpc(task, model, DirectActions(20, rms=0.1), planner, every=8, judge=judge, seed=5)
     assert asked == [(5, 3), (21, 3), (37, 3)]  # other noise for each plan
     assert {len(past.states) // 4 for past in model.asked} == {
         3,
@@ -385,7 +385,7 @@ def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
         return adam(predict, reward, space, torch.full((1, 4, *space.shape), 0.2), iterations=0)
 
     task, model = some_task(horizon=20), Wrong()
-    trial = mpc(task, model, DirectActions(20), push_on, every=8)  # type: ignore[arg-type]
+    trial = mpc(task, model, DirectActions(20, rms=0.1), push_on, every=8)  # type: ignore[arg-type]
     whole = Trajectories(
         trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
     ).segment(3)
@@ -417,7 +417,7 @@ def test_a_reward_that_depends_on_the_time_sees_the_whole_episode() -> None:
     )
     assert trial.plan is not None
     torch.testing.assert_close(trial.plan.curve[-1], trial.executed_return, rtol=1e-3, atol=1e-4)
-    assert (trial.executed_return > 0.7 * execute(task, zero_torques(task)).executed_return).all()
+    assert (trial.executed_return > 0.7 * execute(task, task.idle_actions()).executed_return).all()
 
 
 # Tasks

@@ -97,7 +97,7 @@ class Pushed:
 
 
 def test_more_noise_in_the_world_is_less_signal_and_none_is_all() -> None:
-    task, space = some_task(horizon=10), DirectActions(10)
+    task, space = some_task(horizon=10), DirectActions(10, rms=0.1)
     strong, weak = (gradients.signal(task, Pushed(wind), space, samples=200) for wind in (0.1, 1.0))
     assert strong.shape == weak.shape == (3,)
     assert (strong > 5 * weak).all()

@@ -18,9 +18,7 @@ from tsmlib.evaluation.contacts import Deflections
 from tsmlib.evaluation.futures import SampledFutures
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
-from tsmlib.models.recurrent import RecurrentTSM
 from tsmlib.models.tsm import TSM
-from tsmlib.rewards import BLOCK
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 PUSH = "tsm/ReacherPush-v1"
@@ -52,11 +50,6 @@ class Shifts:
 
     def decode(self, past: Segment, actions: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         return (past.states[:, -1] + self.reach * z)[:, None].expand(-1, actions.shape[1], -1)
-
-
-@pytest.fixture(scope="module")
-def recurrent(test_data: Trajectories) -> RecurrentTSM:
-    return RecurrentTSM.for_data(test_data, hidden=8, latent_dim=3)
 
 
 def still_window(n: int, steps: int = 10) -> Window:
@@ -144,81 +137,11 @@ def test_windows_of_figure_9_begin_five_steps_before_the_first_touch(
         contacts.windows_before_contact(model, test_data, samples=1, horizon=95)
 
 
-def test_codes_of_a_recurrent_model_are_looked_at_in_the_same_way(
-    recurrent: RecurrentTSM, test_data: Trajectories
-) -> None:
-    seen = futures.sample_futures(recurrent, test_data, samples=4, horizon=30)
-    swings, _ = contacts.windows_before_contact(recurrent, test_data, samples=2, horizon=20)
-    found = latent_results.rows(recurrent, seen, swings, model="rtsm", seed=0, scale="smoke")
-    effects = [row["value"] for row in found if row["metric"] == "importance"]
-    assert len(effects) == 3
-    assert min(effects) > 0
-    codes = torch.randn(5, 3, generator=rng())
-    one = latent.widest(seen, recurrent, codes, 30)
-    ways = latent.decode_codes(recurrent, one, codes, 30)
-    assert ways.shape == (5, 30, 10)
-    past, future = (Segment(*(part.expand(5, -1, -1) for part in side)) for side in one)
-    first = recurrent.decode(past, future.actions[:, :10], codes)
-    torch.testing.assert_close(ways[:, :10], first)  # then the mode goes on
-    spread = float((ways[:, -1, BLOCK] - ways[0, -1, BLOCK]).norm(dim=1).max())
-    for i in range(
-        len(seen.window.past.states)
-    ):  # no other window has the object end further apart
-        other = Window(*(Segment(*(part[i : i + 1] for part in side)) for side in seen.window))
-        ends = latent.decode_codes(recurrent, other, codes, 30)[:, -1, BLOCK]
-        assert float((ends - ends[0]).norm(dim=1).max()) <= spread
-    still = latent.decode_codes(recurrent, one, torch.zeros(1, 3), 30)
-    assert torch.equal(still, recurrent.predict_segment(*one[:1], one.future.actions))
-
-
 def test_every_step_counts_alike_however_often_it_occurs() -> None:
     squares = torch.tensor([[1.0, 4.0], [1.0, 100.0], [1.0, 100.0]])
     where = torch.tensor([[True, True], [True, False], [True, False]])
     assert latent.root_mean(squares, where) == pytest.approx(math.sqrt(2.5))
     assert math.isnan(latent.root_mean(squares, torch.zeros(3, 2, dtype=torch.bool)))
-
-
-def test_a_planted_spread_after_contact_is_found() -> None:
-    seen = scene(50)
-    seen.window.future.states[:25, 6:, 6:8] = torch.tensor(
-        [0.15, 0.02]
-    )  # the object lies at the arm from step 6 on
-    noise = torch.randn(64, 50, 10, 10, generator=rng())
-    size = torch.full((50, 10), 0.02)
-    size[:25, 6:] = 0.1
-    seen = SampledFutures(PUSH, seen.window, seen.window.future.states + size[..., None] * noise)
-    net: Any = SimpleNamespace(
-        code_len=10,
-        latent_dim=1,
-        features=moving(),
-        decode=lambda past, u, z: u[..., :1].expand(-1, -1, 10),
-    )
-    rows = latent_results.code_rows(net, seen, rng(), model="rtsm", seed=0, scale="smoke")
-    value = {(row["metric"], row.get("subset", "")): row["value"] for row in rows}
-    assert value["spread_ratio", ""] == pytest.approx(5, rel=0.05)
-    assert value["spread", "before touch"] == pytest.approx(0.02, rel=0.05)
-    assert value["importance", ""] == 0
-    assert not any(
-        metric.startswith(("kl", "error_")) for metric, _ in value
-    )  # of no encoder that was trained for it
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_one_code_is_one_future_unless_the_decoder_draws_more(noise: float) -> None:
-    seen, draw = scene(8), rng()
-    still = torch.zeros(8, 1)
-    net: Any = SimpleNamespace(
-        code_len=10,
-        latent_dim=1,
-        features=moving(),
-        encode=lambda states: (still, still),
-        decode=lambda past, u, z: (
-            past.states + noise * torch.randn(past.states.shape, generator=draw)
-        ),
-    )
-    rows = latent_results.code_rows(net, seen, rng(), model="tsm", seed=0, scale="smoke")
-    [variance] = [row["value"] for row in rows if row["metric"] == "fixed_code_variance"]
-    assert variance == pytest.approx(noise**2 / 2, rel=0.2)  # of two, about their mean
 
 
 def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> None:
@@ -284,12 +207,6 @@ def test_intervals_of_honest_directions_hold_the_truth_as_often_as_they_should()
     )
     assert found.inside(0.8).float().mean() == pytest.approx(0.8, abs=0.05)
     assert found.spread.median() == pytest.approx(math.degrees(0.4), rel=0.05)
-
-
-def test_where_nothing_was_moved_there_are_no_deflections_to_tell_of() -> None:
-    found = Deflections(torch.zeros(5, 0), torch.zeros(0), torch.zeros(5, 0))
-    assert [len(end) for end in found.interval()] == [0, 0]
-    assert latent_results.deflection_rows(found, PUSH, model="tsm", seed=0, scale="smoke") == []
 
 
 def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:

@@ -173,7 +173,7 @@ def test_our_planners_plan_through_it(
     past = Segment(some_past().states[:2], some_past().actions[:2])
     predict = tsmlib.model_predictor(MbrlModel(make()), past)
     budget = {"candidates": 40, "iterations": 6} if planner is tsmlib.cem else {"iterations": 20}
-    plan = planner(predict, nearer, tsmlib.DirectActions(8, action_dim=DU), 2, **budget)
+    plan = planner(predict, nearer, tsmlib.DirectActions(8, DU, rms=0.1), 2, **budget)
     zero = torch.zeros(1, 2, 8, DU)
     nothing = nearer(predict(zero), zero).sum(-1).mean(0)[0]  # over the members
     assert (plan.predicted_return > nothing).all()

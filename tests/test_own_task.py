@@ -18,7 +18,7 @@ from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.predictors import model_predictor, simulator_predictor
 from tsmlib.planning.search_spaces import DirectActions
-from tsmlib.planning.tasks import Task, zero_torques
+from tsmlib.planning.tasks import Task
 from tsmlib.pretrained import draw_task
 from tsmlib.rewards import Reward
 
@@ -49,7 +49,7 @@ def test_an_own_task_is_planned_for_and_executed() -> None:
         elites=6,
         iterations=5,
     )
-    trial, nothing = execute(task, plan), execute(task, zero_torques(task))
+    trial, nothing = execute(task, plan), execute(task, task.idle_actions())
     torch.testing.assert_close(
         trial.executed_return, arc(trial.states[:, 1:], trial.actions).sum(-1)
     )
@@ -173,7 +173,7 @@ def test_a_reward_that_is_no_number_somewhere_stops_every_planner() -> None:
             FloatingPointError, match=r"the reward is nan .* although the state there is finite"
         ):
             # type: ignore[operator]
-            plan(through, task.reward, DirectActions(T), torch.ones(1, N, T, 2))
+            plan(through, task.reward, DirectActions(T, rms=0.1), torch.ones(1, N, T, 2))
 
 
 def test_a_slope_that_is_no_number_stops_adam() -> None:
@@ -184,7 +184,7 @@ def test_a_slope_that_is_no_number_stops_adam() -> None:
         adam(
             model_predictor(in_units(TSM(6, 2, channels=8)), task.past(10)),
             task.reward,
-            DirectActions(T),
+            DirectActions(T, rms=0.1),
             N,
             iterations=2,
         )
@@ -205,7 +205,7 @@ def test_adam_refuses_a_reward_without_a_gradient_and_the_others_do_not(flat: Re
     task = posed(flat)
     predict, space = (
         model_predictor(in_units(TSM(6, 2, channels=8)), task.past(10)),
-        DirectActions(T),
+        DirectActions(T, rms=0.1),
     )
     with pytest.raises(
         ValueError, match=r"not a differentiable function of the states.*plan with cem or mppi"

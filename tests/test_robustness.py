@@ -307,7 +307,6 @@ def test_other_episodes_are_refused(kalman: KalmanFilter, held_out: Pair, test_d
 # Rows
 
 
-OURS, THEIRS = zoo.method("tsm", "latent"), zoo.method("lstm", "direct")
 WORLDS: dict[str, dict[str, Any]] = {
     "clean": {},
     "noise": {"noise": NOISE},
