@@ -226,7 +226,7 @@ def test_a_value_that_makes_no_sense_is_refused_with_what_is_allowed(
         ("tsm/ReacherPush-mass1.2.3-v1", "float"),
         ("tsm/Reacher-mass2-v0", "it has no object"),
         ("tsm/ReacherPush-gain0.7-mass2-v1", "none of tsm/Reacher-v0"),
-        ("tsm/ReacherPush-mass2-v0", "gone: .*tsm/ReacherPush-mass2-v1 took its place"),
+        ("tsm/ReacherPush-mass2-v0", "none of tsm/Reacher-v0"),
     ],
 )
 def test_another_spelling_is_refused(name: str, message: str) -> None:
@@ -443,7 +443,7 @@ def test_the_task_of_a_variant_with_the_same_shape_is_the_frozen_one() -> None:
     assert len(large) == 100
     assert closest_gap(large.start.astype(float), large.env).min() > 0
     trial, same = (
-        tsmlib.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3)))
+        tsmlib.execute(task.take(3), torch.from_numpy(torques(3, rms=0.3, steps=100)))
         for task in (heavy, standard)
     )
     assert not torch.equal(trial.states, same.states)
@@ -479,7 +479,7 @@ def test_a_file_of_another_variant_is_refused_with_the_values_that_differ(tmp_pa
 
 def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
     program = (
-        "import json, torch, tsmlib as tsm; from tsmlib.envs import fingerprint\n"
+        "import json, torch, tsmlib; from tsmlib.envs import fingerprint\n"
         "env = 'tsm/Reacher-damping2-v0'\n"
         "assert tsmlib.collect_random(env, episodes=2, horizon=5, seed=0).env == env\n"
         "task = tsmlib.load_task('tsm/Reacher-damping2-v0').take(2)\n"
@@ -495,18 +495,3 @@ def test_another_process_runs_a_task_of_a_variant_by_its_id() -> None:
     assert states == here[:, -1, 0].tolist()
     assert printed == fingerprint(name)
     assert printed["damping"] == 2.0
-
-
-@pytest.mark.parametrize(
-    ("changes", "label"),
-    [
-        ({}, ""),
-        ({"torque_gain": 0.7}, "torque × 0.7"),
-        ({"link_lengths": (0.12, 0.11)}, "upper link × 1.2"),
-        ({"object_radius": 0.045, "mass": 2.0}, "mass × 2, object × 1.5"),
-    ],
-)
-def test_a_figure_names_an_arm_by_factors_of_what_the_standard_one_has(
-    changes: Any, label: str
-) -> None:
-    assert Physics(**changes).label == label

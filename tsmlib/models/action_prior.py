@@ -141,15 +141,17 @@ class ActionPrior(Configured):
         Returns:
             Actions (B, K H, du) in [-1, 1].
         """
-        options = {"dtype": self.std.dtype, "device": self.std.device}
-        z = as_tensor("z", z, ("B", "K", self.latent_dim), **options)
+        z = self._own("z", z, ("B", "K", self.latent_dim))
         shape = (len(z), "L", self.action_dim)
-        past_actions = as_tensor("past_actions", past_actions, shape, **options)
+        past_actions = self._own("past_actions", past_actions, shape)
         segments = []
         for code in z.unbind(1):
             past_actions = self.decode(past_actions[:, -self.past_len :], code)
             segments.append(past_actions)
         return torch.cat(segments, dim=1)
+
+    def _own(self, name: str, value: Tensor, shape: tuple[int | str, ...]) -> Tensor:
+        return as_tensor(name, value, shape, dtype=self.std.dtype, device=self.std.device)
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Squared error plus beta KL per segment, free-running over the window's future.

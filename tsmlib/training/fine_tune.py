@@ -85,9 +85,10 @@ def fine_tune(
     what = "the model and data of its robot, changed,"
     require_robot(model, train.robot, what, but=("env",))
     first = {name: weight.detach().clone() for name, weight in model.state_dict().items()}
-    held_out = fixed_windows(validation, options.past_len, options.future_len)
+    held_out = fixed_windows(validation, *options.lengths)
     before = validate(loss, held_out, require_seed("seed", seed))
-    robot, model.robot = getattr(model, "robot", None), train.robot
+    robot = getattr(model, "robot", None)
+    setattr(model, "robot", train.robot)  # noqa: B010 - of any module
     try:
         with _only(model, part):
             history = fit(
@@ -111,7 +112,7 @@ def fine_tune(
             )
         raise
     except BaseException:
-        model.robot = robot
+        setattr(model, "robot", robot)  # noqa: B010
         raise
     if min(history.validation) >= before:
         model.load_state_dict(first)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -100,14 +101,19 @@ def fit(
     require_type("progress", progress, (bool, str), "True, False or the title of a bar")
     if checkpoint is not None:
         require_type("checkpoint", checkpoint, (str, Path), "the path of a folder")
-    if hasattr(model, "take_robot"):
-        model.take_robot(train)
-    lengths = {"past_len": o.past_len, "future_len": o.future_len}
-    held_out = fixed_windows(validation, o.past_len, o.future_len)
+    if (take_robot := getattr(model, "take_robot", None)) is not None:
+        take_robot(train)
+    past_len, future_len = o.lengths
+    held_out = fixed_windows(validation, past_len, future_len)
     held_out = Window(*(segment.to(require_device(device)) for segment in held_out))
     generator, title = torch.Generator(), type(model).__name__ if progress is True else progress
-    episodes = train.tensors().to(device)
-    draw = batches(episodes, **lengths, batch_size=o.batch_size, generator=generator)
+    draw = batches(
+        train.tensors().to(device),
+        past_len=past_len,
+        future_len=future_len,
+        batch_size=o.batch_size,
+        generator=generator,
+    )
     keep_freed_memory()
     with _trained_on(device, model):
         identity: dict[str, Json] = asdict(o)
@@ -147,7 +153,7 @@ def checked(
     require_type("model", model, nn.Module, f"a model, {CALL}")
     if not any(weight.requires_grad for weight in model.parameters()):
         raise ValueError("model has no weight to train; expected one with requires_grad")
-    loss = getattr(model, "loss", None) if loss is None else loss
+    loss = cast(Loss, getattr(model, "loss", None) if loss is None else loss)
     require_callable("loss", loss, f"a function (window, generator) -> scalar, {CALL}")
     require_type("data", data, Trajectories, f"Trajectories, {CALL}")
     if validation is None:
@@ -159,7 +165,7 @@ def checked(
     return loss, data, validation, options.for_model(model, data)
 
 
-def require_device(device: object) -> str:
+def require_device(device: str) -> str:
     """The name of a device that is there; ValueError otherwise."""
     require_type("device", device, str, "'cpu' or 'cuda'")
     try:
@@ -167,7 +173,7 @@ def require_device(device: object) -> str:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device is {device!r:.80}; expected 'cpu' or 'cuda': {reason}") from error
-    return str(device)
+    return device
 
 
 def _identity(

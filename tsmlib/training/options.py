@@ -64,6 +64,13 @@ class TrainingOptions:
         if first >= last:
             raise ValueError(f"span is {self.span}; expected the first number below the second")
 
+    @property
+    def lengths(self) -> tuple[int, int]:
+        """Steps of the past and of the future of a window, both known."""
+        if self.past_len is None or self.future_len is None:
+            raise ValueError("past_len or future_len is None; options.for_model(model, data) asks")
+        return self.past_len, self.future_len
+
     def for_model(self, model: nn.Module, data: Trajectories) -> TrainingOptions:
         """Fill in what is None.
 
