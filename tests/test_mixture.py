@@ -14,7 +14,6 @@ import tsmlib
 from tsmlib.models.base import predict_segment, stepper
 from tsmlib.planning.predictors import EnsemblePredictor
 from tsmlib.sampling import Noise, SeparateNoise, SharedNoise
-from tsmlib.storage.artifacts import digest
 from tsmlib.trajectory import Segment
 
 DX, DU, B, T = 6, 2, 5, 25
@@ -124,14 +123,6 @@ def test_copies_draw_as_each_alone() -> None:
         assert torch.allclose(part, predict_segment(mixture, past, actions, generator=drawn(seed)))
 
 
-def test_copies_with_generators_of_their_own_within_shared_noise_are_refused() -> None:
-    mixture, (past, actions) = tsmlib.Mixture([recurrent(0), recurrent(1)]), given()
-    with pytest.raises(TypeError, match="several generators in SharedNoise; a Mixture takes one"):
-        predict_segment(
-            mixture, past, actions, generator=SharedNoise(SeparateNoise((drawn(1),)), B)
-        )
-
-
 def test_gradients_reach_the_actions() -> None:
     mixture, (past, actions) = tsmlib.Mixture([one_step(0), recurrent(1)]), given()
     actions.requires_grad_()
@@ -164,14 +155,6 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     assert plan.states.shape == (32, 2, task.horizon, 6)
 
 
-def test_each_member_of_each_model_judges_a_candidate() -> None:
-    (past, actions), alone = given(), [recurrent(0), one_step(1), one_step(2)]
-    judge = tsmlib.model_predictor(tsmlib.Mixture([alone[0], tsmlib.Mixture(alone[1:])]), past)
-    assert isinstance(judge, EnsemblePredictor)
-    for found, model in zip(judge(actions[None]), alone, strict=True):
-        assert torch.allclose(found[0], tsmlib.rollout(model, past, actions))
-
-
 def test_what_is_no_models_of_one_environment_is_refused() -> None:
     with pytest.raises(ValueError, match="models is empty"):
         tsmlib.Mixture([])
@@ -194,9 +177,3 @@ def test_a_mixture_is_neither_stored_nor_trained(tmp_path: Path) -> None:
         tsmlib.save_model(tmp_path / "m.safetensors", mixture, {})
     with pytest.raises(TypeError, match="a Mixture is not trained"):
         mixture.loss(None, None)
-
-
-def test_mixtures_are_told_apart_by_their_weights() -> None:
-    assert digest(tsmlib.Mixture([one_step(0), one_step(1)]).state_dict()) != digest(
-        tsmlib.Mixture([one_step(0), one_step(2)]).state_dict()
-    )

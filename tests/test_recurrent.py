@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import resource
-import sys
 
 import pytest
 import torch
@@ -13,7 +11,6 @@ from torch import Tensor
 from tsmlib.models.base import rollout, stepper
 from tsmlib.models.energy import energy_score
 from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib.training.fit import keep_freed_memory
 from tsmlib.trajectory import Segment, Window
 
 B, DX, DU, H = 6, 5, 2, 4
@@ -119,17 +116,3 @@ def test_the_loss_is_the_energy_score_of_two_rollouts_and_the_distance_of_the_mo
         for m, x in zip(features(net, mode), features(net, future.states), strict=True)
     ]
     assert float(net.point_loss(seen, rng())) == pytest.approx(float(sum(points)) / 2, rel=1e-6)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
-def test_an_update_fetches_no_memory_anew() -> None:
-    net, seen = RecurrentTSM(DX, DU), window(20)
-    wide = Window(*(Segment(*(part.float().repeat(20, 1, 1) for part in side)) for side in seen))
-    keep_freed_memory()
-    fetched = []
-    for n in range(8):
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        net.zero_grad(set_to_none=True)
-        net.loss(wide, rng(n)).backward()
-        fetched.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-    assert sorted(fetched[4:])[1] < 500  # of thousands; a thread that joins late fetches its own
