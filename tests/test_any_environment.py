@@ -4,12 +4,14 @@ says why not.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from functools import partial
 from typing import Any
 
 import gymnasium
+import gymnasium.wrappers as W
 import numpy as np
 import pytest
 import torch
@@ -23,7 +25,7 @@ from torch import Tensor
 import tsmlib
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import stepping
-from tsmlib.envs.spaces import environment_id, idle_action, within_bounds
+from tsmlib.envs.spaces import environment_id, idle_action, stated_id, within_bounds
 from tsmlib.envs.stepping import (
     Stepping,
     UnsupportedEnvironment,
@@ -34,8 +36,19 @@ from tsmlib.envs.stepping import (
 from tsmlib.envs.unstable import SimulationUnstable
 
 PENDULUM, HOPPER, CHEETAH = "Pendulum-v1", "Hopper-v5", "HalfCheetah-v5"
-V5 = """Ant HalfCheetah Hopper Humanoid HumanoidStandup InvertedDoublePendulum InvertedPendulum
-Pusher Reacher Swimmer Walker2d""".split()
+V5 = [
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "InvertedDoublePendulum",
+    "InvertedPendulum",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+]
 IDS = [PENDULUM, "MountainCarContinuous-v0", "Pendulum-v1(g=1.0)", "HalfCheetah-v5(frame_skip=10)"]
 IDS += [f"{name}-v5" for name in V5] + [f"{name}-v4" for name in V5 if name != "Pusher"]
 
@@ -199,6 +212,12 @@ def test_an_id_carries_the_arguments_in_which_a_robot_differs() -> None:
     with pytest.raises(UnsupportedEnvironment, match="cannot be made from its id"):
         make_simulation("Pendulum-v1(g=earth)", 1)
     assert make_simulation("Pendulum-v1(g=10.0, render_mode=None)", 1).id == "Pendulum-v1(g=10.0)"
+
+
+def test_an_id_in_a_file_carries_arguments_and_wrappers_too() -> None:
+    wrapped = gymnasium.make_vec(PENDULUM, num_envs=1, g=1.0, wrappers=[W.TimeAwareObservation])
+    record = json.loads(wrapped.envs[0].spec.to_json())  # type: ignore[attr-defined]
+    assert stated_id(record) == "Pendulum-v1(g=1.0)+TimeAwareObservation"
 
 
 def test_an_argument_that_no_id_can_carry_is_named(made: Made) -> None:

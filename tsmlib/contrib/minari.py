@@ -151,9 +151,14 @@ def _environment(t: Trajectories) -> Any:
     """The Gymnasium environment of these data, where its id is known here and its spaces are those of the data."""
     import gymnasium
 
-    if ":" in t.env or t.env not in gymnasium.registry:
+    from tsmlib.envs.stepping import UnsupportedEnvironment, make
+
+    if ":" in t.env:
         return None
-    env = gymnasium.make(t.env, disable_env_checker=True)
+    try:
+        env = make(t.env)
+    except (gymnasium.error.Error, UnsupportedEnvironment, ValueError):
+        return None
     spaces = (env.observation_space, env.action_space)
     fits = [getattr(space, "shape", None) for space in spaces] == [
         (t.robot.state_dim,),
@@ -168,7 +173,11 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
     about: Any = metadata.get("tsmlib")
     if about is None:
         stated: Any = metadata.get("env_spec")
-        env = json.loads(stated)["id"] if stated is not None else metadata["dataset_id"]
+        env = metadata["dataset_id"]
+        if stated is not None:
+            from tsmlib.envs.spaces import stated_id
+
+            env = stated_id(json.loads(stated))
         about = {
             "env": env,
             "dt": None,

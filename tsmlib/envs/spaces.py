@@ -115,6 +115,17 @@ def canonical(env_id: str) -> str:
     return spec.id + _arguments(spec.id, spec.kwargs, gymnasium.registry[spec.id].kwargs)
 
 
+def stated_id(record: Mapping[str, Any]) -> str:
+    """The id in a record of how Gymnasium made an environment, as JSON, which is not made."""
+    env_id = str(record["id"])
+    registered = gymnasium.registry.get(env_id)
+    known = [wrapper.name for wrapper in registered.additional_wrappers] if registered else []
+    usual = registered.kwargs if registered else {}
+    name = env_id + _arguments(env_id, record.get("kwargs") or {}, usual, strict=False)
+    words = [wrapper["name"] for wrapper in record.get("additional_wrappers") or ()]
+    return name + "".join(f"+{word}" for word in words if word not in {*known, *HARMLESS})
+
+
 _OF_MAKE = ("OrderEnforcing", "PassiveEnvChecker", "TimeLimit")
 HARMLESS = {  # wrappers that change neither observations nor what an action does
     *_OF_MAKE,
