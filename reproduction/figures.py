@@ -14,6 +14,7 @@ from reproduction.pages import ARMS
 from reproduction.scores import HORIZONS
 from reproduction.tables import select
 from tsmlib import plots
+from tsmlib.statistics import interval
 
 BASELINES = ("onestep", "multistep", "lstm")
 OURS = ("tsm", "rtsm")
@@ -32,6 +33,32 @@ def figure5(tables: Tables = results) -> Figure:
     return plots.curves(
         panels, x=HORIZONS, x_label="steps ahead", y_label="energy score", share="x", log="y"
     )
+
+
+def figure6(tables: Tables = results) -> Figure:
+    """Executed cost of plans over the simulator's, and what was promised too much; open loop.
+
+    Both searched codes of the action prior. The interval is over the targets, of means over seeds.
+    """
+    rows = select(
+        tables("05_control_rows"), planner="cem", execution="open loop", search_space="latent"
+    )
+    costs: dict[str, dict[str, np.ndarray]] = {}
+    gaps: dict[str, dict[str, np.ndarray]] = {}
+    for arm, title in (("Reacher", "reaching"), ("ReacherPush", "pushing")):
+        own = select(rows, env=PLACES[arm])
+        best = _by_target(own, "oracle", "return_true")  # the simulator, same search
+        for word in (*OURS, *BASELINES, "ensemble+mse"):
+            executed = _by_target(own, word, "return_true")
+            promised = _by_target(own, word, "return_predicted")
+            share = 1 + (best - executed) / -best.mean()
+            costs.setdefault(f"{title}: cost, as a share of the simulator's", {})[word] = _interval(
+                share
+            )
+            gaps.setdefault(f"{title}: promised minus paid return (m)", {})[word] = _interval(
+                promised - executed
+            )
+    return plots.forest({**costs, **gaps}, reference=None, columns=2)
 
 
 def ahead(tables: Tables = results) -> Figure:
@@ -58,10 +85,26 @@ def ahead(tables: Tables = results) -> Figure:
     return plots.forest(panels, x_label=label, reference=0.5, better="right", columns=2)
 
 
-FIGURES: dict[str, Callable[[], Figure]] = {"figure5": figure5, "ahead": ahead}
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "figure5": figure5,
+    "figure6": figure6,
+    "ahead": ahead,
+}
 
 
 def _by_seed(rows: pd.DataFrame, column: str) -> np.ndarray:
     """Values (seeds, steps); seeds that lack a step are left out."""
     rows = rows.astype({column: float})
     return rows.pivot_table(index="seed", columns=column, values="value").dropna().to_numpy()
+
+
+def _by_target(rows: pd.DataFrame, model: str, metric: str) -> np.ndarray:
+    """Means over seeds, one for each target."""
+    own = select(rows, model=model, metric=metric)
+    return own.groupby("target")["value"].mean().to_numpy(float)
+
+
+def _interval(values: np.ndarray) -> np.ndarray:
+    """Low, middle and high of a mean."""
+    mean, half = interval(values)
+    return np.array([mean - half, mean, mean + half])
