@@ -190,6 +190,8 @@ def test_the_window_of_a_short_episode_is_as_long_as_the_episode() -> None:
     assert options.for_model(TSM.for_data(short), short).future_len == 10
     assert options.for_model(OneStep.for_data(short), short).future_len == 15
     assert options.for_model(new_tsm(), TRAIN).past_len == H
+    few = TrainingOptions(steps=100)
+    assert [o.for_model(new_tsm(), TRAIN).warmup for o in (options, few)] == [100, 10]
 
 
 OTHER_ROBOTS = {
@@ -502,7 +504,9 @@ def test_a_loss_is_known_by_what_it_gives_and_not_by_its_name(tmp_path: Path) ->
 @pytest.mark.parametrize("new", [lambda: new_tsm(seed=7), lambda: new_tsm(beta=0.5)])
 def test_a_checkpoint_of_another_model_is_refused(tmp_path: Path, new: Callable[[], TSM]) -> None:
     train(new_tsm(), checkpoint=tmp_path / "run")
-    with pytest.raises(files.StoreError, match=r"another run: .*(began with|configuration\.beta) is "):
+    with pytest.raises(
+        files.StoreError, match=r"another run: .*(began with|configuration\.beta) is "
+    ):
         train(new(), checkpoint=tmp_path / "run")
 
 

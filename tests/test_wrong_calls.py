@@ -174,7 +174,7 @@ CALLS = [
         dict.fromkeys(("past_len", "future_len"), OPTIONAL)
         | dict.fromkeys(("lr_final", "muon"), NOT_NEGATIVE)
         | {"lr": POSITIVE, "clip": POSITIVE | {"infinite"}}
-        | dict.fromkeys(("warmup", "patience"), COUNT_OR_ZERO | {"huge"})
+        | {"warmup": COUNT_OR_ZERO | OPTIONAL | {"huge"}, "patience": COUNT_OR_ZERO | {"huge"}}
         | dict.fromkeys(("steps", "batch_size", "validate_every"), frozenset({"huge"}))
         | {"past_len": OPTIONAL | {"huge"}, "future_len": OPTIONAL | {"huge"}},
         {"span": {"backwards": (1.0, 0.0), "beyond": (0.0, 2.0), "three": (0.0, 0.5, 1.0)}},

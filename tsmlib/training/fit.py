@@ -204,7 +204,7 @@ def _update(
     o: TrainingOptions,
 ) -> float:
     """One step of the optimisers; the loss before it."""
-    lr = schedule(step, o.steps, o.lr, o.lr_final, o.warmup, o.span)
+    lr = schedule(step, o.steps, o.lr, o.lr_final, o.warmup or 0, o.span)
     for name, optimizer in state.optimizers.items():
         for group in optimizer.param_groups:
             group["lr"] = lr if name == "adam" else lr / o.lr * o.muon

@@ -23,7 +23,8 @@ class TrainingOptions:
         batch_size: windows of an update.
         lr: peak learning rate of Adam; its default (appendix A).
         lr_final: learning rate at the end of the cosine schedule.
-        warmup: updates in which the learning rates rise from zero.
+        warmup: updates in which the learning rates rise from zero; None for 100, and no more than a
+            tenth of all.
         muon: peak learning rate of Muon for the weight matrices, beside Adam for all else; it
             follows the schedule of lr. 0: Adam for everything.
         span: the part of one schedule, from 0 to 1, that this training covers, where several follow
@@ -40,7 +41,7 @@ class TrainingOptions:
     batch_size: int = 256
     lr: float = 1e-3
     lr_final: float = 1e-5
-    warmup: int = 100
+    warmup: int | None = None
     muon: float = 0.0
     span: tuple[float, float] = (0.0, 1.0)
     clip: float = 1.0
@@ -51,8 +52,9 @@ class TrainingOptions:
         for name in ("past_len", "future_len", "steps", "batch_size", "validate_every"):
             if (value := getattr(self, name)) is not None or not name.endswith("_len"):
                 require_count(name, value)
-        for name in ("warmup", "patience"):
-            require_count(name, getattr(self, name), least=0)
+        require_count("patience", self.patience, least=0)
+        if self.warmup is not None:
+            require_count("warmup", self.warmup, least=0)
         for name in ("lr_final", "muon"):
             require_number(name, getattr(self, name), 0)
         require_number("lr", self.lr, 0, above=True)
@@ -95,7 +97,8 @@ class TrainingOptions:
             future_len = segment * max(1, min(2, data.horizon // segment))
         elif future_len is None:
             future_len = min(20, data.horizon)
-        return replace(self, past_len=past_len, future_len=future_len)
+        warmup = min(100, self.steps // 10) if self.warmup is None else self.warmup
+        return replace(self, past_len=past_len, future_len=future_len, warmup=warmup)
 
 
 def schedule(
