@@ -94,7 +94,7 @@ class Log:
             if dt > SLOW:
                 raise TrajectoryError(
                     f"the median step of '{self.time}' is {dt:g} s; expected seconds: divide a "
-                    f"time in milliseconds by 1e3, in nanoseconds by 1e9, or give dt={dt:g} if it is so"
+                    f"time in milliseconds by 1e3, in nanoseconds by 1e9, or give dt={dt:g}"
                 )
         dt = require_number("dt", dt, 0, above=True)
         if abs(median - dt) > 0.05 * dt:

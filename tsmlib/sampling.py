@@ -1,8 +1,7 @@
-"""Sources of random numbers: one generator, common random numbers, separate generators, numbers given, none."""
+"""Sources of random numbers: one generator, common numbers, separate generators, none."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,17 +10,17 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class SeparateNoise:
-    """Independent copies: rows are laid out copy by copy, (M, B), and each copy draws from a generator of its own."""
+    """Independent copies: rows lie copy by copy, (M, B); each copy draws from its generator."""
 
     generators: tuple[torch.Generator, ...]
 
 
 @dataclass(frozen=True)
 class SharedNoise:
-    """Common random numbers: rows b, b + period, b + 2 period, ... of every batch draw the same noise.
+    """Common random numbers: rows b, b + period, ... of every batch draw the same noise.
 
-    Planners lay candidates out as (C, B) and use a period of B, so that candidates are compared in the same futures.
-    The generator may be several, each of its own copy within the period.
+    Planners lay candidates out as (C, B) and use a period of B, so that candidates are compared in
+    the same futures. The generator may be several, each of its own copy within the period.
     """
 
     generator: torch.Generator | SeparateNoise
@@ -30,47 +29,10 @@ class SharedNoise:
 
 @dataclass(frozen=True)
 class NoNoise:
-    """Zeros; of an ensemble each member in turn, member ``first`` for ``period`` rows, then the next, and so on."""
+    """Zeros; of an ensemble each member in turn: ``first`` for ``period`` rows, then the next."""
 
     period: int
     first: int = 0
-
-
-@dataclass
-class GivenNoise:
-    """Numbers that were drawn before, in the order in which they are asked for (``stacked_training``); each is given
-    once, and removed."""
-
-    numbers: list[Tensor]
-
-    def next(self, shape: Sequence[int]) -> Tensor:
-        """ValueError for another shape than that which was drawn."""
-        given = self.numbers.pop(0)
-        if tuple(given.shape) != tuple(shape):
-            raise ValueError(
-                f"noise of shape {tuple(shape)} is asked for, but {tuple(given.shape)} was drawn"
-            )
-        return given
-
-
-class Draw(NamedTuple):
-    """Numbers that are asked for: standard normal ones, or indices from 0 to ``below`` - 1."""
-
-    shape: torch.Size
-    below: int | None = None
-
-    def sample(self, generator: torch.Generator) -> Tensor:
-        """The numbers, on the generator's device."""
-        if self.below is None:
-            return torch.randn(self.shape, generator=generator, device=generator.device)
-        return torch.randint(self.below, self.shape, generator=generator, device=generator.device)
-
-
-@dataclass
-class RecordedNoise:
-    """Zeros in place of noise; keeps what was asked for."""
-
-    draws: list[Draw] = field(default_factory=list)
 
 
 Noise = torch.Generator | SharedNoise | SeparateNoise | NoNoise
@@ -86,16 +48,9 @@ def generator_of(*key: int) -> torch.Generator:
     )
 
 
-def standard_normal(
-    shape: Sequence[int], noise: Noise | GivenNoise | RecordedNoise, like: Tensor
-) -> Tensor:
-    """Draw N(0, 1) of ``shape`` with the device and type of ``like``: the same numbers on any device."""
+def standard_normal(shape: Sequence[int], noise: Noise, like: Tensor) -> Tensor:
+    """Draw N(0, 1) of ``shape``, of device and type of ``like``: the same numbers everywhere."""
     if isinstance(noise, NoNoise):
-        return like.new_zeros(tuple(shape))
-    if isinstance(noise, GivenNoise):
-        return noise.next(shape)
-    if isinstance(noise, RecordedNoise):
-        noise.draws.append(Draw(torch.Size(shape)))
         return like.new_zeros(tuple(shape))
     if isinstance(noise, SeparateNoise):
         share = (shape[0] // len(noise.generators), *shape[1:])
@@ -111,28 +66,20 @@ def standard_normal(
 
 
 def random_indices(
-    below: int,
-    shape: Sequence[int],
-    noise: torch.Generator | GivenNoise | RecordedNoise,
-    device: torch.device,
+    below: int, shape: Sequence[int], noise: torch.Generator, device: torch.device
 ) -> Tensor:
-    """Indices from 0 to ``below`` - 1, all equally likely, on ``device``. Only losses draw them: the noise of planners
-    (``SharedNoise``, ...) is not accepted."""
-    if isinstance(noise, GivenNoise):
-        return noise.next(shape)
-    draw = Draw(torch.Size(shape), below)
-    if isinstance(noise, RecordedNoise):
-        noise.draws.append(draw)
-        return torch.zeros(draw.shape, dtype=torch.long, device=device)
-    return draw.sample(noise).to(device)
+    """Indices from 0 to ``below`` - 1, all equally likely, on ``device``."""
+    drawn = torch.randint(below, tuple(shape), generator=noise, device=noise.device)
+    return drawn.to(device)
 
 
 def by_generator(
     rows: int, noise: torch.Generator | SharedNoise | SeparateNoise
 ) -> Iterator[tuple[slice, torch.Generator]]:
-    """The rows that draw from one generator, part by part: what ``standard_normal`` does, for draws of any kind.
+    """The rows of each generator, part by part: ``standard_normal`` for draws of any kind.
 
-    Each part is drawn before the next is asked for. Rows that share noise find their generator as the first ones did.
+    Each part is drawn before the next is taken. Rows that share noise find their generator as the
+    first ones did.
     """
     if isinstance(noise, torch.Generator):
         yield slice(0, rows), noise

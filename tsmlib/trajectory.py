@@ -159,7 +159,7 @@ class Trajectories(FromLogs):
         ]:
             raise TrajectoryError(
                 f"{len(ends)} episodes of {ends[-1]} steps in all, but {len(states)} rows of "
-                f"states and {len(actions)} of actions; expected one state more than actions in each"
+                f"states and {len(actions)} of actions; expected one state more each"
             )
         x = np.split(states, ends[:-1] + np.arange(1, len(ends)))
         u = np.split(actions, ends[:-1])

@@ -128,6 +128,12 @@ def score(
         parts.append((values, pit, outside))
     values = {metric: torch.cat([part[0][metric] for part in parts]) for metric in parts[0][0]}
     for metric, value in values.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(
+                f"the score '{metric}' is not finite; expected finite numbers: check the "
+                "statistics of the model's features, and that its data move"
+            )
+    for metric, value in values.items():
         if value.isnan().any():
             n, t = value.isnan().nonzero()[0].tolist()
             raise FloatingPointError(
