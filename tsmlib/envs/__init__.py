@@ -1,5 +1,4 @@
-"""Two-link arms in two simulators behind one interface; importing this module registers them with
-Gymnasium.
+"""Two-link arms in two simulators behind one interface, and PushT, registered with Gymnasium.
 
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose
 ``rollout`` simulates whole action sequences at once;
@@ -22,14 +21,24 @@ from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
 
 
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
-    """The id of the same arm behind `SensorNoise` and `ActionDelay`, registered where it is not
-    yet.
+    """Name the same arm behind `SensorNoise` and `ActionDelay`, and register it (section 5.3.3).
 
-    noise: sigma, in units of data scaled to [-1, 1] (``geometry.HALF_RANGE``). delay: tau in steps.
-    Both of the paper's, ``NOISE`` and ``DELAY``, are registered for every arm. ValueError where
-    they make no sense.
+    Args:
+        env_id: of a plain arm or a variant.
+        noise: sigma, in units of data scaled to [-1, 1] (``geometry.HALF_RANGE``); at most four
+            decimals. The paper's is ``NOISE``.
+        delay: tau, steps. The paper's is ``DELAY``.
+
+    Returns:
+        The id.
+
+    Raises:
+        ValueError: another environment, or a noise or delay that makes no sense.
     """
-    plain = _spec(env_id)
+    try:
+        plain = EnvSpec.parse(env_id)
+    except ValueError:
+        plain = None
     if plain is None or plain != plain.arm:
         raise ValueError(
             f"{env_id!r} is none of {', '.join(ENV_IDS)}, nor a variant; noise and delay are added "
@@ -39,27 +48,39 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
     if not 0.0 <= noise <= 10.0 or round(noise, 4) != noise or not (whole and 0 <= delay <= 100):
         raise ValueError(
             f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four "
-            "decimals, and a "
-            "whole number of steps from 0 to 100"
+            "decimals, and a whole number of steps from 0 to 100"
         )
-    return _known(replace(plain, noise=noise, delay=delay))
+    return EnvSpec.parse(replace(plain, noise=noise, delay=delay).id).id
 
 
 def variant(env_id: str, **changes: Unpack[Changes]) -> str:
-    """The id of the same arm with other physics (`Physics`), registered where it is not yet.
+    """Name the same arm with other physics, and register it.
 
-    ``gymnasium.make(env_id, **changes)`` makes the same environment. ValueError where a value makes
-    no sense.
+    ``gymnasium.make(env_id, **changes)`` makes the same environment.
+
+    Args:
+        env_id: of an arm.
+        **changes: of `Physics`: mass (kg), damping (N m s/rad), link_lengths (m), object_radius (m)
+            and torque_gain.
+
+    Returns:
+        The id.
+
+    Raises:
+        ValueError: a value, or it in this task, makes no sense.
     """
-    return _known(EnvSpec.parse(env_id).varied(**changes))
+    return EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id).id
 
 
 def fingerprint(env_id: str) -> dict[str, object]:
-    """What data or a model of an environment belong to, as JSON values: anything that says
-    otherwise does not fit.
+    """Say what data or a model of an arm belong to; what says otherwise does not fit.
 
-    Of a variant, the values that it changes are fields of their own, and ``standard`` holds those
-    of the standard arm.
+    Args:
+        env_id: of an arm.
+
+    Returns:
+        JSON values. Of a variant, the values that it changes are fields of their own, and
+        ``standard`` holds those of the standard arm.
     """
     spec = EnvSpec.parse(env_id)
     simulator = import_module(f"tsmlib.envs.{spec.simulator}_arm").physics_hash(spec.arm.id)
@@ -77,17 +98,6 @@ def fingerprint(env_id: str) -> dict[str, object]:
         **varied,
         "simulator": simulator,
     }
-
-
-def _known(spec: EnvSpec) -> str:
-    return EnvSpec.parse(spec.id).id
-
-
-def _spec(env_id: str) -> EnvSpec | None:
-    try:
-        return EnvSpec.parse(env_id)
-    except ValueError:
-        return None
 
 
 for _id in ENV_IDS:
