@@ -1,3 +1,4 @@
+from . import plots as plots
 from .collection import collect as collect
 from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop
