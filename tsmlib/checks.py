@@ -13,6 +13,7 @@ from torch import Tensor
 
 T = TypeVar("T")
 LARGEST = 10_000  # size of a layer, a segment or an ensemble
+MOST = 1_000_000  # candidates, iterations, steps of a plan: beyond is a slip, and never ends
 
 
 def require_count(name: str, value: object, *, least: int = 1, most: int | None = None) -> int:

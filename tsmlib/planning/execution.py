@@ -20,6 +20,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from tsmlib.checks import (
+    MOST,
     as_tensor,
     described,
     require_callable,
@@ -35,6 +36,7 @@ from tsmlib.models.base import Model, as_dynamics
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.planners import reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
+from tsmlib.planning.search import require_space
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, Trajectories, real_steps
@@ -113,11 +115,11 @@ def execute(task: Task, plan: Plan | Tensor | Controller, *, past_len: int = 10)
         SimulationUnstable: a state that is not finite.
     """
     _require_task(task)
-    past_len = require_count("past_len", past_len)
+    past_len = require_count("past_len", past_len, most=MOST)
     if isinstance(plan, Plan) or not callable(plan):
         actions = _open_loop_actions(task, plan)
         seen, run = _run(task, open_loop(actions), task.horizon)
-    elif isinstance(plan, nn.Module) or hasattr(plan, "begin"):
+    elif isinstance(plan, nn.Module | type) or hasattr(plan, "begin"):
         raise TypeError(
             f"plan is {described(plan)}; expected a Plan, actions or a controller. A policy acts "
             "by tsmlib.policies.networks.controller(policy, task.target), a model by a plan"
@@ -253,10 +255,17 @@ def mpc(
     """
     _require_task(task)
     every = require_count("every", every)
-    ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead)
+    ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead, most=MOST)
     if lookahead is not None and ahead < every:
         raise ValueError(f"lookahead is {ahead}; expected at least the {every} steps of every")
     seed = require_seed("seed", seed)
+    require_space(space)
+    planned = space.decode(torch.zeros(1, len(task), *space.shape)).shape[2]
+    if planned != min(ahead, task.horizon):
+        raise ValueError(
+            f"space is of {planned} steps; expected the {min(ahead, task.horizon)} of the whole "
+            f"episode of task {task.name!r}, or of lookahead"
+        )
     require_callable("planner", planner, "a function, such as tsmlib.cem")
     require_callable("judge", judge, "a function, such as tsmlib.model_predictor")
     if plan is not None:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib.checks import require_count, require_number, require_seed, require_type
+from tsmlib.checks import MOST, require_count, require_number, require_seed, require_type
 from tsmlib.planning.base import Plan, Predictor, Risk, SearchSpace, mean
 from tsmlib.planning.search import (
     Search,
@@ -60,7 +60,7 @@ def adam(
         ValueError: the return has no gradient with respect to the states.
         FloatingPointError: the gradient, or the return of every candidate, is not finite.
     """
-    iterations = require_count("iterations", iterations, least=0)
+    iterations = require_count("iterations", iterations, least=0, most=MOST)
     lr = require_number("lr", lr, 0, above=True)
     search = Search(predict, reward, space, start)
     parameters = search.start.clone().requires_grad_()
@@ -128,8 +128,8 @@ def cem(
         TypeError, ValueError: an argument that cannot be; the message names it.
         FloatingPointError: no candidate has a finite return, or the reward is NaN.
     """
-    candidates = require_count("candidates", candidates, least=2)
-    elites = require_count("elites", elites, least=2)
+    candidates = require_count("candidates", candidates, least=2, most=MOST)
+    elites = require_count("elites", elites, least=2, most=MOST)
     if elites > candidates:
         raise ValueError(f"elites is {elites}; expected at most the {candidates} candidates")
     keep = require_number("keep", keep, 0, 1)
@@ -188,7 +188,7 @@ def mppi(
         TypeError, ValueError: an argument that cannot be; the message names it.
         FloatingPointError: no candidate has a finite return, or the reward is NaN.
     """
-    candidates = require_count("candidates", candidates, least=2)
+    candidates = require_count("candidates", candidates, least=2, most=MOST)
     temperature = require_number("temperature", temperature, 0, above=True)
     shrink = require_number("shrink", shrink, 0, 1, above=True)
 
@@ -211,7 +211,7 @@ def _sample(
     search: Search, refit: Refit, candidates: int, iterations: int, seed: int, progress: str
 ) -> Plan:
     """Sample candidates around a centre and move centre and deviation by ``refit``."""
-    iterations = require_count("iterations", iterations)
+    iterations = require_count("iterations", iterations, most=MOST)
     generator = torch.Generator().manual_seed(require_seed("seed", seed))
     # Candidates may do what the start cannot.
     search.update(search.start, search.returns_of(search.start), needed=False)
@@ -279,10 +279,10 @@ def sampled_starts(
     Returns:
         (keep, B, *shape), the best first.
     """
-    candidates = require_count("candidates", candidates)
-    if require_count("keep", keep) > candidates:
+    candidates = require_count("candidates", candidates, most=MOST)
+    if require_count("keep", keep, most=MOST) > candidates:
         raise ValueError(f"keep is {keep}; expected at most the {candidates} candidates")
-    search = Search(predict, reward, space, require_count("n_targets", n_targets))
+    search = Search(predict, reward, space, require_count("n_targets", n_targets, most=MOST))
     generator = torch.Generator().manual_seed(require_seed("seed", seed))
     parameters = space.scale * space.noise(candidates, n_targets, generator)
     returns = search.returns_of(parameters)

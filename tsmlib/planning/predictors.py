@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, described, require_count, require_seed
+from tsmlib.checks import MOST, as_tensor, described, require_count, require_seed
 from tsmlib.collection import collect, open_loop
 from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec
@@ -161,7 +161,7 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
     """
     dynamics = as_dynamics(model)
     past = _checked_past(model, past)
-    samples = require_count("samples", samples, least=0)
+    samples = require_count("samples", samples, least=0, most=MOST)
     seed = require_seed("seed", seed)
     if samples and not dynamics.stochastic:
         raise ValueError(
@@ -210,7 +210,7 @@ def expected_predictor(
     Raises:
         ValueError: fewer than one sample; the mode alone is ``model_predictor(model, past)``.
     """
-    if not require_count("samples", samples, least=0):
+    if not require_count("samples", samples, least=0, most=MOST):
         raise ValueError(
             "samples is 0; expected at least 1. The mode alone is model_predictor(model, past)"
         )
@@ -239,7 +239,7 @@ def fresh_predictor(model: Model, past: Segment, *, seed: int, samples: int = FR
     Returns:
         The predictor, for ``reevaluate``.
     """
-    samples = require_count("samples", samples)
+    samples = require_count("samples", samples, most=MOST)
     stochastic = as_dynamics(model).stochastic
     return model_predictor(model, past, samples=samples if stochastic else 0, seed=seed)
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, described, require_callable, require_count
+from tsmlib.checks import MOST, as_tensor, described, require_callable, require_count
 from tsmlib.models.layers import BLOCK
 from tsmlib.planning.base import Plan, Predictor, Risk, SearchSpace, mean
 from tsmlib.planning.predictors import EnsemblePredictor
@@ -111,7 +111,7 @@ class Search:
     ) -> None:
         require_predictor(predict)
         require_reward(reward)
-        _require_space(space)
+        require_space(space)
         require_callable("risk", risk, "tsmlib.planning.base.mean or worst")
         self.predict, self.reward, self.space = predict, reward, space
         self.risk, self.judged = risk, judged
@@ -186,7 +186,7 @@ def require_predictor(predict: object) -> None:
     require_callable("predict", predict, f"a predictor, such as {hint}")
 
 
-def _require_space(space: object) -> None:
+def require_space(space: object) -> None:
     missing = [n for n in ("shape", "scale", "decode", "noise") if not hasattr(space, n)]
     if missing or isinstance(space, type):
         raise TypeError(
@@ -198,7 +198,7 @@ def _require_space(space: object) -> None:
 def _starts(space: SearchSpace, start: object) -> Tensor:
     """Starting parameters (C, B, *shape), whose actions are bounded."""
     if isinstance(start, int | float | np.number | str | bool) or start is None:
-        n_targets = require_count("start, the number of targets,", start)
+        n_targets = require_count("start, the number of targets,", start, most=MOST)
         parameters = torch.zeros(1, n_targets, *space.shape)
     else:
         parameters = as_tensor("start", start, ("C", "B", *space.shape)).detach()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, require_count, require_number, require_type
+from tsmlib.checks import MOST, as_tensor, require_count, require_number, require_type
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.layers import on_device_of
@@ -51,8 +51,8 @@ class DirectActions:
                 "expected that of the model's data: DirectActions.for_data(data, horizon), or "
                 "rms=0.1 for the arms"
             )
-        steps = require_count("horizon", horizon)
-        self.shape: tuple[int, ...] = (steps, require_count("action_dim", action_dim))
+        steps = require_count("horizon", horizon, most=MOST)
+        self.shape: tuple[int, ...] = (steps, require_count("action_dim", action_dim, most=MOST))
         self.scale = require_number("rms", rms, 0, above=True)
         self.smoothness = require_number("smoothness", smoothness, 0)
 
@@ -155,7 +155,7 @@ class LatentActions:
     ) -> None:
         hint = 'an ActionPrior, such as tsmlib.load_pretrained("prior", env=env)'
         require_type("prior", prior, ActionPrior, hint)
-        horizon = require_count("horizon", horizon)
+        horizon = require_count("horizon", horizon, most=MOST)
         n_segments = -(-horizon // prior.segment_len)
         if whole and n_segments * prior.segment_len != horizon:
             raise ValueError(

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from tsmlib import rewards
 from tsmlib.checks import (
+    MOST,
     as_tensor,
     described,
     require_callable,
@@ -127,12 +128,17 @@ class Task:
             ValueError: ``success`` is a distance and there is no ``tolerance``.
         """
         require_type("env", env, str, "an id, such as 'Pendulum-v1'")
-        n, seed = require_count("n", n), require_seed("seed", seed)
+        n, seed = require_count("n", n, most=MOST), require_seed("seed", seed)
         require_reward(reward)
         if tolerance is not None:
             tolerance = require_number("tolerance", tolerance, 0)
         plain = EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
-        with closing(make_simulation(plain, n)) as begun:
+        require_type("name", name, str, "a text")
+        try:
+            episodes = make_simulation(plain, n)
+        except gymnasium.error.Error as error:
+            raise ValueError(f"env is {env!r:.80}, which cannot be made: {error}") from error
+        with closing(episodes) as begun:
             start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
         _require_repeated(env, begun.names, start, again)
         task = cls(
@@ -196,12 +202,12 @@ class Task:
         start = as_tensor("start", self.start, ("B", "dx"))
         if not len(start):
             raise ValueError(f"task {self.name!r} has no start; expected at least one")
-        du = require_count("action_dim", self.action_dim)
+        du = require_count("action_dim", self.action_dim, most=MOST)
         idle = torch.zeros(du) if self.idle is None else as_tensor("idle", self.idle, (du,))
         checked: dict[str, object] = {
             "start": start.numpy(),
             "target": as_tensor("target", self.target, (len(start), "dg")),
-            "horizon": require_count("horizon", self.horizon),
+            "horizon": require_count("horizon", self.horizon, most=MOST),
             "tolerance": require_number("tolerance", self.tolerance, 0),
             "seeds": tuple(require_seed("a seed", seed) for seed in self.seeds),
             "idle": idle,
@@ -324,7 +330,7 @@ class Task:
         Returns:
             x_0 repeated and no actions: (B, L, dx) and (B, L, du).
         """
-        steps = require_count("past_len", past_len)
+        steps = require_count("past_len", past_len, most=MOST)
         return initial_past(torch.from_numpy(self.start).float(), steps, self.action_dim)
 
     def take(self, chosen: int | Sequence[int]) -> Task:

@@ -18,7 +18,6 @@ from torch.nn import functional as F
 
 from tsmlib.checks import (
     as_tensor,
-    require_count,
     require_counts,
     require_number,
     require_seed,
@@ -70,11 +69,10 @@ class Policy(Configured):
         copies: int,
     ) -> None:
         super().__init__()
-        self.state_dim = require_count("state_dim", state_dim)
-        self.target_dim = require_count("target_dim", target_dim)
+        require_counts(state_dim=state_dim, target_dim=target_dim, copies=copies)
+        self.state_dim, self.target_dim, self.copies = state_dim, target_dim, copies
         self.target_std = require_number("target_std", target_std, 0, above=True)
-        self.copies = require_count("copies", copies)
-        self.features = Features(state_dim, tuple(angles))
+        self.features = Features(state_dim, angles)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
         """Get ready to act after ``past`` (R, L, .); the result is given its last step first."""
@@ -173,8 +171,8 @@ class OneStepPolicy(Policy):
         seed: int = 0,
     ) -> None:
         super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
-        self.action_dim = self.output_dim = require_count("action_dim", action_dim)
-        require_counts(hidden=hidden, layers=layers)
+        require_counts(action_dim=action_dim, hidden=hidden, layers=layers)
+        self.action_dim = self.output_dim = action_dim
         generators = _generators(copies, seed)
         widths = [self.features.dim + target_dim, *[hidden] * layers, action_dim]
         self.net = nn.ModuleList(BatchedLinear(i, o, generators) for i, o in pairwise(widths))
@@ -233,6 +231,7 @@ class SegmentPolicy(Policy):
         super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
         hint = 'an ActionPrior, such as tsmlib.load_pretrained("prior", env=env)'
         require_type("prior", prior, (ActionPrior, Mapping), hint)
+        require_counts(channels=channels)
         self.prior = deepcopy(prior) if isinstance(prior, ActionPrior) else ActionPrior(**prior)  # type: ignore[arg-type]
         self.prior.requires_grad_(False)
         self.action_dim, self.output_dim = len(self.prior.std), self.prior.latent_dim
