@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import functools
 import http.server
+import io
+import os
 import webbrowser
 from pathlib import Path
+from typing import BinaryIO
 
 from reproduction.runner import RunError
 from tsmlib.pretrained import ROOT
@@ -25,7 +28,20 @@ HEADERS = {
 class Handler(http.server.SimpleHTTPRequestHandler):
     """Files of a folder with the types and headers that the page needs. Says nothing."""
 
+    timeout = 30  # seconds that a connection may say nothing
     extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, **TYPES}  # noqa: RUF012
+
+    def send_head(self) -> io.BytesIO | BinaryIO | None:
+        """Answer this machine alone, with files of the folder and not with what links lead to."""
+        host = self.headers.get("Host", "").rpartition(":")[0]
+        path = self.translate_path(self.path)
+        if host not in ("127.0.0.1", "localhost"):
+            self.send_error(403)
+        elif "\0" in path or os.path.realpath(path) != os.path.abspath(path):
+            self.send_error(404)
+        else:
+            return super().send_head()
+        return None
 
     def end_headers(self) -> None:
         for name, value in HEADERS.items():

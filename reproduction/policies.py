@@ -18,7 +18,8 @@ from tsmlib.evaluation.actions import within
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
-from tsmlib.policies.learning import episodes_from, imagine
+from tsmlib.policies.imagination import imagine
+from tsmlib.policies.learning import episodes_from
 from tsmlib.policies.networks import Policy, controller
 from tsmlib.storage import artifacts
 
@@ -80,7 +81,7 @@ def assess(
     policy: Policy, model: DynamicsModel, task: Task, *, seed: int
 ) -> dict[str, torch.Tensor]:
     """Executed and predicted return of a policy, without noise: means, one for each copy."""
-    many, done = task.times(policy.copies), executed(policy, task)
+    many, done = _times(task, policy.copies), executed(policy, task)
     start, draw = torch.from_numpy(many.start).float(), torch.Generator().manual_seed(seed)
     seen = imagine(
         policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw
@@ -96,7 +97,7 @@ def assess(
 
 def executed(policy: Policy, task: Task) -> Trial:
     """Every copy of a policy on every target, one copy after the other."""
-    many = task.times(policy.copies)
+    many = _times(task, policy.copies)
     return tsmlib.execute(many, controller(policy, many.target), past_len=policy.past_len)
 
 
@@ -137,3 +138,8 @@ def learning_rows(run: Run, name: str, policy_name: str) -> list[Row]:
             for c, v in enumerate(values.unflatten(0, (policy.copies, -1)).mean(1).tolist())
         ),
     ]
+
+
+def _times(task: Task, n: int) -> Task:
+    """All of its targets n times, one round after the other."""
+    return task.take(n * list(range(len(task))))

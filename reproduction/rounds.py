@@ -215,7 +215,7 @@ def adapted_rows(run: Run, name: str, way_name: str) -> list[Row]:
     net = load_model(run, standard, word)
     train, held_out = _divided(random_data(env, max(5, episodes), seed=FEW_SEED + run.seed))
     train, share = symmetric(train), run.pick(0.0, 0.3, 1.0)
-    tuned, scratch = (max(2, round(share * n)) for n in UPDATES[word])
+    tuned, scratch = (max(2, round(share * n)) for n in UPDATES.get(word, (300, 800)))
     if way == "scratch":
         spec = zoo.find(word)
         arguments = spec.arguments(EnvSpec.parse(env))

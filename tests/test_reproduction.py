@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import http.client
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -16,7 +19,7 @@ import pandas as pd
 import pytest
 
 import tsmlib
-from reproduction import figures, pages, runner, runs, tables, targets
+from reproduction import explorer, figures, pages, runner, runs, tables, targets
 from reproduction.papermill_plugin import completed
 from reproduction.plans import How
 from reproduction.runs import Missing, Run, env_id
@@ -138,6 +141,57 @@ def test_a_table_is_made_with_all_that_it_needs(home: Path) -> None:
     with pytest.raises(Missing, match="--seed 2"):
         targets.pool("smoke", "03_predict", [0, 2])
     assert not list(home.rglob("*.tmp-*"))
+
+
+EXAMPLES = (  # one target of each kind
+    "data/Reacher/train",
+    "models/Reacher/tsm",
+    "models/Reacher/prior",
+    "collection/Reacher",
+    "gradients/Reacher/tsm",
+    "scores/Reacher/tsm",
+    "episodes/Reacher/tsm",
+    "blind/Reacher/tsm",
+    "codes/Reacher/tsm",
+    "filters/Reacher-noise0.25/filter",
+    "plans/Reacher/tsm-latent-cem",
+    "plans/Reacher/tsm-latent-cem-every10",
+    "trials/Reacher/tsm-latent-cem",
+    "trials/Reacher/zero",
+    "torques/Reacher/sampled",
+    "signals/Reacher/tsm",
+    "policies/Reacher/tsm-latent",
+    "learning/Reacher/tsm-latent",
+    "adapted/Reacher-gain0.7/tsm-zero-5",
+    "robots/Pendulum-v1/rtsm",
+    "rounds/Pendulum/rtsm-plans",
+    "tables/01_collect",
+)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder for the targets of all tests that make one."""
+    folder = tmp_path_factory.mktemp("targets")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "home", lambda: folder)
+        yield folder
+
+
+def test_there_is_an_example_of_every_kind() -> None:
+    assert {name.partition("/")[0] for name in EXAMPLES} == set(targets.KINDS)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_target_of_every_kind_is_made_at_the_smallest_scale(name: str, shared: Path) -> None:
+    path = targets.make(Run("smoke"), name)
+    assert path.is_relative_to(shared)
+    if path.suffix == ".csv":
+        table = tables.read(path)
+        assert len(table)
+        assert set(table["seed"]) == {0}
+        assert set(table["scale"]) == {"smoke"}
+        assert not table.duplicated().any()
 
 
 def test_a_training_that_is_killed_goes_on_to_the_bit(tmp_path: Path) -> None:
@@ -324,3 +378,26 @@ def test_loading_a_model_imports_no_pandas_and_no_notebook() -> None:
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_the_explorer_answers_this_machine_with_files_of_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "dist"
+    folder.mkdir()
+    for name in ("index.html", "manifest.json"):
+        (folder / name).write_text("page")
+    (tmp_path / "secret").write_text("secret")
+    (folder / "link").symlink_to(tmp_path / "secret")
+    with explorer.server(folder.resolve(), port=0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        def status(path: str, host: str = "127.0.0.1") -> int:
+            connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+            connection.request("GET", path, headers={"Host": f"{host}:{server.server_port}"})
+            return connection.getresponse().status
+
+        assert status("/index.html") == status("/index.html", "localhost") == 200
+        assert status("/index.html", "evil.example") == 403
+        assert {status(path) for path in ("/link", "/%00", "/../secret", "/none")} == {404}
+        server.shutdown()
+    with pytest.raises(runner.RunError, match="make explorer"):
+        explorer.server(tmp_path)
