@@ -105,6 +105,16 @@ class HalfASave(DelayInAnObject):
         self.x = state
 
 
+class SavesToAFile(Cart):
+    """Its methods of these names are something else."""
+
+    def save_state(self, path: str) -> None:
+        raise AssertionError
+
+    def restore_state(self, path: str, strict: bool) -> None:
+        raise AssertionError
+
+
 class LateObject(Cart):
     line, taken = None, 0
 
@@ -422,6 +432,7 @@ HOSTILE = {
         HandsOutItsBuffer: {},
         DelayInAnObject: {"oracle": "DelayInAnObject.line is or holds a Line"},
         DelayWithMethods: {},
+        SavesToAFile: {},
         HalfASave: {"oracle": "the same seed and actions do not repeat it"},
         LateObject: {},
         DelayInAClosure: {"oracle": "DelayInAClosure.later is or holds a function"},

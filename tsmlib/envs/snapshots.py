@@ -20,6 +20,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from contextlib import closing
+from inspect import signature
 from pathlib import PurePath
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, NamedTuple
@@ -59,9 +60,13 @@ def refusal(env: gymnasium.Env) -> str:
 
 
 def _offers(layer: Any) -> bool:
-    return callable(getattr(layer, "save_state", None)) and callable(
-        getattr(layer, "restore_state", None)
-    )
+    """Whether a layer has both methods, which take what they should."""
+    try:
+        signature(layer.save_state).bind()
+        signature(layer.restore_state).bind(None)
+    except (AttributeError, TypeError, ValueError):
+        return False
+    return True
 
 
 def _fixed(value: Any) -> bool:
