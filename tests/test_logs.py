@@ -257,7 +257,11 @@ def test_flat_arrays_end_where_they_say() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"observations": OBS[:5]}, "terminals have shape"),
+        ({"observations": OBS[:5]}, "with one row for each step"),
+        ({"observations": {"a": OBS}}, "observations are of type object"),
+        ({"actions": ACT + 1j}, "actions are of type complex128"),
+        ({"actions": ACT.astype(str)}, "expected real numbers"),
+        ({"timeouts": None}, "timeouts have shape"),
         ({"actions": ACT[:, 0]}, "actions .* expected .M, dx"),
         ({"terminals": OVER[:5]}, "terminals have shape"),
         ({"terminals": np.full(10, 2)}, "expected 10 booleans"),

@@ -24,7 +24,7 @@ def episodes(name: str, values: Arrays) -> list[np.ndarray]:
         raise TrajectoryError(
             f"{name} is {described(values)}; expected an array (N, T, d), or a list of (T, d)"
         )
-    parts = [_numbers(f"{name} of episode {i}", part) for i, part in enumerate(values)]
+    parts = [numbers(f"{name} of episode {i}", part) for i, part in enumerate(values)]
     if not parts:
         raise TrajectoryError(f"there are no {name}; expected at least one episode")
     for i, part in enumerate(parts):
@@ -42,7 +42,8 @@ def _array(tensor: Tensor) -> np.ndarray:
     return (whole.float() if whole.dtype == torch.bfloat16 else whole).numpy()
 
 
-def _numbers(what: str, values: object) -> np.ndarray:
+def numbers(what: str, values: object) -> np.ndarray:
+    """An array of real numbers of any type; TrajectoryError for anything else."""
     if isinstance(values, Tensor):
         values = _array(values)
     try:
@@ -57,6 +58,7 @@ def _numbers(what: str, values: object) -> np.ndarray:
 
 
 def one_each(field: str, values: Sequence[object], n: int, kind: type) -> list:
+    """As many values of a kind as there are episodes."""
     array = np.asarray(values)
     if array.shape != (n,) or not np.issubdtype(array.dtype, kind):
         raise TrajectoryError(
@@ -66,6 +68,7 @@ def one_each(field: str, values: Sequence[object], n: int, kind: type) -> list:
 
 
 def unwrapped(states: np.ndarray, angles: tuple[int, ...]) -> np.ndarray:
+    """States (T, dx) whose angles do not jump."""
     states = states.astype(np.float64)
     states[:, list(angles)] = np.unwrap(states[:, list(angles)], axis=0)
     return states

@@ -16,6 +16,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
+from tsmlib import casting
 from tsmlib.checks import require_choice
 from tsmlib.log_rows import Bounds, FilePath, Log, Missing, Table, flags, names_of, scaled
 from tsmlib.robot import TrajectoryError, columns_of
@@ -126,17 +127,20 @@ class FromLogs:
         Raises:
             TrajectoryError: arrays that do not fit, or next observations that are not the next.
         """
-        x, u = np.asarray(observations), np.asarray(actions, np.float64)
-        over = [flags("terminals", terminals, len(x)), flags("timeouts", timeouts, len(x))]
+        x = casting.numbers("observations", observations)
+        u = casting.numbers("actions", actions).astype(np.float64)
         if x.ndim != 2 or u.ndim != 2 or len(u) != len(x) or not len(x):
             raise TrajectoryError(
                 f"observations have shape {x.shape}, actions {u.shape}; expected (M, dx) and "
                 "(M, du) with one row for each step"
             )
+        over = [flags("terminals", terminals, len(x)), flags("timeouts", timeouts, len(x))]
         ends = np.flatnonzero(over[0] | over[1]) + 1
         begins = [0, *(int(end) for end in ends if end < len(x))]
         parts = list(zip(begins, [*begins[1:], len(x)], strict=True))
-        after = None if next_observations is None else np.asarray(next_observations)
+        after = next_observations
+        if after is not None:
+            after = casting.numbers("next_observations", after)
         if after is not None:
             inside = np.setdiff1d(np.arange(len(x) - 1), ends - 1)
             if after.shape != x.shape or not np.array_equal(after[inside], x[inside + 1]):

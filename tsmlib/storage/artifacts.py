@@ -21,6 +21,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from tsmlib.checks import described, require_type
 from tsmlib.robot import Robot
 from tsmlib.storage.files import (
     Json,
@@ -82,19 +83,25 @@ def save(
     if path.suffix != ".safetensors":
         raise StoreError(f"cannot write {path}: expected a name that ends in .safetensors.")
     try:
-        arrays = {
-            name: torch.as_tensor(value).detach().cpu().contiguous().clone()
-            for name, value in tensors.items()
-        }
+        if "__metadata__" in tensors:
+            raise TypeError("'__metadata__' names the header")
+        arrays = {name: _owned(value) for name, value in tensors.items()}
         _require_finite(path, arrays)
         about: dict[str, Json] = {"sha256": _ZEROS, "schema": SCHEMA, "kind": kind}
         about |= {"header": dict(header), "provenance": provenance()}
         data = safetensors.torch.save(arrays, metadata={"tsmlib": dumps(path, about)})
-    except (TypeError, safetensors.SafetensorError) as error:
+    except (TypeError, AttributeError, safetensors.SafetensorError) as error:
         raise StoreError(f"cannot write {path}: {error}. Expected arrays of numbers.") from error
     at = data.index(_MARK) + len(_MARK)
     digest = hashlib.sha256(data).hexdigest().encode()
     write_bytes(path, data[:at] + digest + data[at + len(digest) :])
+
+
+def _owned(value: Tensor | np.ndarray) -> Tensor:
+    """A contiguous copy on the CPU, in this machine's byte order."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value, value.dtype.newbyteorder("="), order="C"))
+    return value.detach().cpu().clone(memory_format=torch.contiguous_format)
 
 
 def load(path: PathLike, *, kind: str) -> tuple[dict[str, Tensor], dict[str, Json]]:
@@ -175,6 +182,7 @@ def save_trajectories(
     path: PathLike, trajectories: Trajectories, header: Mapping[str, Json] | None = None
 ) -> None:
     """Write trajectories; ``header`` says where they come from (seed, controller, ...)."""
+    require_type("trajectories", trajectories, Trajectories, "Trajectories")
     t = trajectories
     about = {field.name: getattr(t, field.name) for field in fields(Robot)[:-1]}
     if any(t.terminated):
@@ -232,6 +240,8 @@ def save_model(path: PathLike, model: Model, header: Mapping[str, Json] | None =
     Raises:
         StoreError: weights that are not finite, or no room.
     """
+    if not hasattr(model, "config"):
+        raise TypeError(f"model is {described(model)}; expected one with config() and state_dict()")
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
     stated = about.get("fingerprint", {})
     if hasattr(model, "segment_len") and isinstance(stated, Mapping):
