@@ -135,7 +135,7 @@ def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     mixture = tsmlib.Mixture(
         [
             tsmlib.load_pretrained(word, env=env)
-            for word in ("rtsm", "onestep", "tsm", "ensemble+mse")
+            for word in ("rtsm", "onestep", "tsm", "lstm")
         ]
     )
     task, prior = tsmlib.load_task(env).take(2), tsmlib.load_pretrained("prior", env=env)
