@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from PIL import Image
 
-from tsmlib.envs import render
+from tsmlib.envs import drawing, render
 from tsmlib.envs.geometry import fingertip
 from tsmlib.envs.render import EXTENT, draw_scene, render_array
 from tsmlib.envs.spec import ENV_IDS, PYMUNK_IDS
@@ -73,3 +74,25 @@ def test_several_poses_and_paths_share_one_drawing() -> None:
 def test_a_state_of_another_environment_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\(6,\); tsm/PymunkPush-v1 expected \(10,\)"):
         render_array(a_state(PYMUNK_IDS[0]), PYMUNK_IDS[2])
+
+
+def coloured(frame: np.ndarray, colour: str) -> np.ndarray:
+    """Rows and columns (n, 2) of the pixels of a colour."""
+    return np.argwhere((frame == Image.new("RGB", (1, 1), colour).getpixel((0, 0))).all(-1))
+
+
+def test_robots_are_drawn_from_what_they_observe_and_others_are_named() -> None:
+    assert all(map(drawing.drawable, ("Pendulum-v1", "HalfCheetah-v5", "Walker2d-v5")))
+    assert not any(map(drawing.drawable, ("Ant-v5", "Reacher-v5", "MountainCarContinuous-v0")))
+    with pytest.raises(ValueError, match="Ant-v5 cannot be drawn from its observations"):
+        drawing.frames("Ant-v5", np.zeros((2, 105)))
+
+
+def test_a_pendulum_is_drawn_where_its_angle_says() -> None:
+    angles = np.array([0.0, np.pi / 2, np.pi])  # up, to the left, down
+    states = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    middles = [coloured(x, drawing.BODY).mean(0) for x in drawing.frames("Pendulum-v1", states)]
+    away = np.array(middles) - (drawing.HEIGHT / 2, drawing.WIDTH / 2)
+    assert away[0, 0] < -30
+    assert away[1, 1] < -30
+    assert away[2, 0] > 30
