@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -260,18 +261,17 @@ CALLS = [
     ),
     Call(
         "learn_policy",
-        learn_policy,
+        partial(learn_policy, options=tsmlib.LearningOptions(horizon=3, episodes=2, iterations=1)),
         dict(
             policy=Made(lambda: tsmlib.OneStepPolicy(6, 2, angles=(0, 1), hidden=4)),
             model=MODEL,
             reward=rewards.reach,
             draw=episodes_from(torch.from_numpy(TASK.start)),
-            options=tsmlib.LearningOptions(horizon=3, episodes=2, iterations=1),
             seed=0,
             measure=None,
             callback=None,
         ),
-        SEEDS | {"options": OPTIONAL, "measure": OPTIONAL, "callback": OPTIONAL},
+        SEEDS | {"measure": OPTIONAL, "callback": OPTIONAL},
         {
             "reward": {"made": still, "nothing": lambda g: None},
             "draw": {

@@ -4,7 +4,7 @@ of ``scoring``.
 Letters in shapes: S samples, N trajectories or segments, T predicted steps, D scored features.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from tsmlib.checks import require_count, require_seed, require_type
+from tsmlib.checks import MOST, require_count, require_seed, require_type
 from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, measure
 from tsmlib.models.base import Model, as_dynamics, require_robot, rollout
 from tsmlib.models.features import Features
@@ -105,7 +105,7 @@ def score(
         FloatingPointError: a score is not a number.
     """
     _require_fit(model, features, test, validation)
-    samples, seed = require_count("samples", samples), require_seed("seed", seed)
+    samples, seed = require_count("samples", samples, most=MOST), require_seed("seed", seed)
     rollouts = partial(
         _rollouts, model, samples=samples, horizon=horizon, starts=starts, progress=progress
     )
@@ -240,6 +240,7 @@ def _rollouts(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Blocks of trajectories: states (S, n, T, dx) and truth (n, T, dx). Blocks are independent."""
     horizon = require_count("horizon", horizon)
+    require_type("starts", starts, Iterable, "steps observed before a prediction, such as (10,)")
     starts = [require_count("a start", start) for start in starts]
     if not (starts and min(starts) >= 1 and 1 <= horizon <= data.horizon - max(starts)):
         raise ValueError(
