@@ -96,7 +96,8 @@ def _words(field: str, words: object) -> tuple[str, ...]:
 def columns_of(angles: object, names: tuple[str, ...]) -> tuple[int, ...]:
     """Angles, each an index or a name, as sorted indices."""
     listed = [] if isinstance(angles, str | Set) else list(np.asarray(angles, object).ravel())
-    known = {name: d for d, name in enumerate(names)} | {d: d for d in range(len(names))}
+    known: dict[object, int] = {name: d for d, name in enumerate(names)}
+    known |= {d: d for d in range(len(names))}
     found = [
         known.get(a)
         for a in listed

@@ -21,7 +21,7 @@ from tsmlib.storage.files import Json, PathLike, StoreError, read_bytes
 from tsmlib.trajectory import Trajectories
 
 MAX_RATIO = 20  # bytes that a file declares over its own
-_SUPPORTED = "supported are observations that are a Box of one dimension, and actions that are one too, with bounds"
+_SUPPORTED = "supported are observations and actions that are Boxes of one dimension, with bounds"
 
 
 def load_minari(
@@ -65,7 +65,8 @@ def load_minari(
             terminated.append(ended)
         if meaning["dt"] is None:
             warnings.warn(
-                f"{place} does not say how long a step is; one step counts as one second: give dt=...",
+                f"{place} does not say how long a step is; one step counts as one second: "
+                "give dt=...",
                 stacklevel=2,
             )
             meaning["dt"] = 1.0
@@ -148,7 +149,7 @@ def _minari(what: PathLike) -> ModuleType:
 
 
 def _environment(t: Trajectories) -> Any:
-    """The Gymnasium environment of these data, where its id is known here and its spaces are those of the data."""
+    """The Gymnasium environment of these data, where its id is known and its spaces fit."""
     import gymnasium
 
     from tsmlib.envs.stepping import UnsupportedEnvironment, make
@@ -169,7 +170,7 @@ def _environment(t: Trajectories) -> Any:
 
 
 def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
-    """What the metadata say of environment and states. ValueError where they say something else than they should."""
+    """What the metadata say of environment and states. ValueError for nonsense."""
     about: Any = metadata.get("tsmlib")
     if about is None:
         stated: Any = metadata.get("env_spec")
@@ -194,7 +195,7 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
 def _episodes(
     dataset: Any, low: np.ndarray, high: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """States (T + 1, dx), actions (T, du) in [-1, 1], and whether the environment ended it, of each episode."""
+    """States (T + 1, dx), actions (T, du) in [-1, 1] and whether it terminated, of each episode."""
     centre, half = (low + high) / 2, (high - low) / 2
     for number, episode in enumerate(dataset.iterate_episodes()):
         actions, over = (
@@ -203,17 +204,19 @@ def _episodes(
         )
         if actions.ndim != 2 or actions.shape[1] != len(low) or not len(actions) == len(over) > 0:
             raise ValueError(
-                f"episode {number} has actions {actions.shape} and terminations {over.shape}, expected (T, {len(low)}) "
-                "and (T,) with at least one step"
+                f"episode {number} has actions {actions.shape} and terminations {over.shape}, "
+                f"expected (T, {len(low)}) and (T,) with at least one step"
             )
         if over[:-1].any():
             raise ValueError(
-                f"episode {number} goes on after its termination at step {int(over.argmax())}, expected its end there"
+                f"episode {number} goes on after its termination at step {int(over.argmax())}, "
+                "expected its end there"
             )
         scaled = (actions - centre) / half
         if (most := np.abs(scaled).max()) > 1 + 1e-5:
             raise ValueError(
-                f"actions of episode {number} leave the action space, by a factor of {most:g}, expected them within "
+                f"actions of episode {number} leave the action space, by a factor of {most:g}, "
+                "expected them within "
                 f"{low.tolist()!s:.80} to {high.tolist()!s:.80}"
             )
         yield (
@@ -224,7 +227,7 @@ def _episodes(
 
 
 def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarray, np.ndarray]:
-    """Two flat Box spaces, as many episodes as stated, and numbers within the file itself, no more than it can hold.
+    """Two flat Box spaces, as many episodes as stated, plain numbers, no more than the file holds.
 
     The bounds (du,) of the actions.
     """
@@ -235,7 +238,8 @@ def _require_plain(folder: Path, metadata: Mapping[str, Json]) -> tuple[np.ndarr
     low, high = _box("actions", stated["action_space"])
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ValueError(
-            f"actions have no bounds, {stated['action_space']:.100}: nothing says how to scale them to [-1, 1]; "
+            f"actions have no bounds, {stated['action_space']:.100}: nothing says how to scale "
+            f"them to [-1, 1]; "
             f"{_SUPPORTED}. Read it with minari, scale its actions, and make Trajectories of it"
         )
     if stated["data_format"] != "hdf5":
