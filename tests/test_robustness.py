@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from torch import Tensor
 from tsmlib.collection import collect_random
 from tsmlib.envs import imperfect
 from tsmlib.envs.geometry import HALF_RANGE, fingertip
-from tsmlib.envs.spec import DELAY, NOISE
+from tsmlib.envs.spec import NOISE
 from tsmlib.evaluation import filtering
 from tsmlib.evaluation.filtering import KalmanFilter, errors, rmse
 from tsmlib.sampling import Noise
@@ -302,28 +301,3 @@ def test_other_episodes_are_refused(kalman: KalmanFilter, held_out: Pair, test_d
             ValueError, match=f"episodes of {NOISY} and of {REACHER} hold other torques"
         ):
             call()
-
-
-# Rows
-
-
-WORLDS: dict[str, dict[str, Any]] = {
-    "clean": {},
-    "noise": {"noise": NOISE},
-    "delay": {"delay": DELAY},
-}
-
-
-ROWS = [
-    *learned(
-        {
-            "clean": [[-12, -5, -3, -1], [-12, -5, -5, -1]],
-            "noise": [[-12, -6, -5], [-12, -6, -5]],
-            "delay": [[-12, -6, -8], [-12, -6, -7]],
-        }
-    ),
-    *learned({"noise": [[-12, -9, -8], [-12, -9, -6]]}, THEIRS),
-    *learned({"noise": [[0.6], [0.7]], "delay": [[0.5], [0.6]]}, metric="success50", first=440),
-    dict(env=REACHER, model="tsm", planner="none", noise=NOISE, metric="nrmse", value=0.1, seed=0),
-]
-LEARNED = tables.frame(ROWS)
