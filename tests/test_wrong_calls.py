@@ -43,7 +43,15 @@ SMALL: dict[str, Any] = {
 }
 KINDS = {name: getattr(tsmlib, name) for name in SMALL}
 MORE = {  # arguments beside those above
-    "TSM": dict(beta=1.0, full_encoder=False, head_channels=0, state_skip=0, plain=False),
+    "TSM": dict(
+        beta=1.0,
+        full_encoder=False,
+        head_channels=0,
+        state_skip=0,
+        plain=False,
+        prior="normal",
+        residual="square",
+    ),
     "RecurrentTSM": dict(mode_weight=0.0),
     "Ensemble": dict(gaussian=True),
     "ActionPrior": dict(beta=0.03),
