@@ -83,7 +83,7 @@ def data() -> Trajectories:
     )
 
 
-# The time convention -------------------------------------------------------------------------------------------------
+# The time convention
 
 
 def test_a_model_of_ones_own_needs_a_segment_length_and_its_predictions_alone(
