@@ -200,7 +200,7 @@ def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
     trial = execute(task, watching)
     assert trial.observed is not None
     whole = Trajectories(
-        trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, ("",) * 6, ("",) * 6
+        trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, tuple("abcdef"), tuple("abcdef")
     ).segment(10)
     assert len(seen) == 20
     for t, past in enumerate(seen):
@@ -387,7 +387,7 @@ def test_every_plan_is_made_from_the_past_that_was_observed() -> None:
     task, model = some_task(horizon=20), Wrong()
     trial = mpc(task, model, DirectActions(20, rms=0.1), push_on, every=8)  # type: ignore[arg-type]
     whole = Trajectories(
-        trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, ("",) * 6, ("",) * 6
+        trial.states.numpy(), trial.actions.numpy(), REACHER, 0.02, tuple("abcdef"), tuple("abcdef")
     ).segment(3)
     observed = {
         past.states[:4].numpy().tobytes() + past.actions[:4].numpy().tobytes()

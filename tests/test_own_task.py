@@ -120,7 +120,7 @@ def test_fewer_instances_keep_the_reward() -> None:
 )
 def test_a_reward_of_the_wrong_shape_is_refused(wrong: Reward, found: str) -> None:
     with pytest.raises(
-        ValueError, match=rf"is {found}; expected a tensor \(2, 1, 3, 20\), one number per step"
+        ValueError, match=rf"is {found}.*; expected a tensor \(2, 1, 3, 20\), one number per step"
     ):
         posed(wrong)
 
@@ -131,7 +131,7 @@ def test_some_instances_are_taken_by_number_and_none_that_there_is_not() -> None
     assert torch.equal(some.target, task.target[[3, 1]])
     assert (some.start == task.start[[3, 1]]).all()
     for wrong in ([], [4], [-1]):
-        with pytest.raises(ValueError, match="choose some from 0 to 3"):
+        with pytest.raises(ValueError, match="choose some from 0 to 3|an index of a target"):
             task.take(wrong)
 
 
