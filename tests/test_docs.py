@@ -36,14 +36,20 @@ def test_the_program_of_a_page_runs(
     run(page, tmp_path, monkeypatch)
 
 
-def test_the_push_of_the_readme_ends_near_its_target_and_is_filmed(
+def test_the_programs_of_the_readme_push_read_a_log_and_plan_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    push, logs, robot = BLOCK.findall(README.read_text())
     names: dict[str, Any] = {}
-    exec(BLOCK.findall(README.read_text())[0], names)
+    exec(push, names)
     assert float(names["trial"].final_distance[0]) < 0.05
     assert (tmp_path / "push.mp4").stat().st_size > 1000
+    rows = (f"{run},{0.1 * k:.1f},{0.01 * k * run},{0.1 * run},0.5" for run in range(20) for k in range(40))
+    (tmp_path / "robot.csv").write_text("\n".join(["run,t,q,dq,torque", *rows]))
+    names["few"] = tsmlib.TrainingOptions(steps=5)
+    for program in (logs, robot):
+        exec(program.replace("fit(model, data)", "fit(model, data, options=few)"), names)
 
 
 @pytest.mark.parametrize("page", [README, *PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
