@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsmlib.evaluation.data import autocorrelation, cells_visited, contact_counts
+from tsmlib.evaluation.data import autocorrelation, cells_visited
 
 
 def test_points_everywhere_visit_every_cell_and_one_point_one() -> None:
@@ -22,15 +22,6 @@ def test_what_is_out_of_reach_does_not_count() -> None:
     assert cells_visited(centre, inner=0.5, outer=1, cells=4) == 0
     half = np.stack(np.meshgrid(np.linspace(0.001, 1, 200), np.linspace(-1, 1, 400)), -1)
     assert cells_visited(half, inner=0.1, outer=1) == pytest.approx(0.5)
-
-
-def test_an_arm_that_comes_back_to_the_object_meets_it_twice() -> None:
-    states = np.zeros((2, 6, 10))  # the arm lies along x
-    states[..., 4], states[..., 7] = 0.21, 0.1
-    states[0, [1, 2, 4], 7] = 0.0  # the object is under it in two stretches
-    assert contact_counts(states, "tsm/ReacherPush-v1").tolist() == [2, 0]
-    states[0, 0, 7] = 0.0  # from the start on
-    assert contact_counts(states, "tsm/ReacherPush-v1").tolist() == [2, 0]
 
 
 def test_a_wave_remembers_its_period_and_noise_nothing() -> None:
