@@ -1,12 +1,9 @@
-"""Gives ``papermill notebooks/05_control.ipynb`` an output path, in runs/laptop/seed0/.
-
-papermill refuses a command without one before it asks plugins. Other commands are left alone.
-"""
+"""Gives ``papermill notebooks/05_control.ipynb``, typed in a terminal, an output path in runs/."""
 
 import sys
 from pathlib import Path
 
-handler = None  # what the entry point names; papermill registers it, and it handles no paths
+handler = None  # what the entry point names; it handles no paths
 
 
 def completed(argv: list[str]) -> list[str]:
@@ -16,10 +13,9 @@ def completed(argv: list[str]) -> list[str]:
         at = rest.index("-p")
         given[rest[at + 1]] = rest[at + 2]
         del rest[at : at + 3]
-    if len(rest) != 1 or not (notebook := Path(rest[0]).resolve()).match("notebooks/*.ipynb"):
-        return argv
-    root = notebook.parents[1]
-    if not (root / "reproduction").is_dir():
+    notebook = Path(rest[0]).resolve() if len(rest) == 1 else Path()
+    root = notebook.parent.parent
+    if not notebook.match("notebooks/*.ipynb") or not (root / "reproduction").is_dir():
         return argv
     if unknown := [name for name in given if f'"{name} = ' not in notebook.read_text()]:
         sys.exit(f"error: {notebook.name} has no parameter {unknown[0]!r}")
@@ -28,5 +24,5 @@ def completed(argv: list[str]) -> list[str]:
     return [*argv, str(folder / notebook.name)]
 
 
-if Path(sys.argv[0]).stem == "papermill":
+if Path(sys.argv[0]).stem == "papermill" and sys.stdout.isatty():
     sys.argv[:] = completed(sys.argv)
