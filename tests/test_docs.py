@@ -45,7 +45,11 @@ def test_the_programs_of_the_readme_push_read_a_log_and_plan_again(
     exec(push, names)
     assert float(names["trial"].final_distance[0]) < 0.05
     assert (tmp_path / "push.mp4").stat().st_size > 1000
-    rows = (f"{run},{0.1 * k:.1f},{0.01 * k * run},{0.1 * run},0.5" for run in range(20) for k in range(40))
+    rows = (
+        f"{run},{0.1 * k:.1f},{0.01 * k * run},{0.1 * run},0.5"
+        for run in range(20)
+        for k in range(40)
+    )
     (tmp_path / "robot.csv").write_text("\n".join(["run,t,q,dq,torque", *rows]))
     names["few"] = tsmlib.TrainingOptions(steps=5)
     for program in (logs, robot):

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import torch
@@ -132,6 +132,19 @@ class Trajectories(FromLogs):
         )
         casting.require_bounds(self.flat_actions, env)
         casting.require_no_jumps(self.increments(), self.steps, robot)
+
+    @classmethod
+    def ragged(
+        cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], **robot: Any
+    ) -> Trajectories:
+        """Episodes of different lengths, (T_i + 1, dx) and (T_i, du): the constructor takes them too.
+
+        Args:
+            states: an array for each episode.
+            actions: an array for each episode.
+            robot: env, dt and what else the constructor takes.
+        """
+        return cls(list(states), list(actions), **robot)
 
     @classmethod
     def from_rows(
