@@ -84,8 +84,19 @@ def success_c(states: Tensor, goal: Tensor) -> Tensor:
     return solved_c(states, goal[..., None, :]).unfold(-1, HELD, 1).all(-1).any(-1)
 
 
+def distance(states: Tensor, goal: Tensor, corners: Tensor | None = None) -> Tensor:
+    """Mean distance of the T's corners from the goal's: (..., 7) twice -> (...), px."""
+    corners = corners_of(PushTPhysics()) if corners is None else corners
+    return (_placed(corners, states) - _placed(corners, goal)).norm(dim=-1).mean(-1)
+
+
+def corners_of(physics: PushTPhysics) -> Tensor:
+    """The corners (P, 2) of the T's boxes in its own frame, px."""
+    return torch.from_numpy(physics.boxes).float().flatten(0, 1)
+
+
 def closest(
-    goal: Tensor, *, pusher: bool, held: int = 1, shape: str = "T", scale: float = 30.0
+    goal: Tensor, *, pusher: bool, held: int = 1, physics: PushTPhysics | None = None
 ) -> Reward:
     """Reward of coming close to a goal once: minus the least distance in an episode, in px.
 
@@ -97,17 +108,15 @@ def closest(
         goal: (B, 7).
         pusher: whether the pusher has a goal too.
         held: steps in a row of which the worst counts.
-        shape, scale: of what is pushed.
+        physics: of the field; the standard one's without.
 
     Returns:
         A reward of states (..., B, T, 7), given in the last step, but for the mean.
     """
-    corners = torch.tensor(PushTPhysics(scale=scale, shape=shape).boxes, dtype=torch.float32)
-    corners = corners.flatten(0, 1)
-    wanted = _placed(corners, goal)[:, None]
+    corners = corners_of(physics or PushTPhysics())
 
     def reward(states: Tensor, actions: Tensor) -> Tensor:
-        away = (_placed(corners, states) - wanted).norm(dim=-1).mean(-1)  # (..., B, T)
+        away = distance(states, goal[:, None], corners)  # (..., B, T)
         if pusher:
             away = (away.square() + (states[..., :2] - goal[:, None, :2]).square().sum(-1)).sqrt()
         steps = away.shape[-1]
@@ -193,7 +202,7 @@ def pusht_task(
         env,
         start,
         target,
-        partial(closest, pusher=pusher, held=held, shape=physics.shape, scale=physics.scale),
+        partial(closest, pusher=pusher, held=held, physics=physics),
         horizon=horizon,
         success_for=lambda goal: partial(success, goal=goal),
     )
