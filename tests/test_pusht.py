@@ -257,6 +257,23 @@ def test_plans_of_a_lookahead_follow_each_other_to_the_end_of_the_episode():
         tsmlib.mpc(task, None, space, planner, every=3, lookahead=2)
 
 
+def test_what_has_succeeded_stays_idle_where_the_first_success_counts():
+    start, goal, _ = pairs(2)
+    task = dataclasses.replace(pusht_task(start, goal), horizon=8)
+    first = torch.from_numpy(start[:, :2])
+
+    def moved(n):  # a success is that the pusher has moved
+        return lambda states: (states[..., :2] - first[:n, None]).norm(dim=-1).amax(-1) > 5
+
+    task = dataclasses.replace(task, success_for=lambda goal: moved(len(goal)))
+    planner = partial(tsmlib.cem, candidates=4, elites=2, iterations=1)
+    space = tsmlib.DirectActions(4, rms=0.6, smoothness=0)
+    trial = tsmlib.mpc(task, None, space, planner, every=2, lookahead=4, until_success=True)
+    assert trial.success.all()
+    assert (trial.actions[:, :2] != 0).any(-1).all()
+    assert (trial.actions[:, 4:] == 0).all()
+
+
 def test_random_play_ends_where_the_t_leaves_the_picture():
     seen = random_play(20, horizon=60, seed=3)
     assert len(seen) % 8 == 0

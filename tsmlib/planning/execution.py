@@ -218,6 +218,7 @@ def mpc(
     *,
     every: int = 10,
     lookahead: int | None = None,
+    until_success: bool = False,
     plan: Plan | None = None,
     judge: Judge = model_predictor,
     seed: int = 0,
@@ -237,7 +238,10 @@ def mpc(
         planner: with the budget of each plan, such as ``partial(cem, candidates=96)``.
         every: steps executed before the next plan.
         lookahead: steps of each plan, where it is not to reach to the end of the episode; of
-            ``DirectActions``, whose new steps begin at zero.
+            ``DirectActions``, whose new steps begin at zero. The reward sees these steps alone,
+            and predicted returns are theirs.
+        until_success: whether instances that have succeeded stay idle, where the first success is
+            what counts, and nothing is planned for them any more.
         plan: the first one, if there is one already, so that closed and open loop begin alike.
         judge: makes what candidates are judged by, by default the model's mode.
         seed: of what judges and fresh samples draw, 0 or above.
@@ -275,7 +279,7 @@ def mpc(
     began, horizon = time.perf_counter(), task.horizon
     past_len = 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(
-        task, model, planner, every, ahead, judge, seed, space, start=len(task), plan=plan
+        task, model, planner, every, ahead, until_success, judge, seed, space, len(task), plan
     )
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
@@ -310,6 +314,7 @@ class _Replanning:
     planner: Planner
     every: int
     ahead: int  # steps of a plan, where as many are left
+    until_success: bool
     judge: Judge
     seed: int
     space: SearchSpace  # of the rest of the episode, as are start and plan
@@ -321,25 +326,52 @@ class _Replanning:
 
     def __call__(self, past: Segment) -> Tensor:
         """``past`` holds the whole episode so far, with ``past_len`` steps before it."""
-        so_far = Segment(*(part[:, part.shape[1] - self.done :] for part in past))
-        reward = _whole_episode(self.task.reward, so_far)
-        predict, fresh = self._predictors(past)
-        plan, self.plan = self.plan or self.planner(predict, reward, self.space, self.start), None
-        self._require_whole(plan)
-        judged = reevaluate(plan, fresh, reward)
-        self.returns.append(judged.predicted_return)
-        self.rollouts.append(judged.states[:1, :, : self.every])
         steps = min(self.every, self.task.horizon - self.done)
+        actions = self.task.idle_actions()[:, :steps]
+        rollout = past.states[None, :, -1:].repeat(1, 1, steps, 1)
+        returns = self.returns[-1].clone() if self.returns else rollout.new_zeros(len(self.task))
+        rows = self._unsolved(past)
+        if len(rows):
+            plan, judged = self._planned(past, rows)
+            actions[rows], returns[rows] = plan.actions[:, :steps], judged.predicted_return
+            rollout[:, rows] = judged.states[:1, :, :steps]
+        self.returns.append(returns)
+        self.rollouts.append(rollout)
         self.done += steps
-        if self.done < self.task.horizon:
-            rest, left = self.space.after(plan.parameters, steps)
+        if len(rows) and self.done < self.task.horizon:
+            parameters = plan.parameters.new_zeros(len(self.task), *plan.parameters.shape[1:])
+            parameters[rows] = plan.parameters
+            rest, left = self.space.after(parameters, steps)
             if self.ahead < self.task.horizon:  # as long a plan as before, or as far as the end
                 needed = min(self.ahead, self.task.horizon - self.done)
                 left = F.pad(left, (0, 0, 0, needed - left.shape[1]))
-                rest, _ = self.space.after(plan.parameters, plan.actions.shape[1] - needed)
+                rest, _ = self.space.after(parameters, plan.actions.shape[1] - needed)
             self.space = rest
             self.start = left[None]
-        return plan.actions[:, :steps]
+        return actions
+
+    def _unsolved(self, past: Segment) -> Tensor:
+        """Which instances are planned for."""
+        everyone = torch.arange(len(self.task))
+        if not self.until_success or not self.done:
+            return everyone
+        _, success = self.task.judged(past.states[:, past.states.shape[1] - self.done - 1 :])
+        return everyone if success is None else everyone[~success]
+
+    def _planned(self, past: Segment, rows: Tensor) -> tuple[Plan, Plan]:
+        """The next plan of some instances, and the same with the return that fresh samples give."""
+        task, start, everyone = self.task, self.start, len(rows) == len(self.task)
+        if not everyone:
+            task, past = task.take(rows.tolist()), Segment(*(part[rows] for part in past))
+            start = start[:, rows] if isinstance(start, Tensor) else len(rows)
+        reward = task.reward
+        if self.ahead >= self.task.horizon:
+            so_far = Segment(*(part[:, part.shape[1] - self.done :] for part in past))
+            reward = _whole_episode(reward, so_far)
+        predict, fresh = self._predictors(task, past)
+        plan, self.plan = self.plan or self.planner(predict, reward, self.space, start), None
+        self._require_whole(plan)
+        return plan, reevaluate(plan, fresh, reward)
 
     def _require_whole(self, plan: Plan) -> None:
         require_type("what the planner gave", plan, Plan, "a Plan, as of tsmlib.cem")
@@ -351,11 +383,11 @@ class _Replanning:
                 "the whole episode, task.horizon steps, or of lookahead steps"
             )
 
-    def _predictors(self, past: Segment) -> tuple[Predictor, Predictor]:
+    def _predictors(self, task: Task, past: Segment) -> tuple[Predictor, Predictor]:
         """What candidates are judged by, and what predicts the return of the finished plan."""
         if self.model is None:
             done = past.actions[:, past.actions.shape[1] - self.done :]
-            simulator = simulator_predictor(self.task, past.states[:, -1].numpy(), done=done)
+            simulator = simulator_predictor(task, past.states[:, -1].numpy(), done=done)
             return simulator, simulator
         recent, seed = past.last(as_dynamics(self.model).past_len), self.seed + 2 * self.done
         fresh = fresh_predictor(self.model, recent, seed=seed + 1)
