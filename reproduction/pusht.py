@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from tsmlib.trajectory import Trajectories
 
 EPISODES, HELD_OUT = 5800, 60  # of 100 steps
 STAGES = ((1, 1024, 7000, (0.0, 0.35)), (4, 384, 5000, (0.35, 0.65)), (10, 192, 3000, (0.65, 1.0)))
-BUDGET = {"candidates": 128, "elites": 12, "iterations": 4}
+CANDIDATES, ELITES, ITERATIONS = 128, 12, 4
 LOOKAHEAD, EVERY, RMS = 25, 5, 0.6  # steps, steps, of full action: uniform actions have 0.58
 
 
@@ -55,20 +56,26 @@ def trial(
     """Planning again every five steps on the first frozen pairs; None plans in the simulator."""
     task = load_pusht("test", protocol).take(pairs)
     space = tsmlib.DirectActions(LOOKAHEAD, rms=RMS, smoothness=0)
-    planner = partial(tsmlib.cem, seed=seed, **BUDGET)
+    planner = partial(
+        tsmlib.cem, candidates=CANDIDATES, elites=ELITES, iterations=ITERATIONS, seed=seed
+    )
     return tsmlib.mpc(
         task, model, space, planner, every=EVERY, lookahead=LOOKAHEAD, until_success=True, seed=seed
     )
 
 
-def row(trial: tsmlib.Trial, seconds: float, **about: str | int) -> dict[str, object]:
+def row(
+    trial: tsmlib.Trial, seconds: float, method: str, protocol: str, seed: int
+) -> dict[str, object]:
     """One line of the table."""
     success = trial.success
     assert success is not None
     n, share = len(success), float(success.float().mean())
     half = 1.96 * (share * (1 - share) / n) ** 0.5
     return {
-        **about,
+        "method": method,
+        "protocol": protocol,
+        "seed": seed,
         "pairs": n,
         "success": round(share, 4),
         "low": round(max(0.0, share - half), 4),
@@ -85,15 +92,16 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("runs/pusht"))
     parser.add_argument("--out", type=Path, default=Path("data/results/11_pusht.csv"))
     given = parser.parse_args()
-    rows = pd.read_csv(given.out).to_dict("records") if given.out.exists() else []
+    rows: list[dict[str, object]] = []
+    if given.out.exists():
+        rows = [dict(line) for _, line in pd.read_csv(given.out).iterrows()]
 
-    def add(method: str, protocol: str, seed: int, pairs: int, make) -> None:
+    def add(method: str, protocol: str, seed: int, make: Callable[[], tsmlib.Trial]) -> None:
         if any((r["method"], r["protocol"], r["seed"]) == (method, protocol, seed) for r in rows):
             return
         began = time.process_time()
         result = make()
-        about = {"method": method, "protocol": protocol, "seed": seed}
-        rows.append(row(result, time.process_time() - began, **about))
+        rows.append(row(result, time.process_time() - began, method, protocol, seed))
         print(rows[-1], flush=True)
         given.out.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(rows).to_csv(given.out, index=False)
@@ -110,12 +118,12 @@ def main() -> None:
         for protocol in "BC":
             task = load_pusht("test", protocol).take(given.pairs)
             play = weak_policy(torch.Generator().manual_seed(seed))
-            add("random play", protocol, seed, given.pairs, partial(tsmlib.execute, task, play))
+            add("random play", protocol, seed, partial(tsmlib.execute, task, play))
             plans = partial(trial, model, protocol, given.pairs, seed=seed)
-            add("egocentric", protocol, seed, given.pairs, plans)
+            add("egocentric", protocol, seed, plans)
     for protocol in "BC" if given.simulator else "":
         plans = partial(trial, None, protocol, given.simulator, seed=0)
-        add("simulator", protocol, 0, given.simulator, plans)
+        add("simulator", protocol, 0, plans)
 
 
 if __name__ == "__main__":

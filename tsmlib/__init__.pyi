@@ -14,6 +14,7 @@ from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout
 from .models.baselines import LSTM as LSTM
 from .models.baselines import OneStep as OneStep
+from .models.egocentric import Egocentric as Egocentric
 from .models.ensemble import Ensemble as Ensemble
 from .models.mixture import Mixture as Mixture
 from .models.recurrent import RecurrentTSM as RecurrentTSM
@@ -38,6 +39,7 @@ from .policies.learning import learn_policy as learn_policy
 from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy
 from .pretrained import load_pretrained as load_pretrained
+from .pretrained import load_pusht as load_pusht
 from .pretrained import load_task as load_task
 from .storage.artifacts import load_model as load_model
 from .storage.artifacts import save_model as save_model

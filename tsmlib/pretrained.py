@@ -106,8 +106,8 @@ def load_pusht(
     """
     tensors, _ = artifacts.load(TASKS / "PushT.safetensors", kind="task")
     word = "validation_" if split == "validation" else ""
-    pairs = (tensors[f"{word}{part}"].numpy() for part in ("start", "target"))
-    return pusht_task(*pairs, protocol, env=env)
+    start, goal = tensors[f"{word}start"].numpy(), tensors[f"{word}target"].numpy()
+    return pusht_task(start, goal, protocol, env=env)
 
 
 def _pusht_model(word: str) -> DynamicsModel:

@@ -150,7 +150,7 @@ def random_play(
         policy = weak_policy(torch.Generator().manual_seed(seed))
         played = collect(fields, policy, horizon=horizon, past_len=1, seed=seed)
     corners = placed(physics.boxes.reshape(-1, 2), played.states)
-    outside = ((corners < 0) | (corners > SIZE)).any((-2, -1))
+    outside = np.asarray(((corners < 0) | (corners > SIZE)).any((-2, -1)))
     ends = np.where(outside.any(1), outside.argmax(1) - 1, horizon)
     pairs = [(played.states, played.actions)]
     if symmetries:
