@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: data/ and notebooks/ in a wheel, where ``tsmlib.pretrained`` looks."""
+"""data/ and notebooks/ in a wheel, where ``tsmlib.pretrained`` looks."""
 
 import shutil
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""The documentation site: ``make docs``. Nothing is fetched and no notebook is executed while it is built.
+"""The documentation site: ``make docs``. Nothing is fetched and no notebook is executed.
 
-A notebook's page shows its outputs where runs/laptop/seed0, or the run of ``make docs RUN=runs/paper/seed0``, has
-executed it as it is stored now.
+A notebook's page shows its outputs where runs/laptop/seed0, or the run of ``make docs
+RUN=runs/paper/seed0``, has executed it as it is stored now.
 """
 
 import sys

@@ -1,9 +1,11 @@
-"""Sphinx extension of this site: pages of notebooks and modules, links into them, docstrings as written, formulas.
+"""Sphinx extension of this site: pages of notebooks and modules, links into them, docstrings,
+formulas.
 
-Formulas become MathML, which browsers show by themselves, so that no page loads a script from elsewhere.
+Formulas become MathML, which browsers show by themselves, so that no page loads a script from
+elsewhere.
 
-Docstrings of tsmlib are plain text with ``code``, paragraphs and indented formulas. Read as reStructuredText,
-``(C, B, *shape)`` would open an emphasis and ``E|X - x|`` a substitution.
+Docstrings of tsmlib are plain text with ``code``, paragraphs and indented formulas. Read as
+reStructuredText, ``(C, B, *shape)`` would open an emphasis and ``E|X - x|`` a substitution.
 """
 
 import os
@@ -29,7 +31,7 @@ SPECIAL = re.compile(r"([\\*|_`])")
 def process(
     app: object, what: str, name: str, found: object, options: object, lines: list[str]
 ) -> None:
-    """Turn the ``lines`` of a docstring into reStructuredText that looks like them. Sphinx's own signature."""
+    """Turn the ``lines`` of a docstring into reStructuredText, by Sphinx's own signature."""
     paragraphs = [
         list(part) for filled, part in groupby(lines, key=lambda line: bool(line.strip())) if filled
     ]
@@ -37,7 +39,7 @@ def process(
 
 
 def converted(paragraph: list[str]) -> list[str]:
-    """One paragraph: indented is a formula, partly indented or a list keeps its lines, all else is text."""
+    """One paragraph: indented is a formula, a list keeps its lines, all else is text."""
     indents = [len(line) - len(line.lstrip()) for line in paragraph]
     if min(indents):
         return ["::", "", *("    " + line for line in paragraph)]
@@ -76,7 +78,7 @@ def public_names() -> dict[str, list[str]]:
 
 
 def write_modules() -> None:
-    """docs/api/modules/ anew: a page for each module, of all its names but those that have a page of their own."""
+    """docs/api/modules/ anew: a page for each module, of the names that have no page."""
     target, public = HERE / "api" / "modules", public_names()
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
@@ -97,7 +99,7 @@ def write_modules() -> None:
 
 
 def copy_notebooks() -> None:
-    """docs/notebooks/ anew: as the run of $TSM_DOCS_RUN executed them, or as they are stored, and which of both."""
+    """docs/notebooks/ anew: as the run of $TSM_DOCS_RUN executed them, or as they are stored."""
     target, run = HERE / "notebooks", os.environ.get("TSM_DOCS_RUN") or "runs/laptop/seed0"
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
@@ -106,7 +108,7 @@ def copy_notebooks() -> None:
 
 
 def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
-    """A notebook with the outputs of ``executed`` where that was made from the notebook as it is stored now."""
+    """A notebook with the outputs of ``executed`` where that was made from it as it is now."""
     notebook, said = nbformat.read(stored, 4), "Not executed for this page"
     if executed.exists():
         own = nbformat.read(executed, 4)
@@ -138,7 +140,7 @@ def inline_formula(page: HTML5Translator, node: nodes.math) -> NoReturn:
 
 
 def display_formula(page: HTML5Translator, node: nodes.math_block) -> NoReturn:
-    """A formula on a line of its own; one with a number of the paper's stands in the environment that shows it."""
+    """A formula on a line of its own, with the paper's number where it has one."""
     tex = node.astext()
     if r"\tag" in tex:
         tex = rf"\begin{{equation}}{tex}\end{{equation}}"
@@ -153,7 +155,7 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
-    """Sphinx's event build-finished: the page of the explorer beside its description, or how to build it."""
+    """Sphinx's event build-finished: the explorer's page, or how to build it."""
     built, target = ROOT / "explorer" / "dist", Path(app.outdir) / "explorer"
     shutil.rmtree(target, ignore_errors=True)
     if (built / "index.html").exists():

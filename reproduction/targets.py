@@ -63,10 +63,8 @@ def plans_of(run: Run, arm: str) -> list[str]:
     )
     names = [f"{word}-{space}-cem" for word in words for space in ("latent", "direct")]
     if run.scale == "paper":
-        names += [
-            f"tsm-{space}-{planner}"
-            for space, planner in product(("latent", "direct"), ("adam", "adam+starts"))
-        ]
+        pairs = product(("latent", "direct"), ("adam", "adam+starts"))
+        names += [f"tsm-{space}-{planner}" for space, planner in pairs]
         names.append("tsm-latent-adam-iterations500")
         names += [f"{word}-direct-cem+white" for word in words]
     if arm == "ReacherPush" and run.scale != "laptop":
@@ -118,16 +116,10 @@ def _robots(run: Run) -> list[str]:
 
 
 def _rounds(run: Run) -> list[str]:
-    loops = [
-        f"{word}-{data}"
-        for word, data in product(("rtsm", "lstm", "ensemble+mse"), ("plans", "random", "none"))
-    ]
-    names = [
-        f"rounds/{world}/{loop}"
-        for world, loop in product(
-            ("Pendulum", "ReacherPush"), run.pick(loops[:1], loops[:2], loops)
-        )
-    ]
+    pairs = product(("rtsm", "lstm", "ensemble+mse"), ("plans", "random", "none"))
+    loops = [f"{word}-{data}" for word, data in pairs]
+    picked = product(("Pendulum", "ReacherPush"), run.pick(loops[:1], loops[:2], loops))
+    names = [f"rounds/{world}/{loop}" for world, loop in picked]
     arms = [f"ReacherPush-{word}" for word in ("mass0.5", "mass2", "gain0.7")]
     arms = run.pick(arms[-1:], arms[-1:], arms)
     ways = run.pick(("zero",), ("zero", "all"), ("zero", "all", "head", "codes", "scratch"))
@@ -335,12 +327,8 @@ def pool(scale: str, name: str, seeds: list[int]) -> Path:
 def _split(name: str) -> tuple[str, list[str]]:
     """Kind and words of a target's name."""
     kind, *words = name.split("/")
-    if (
-        kind not in KINDS
-        or not words
-        or os.pardir in words
-        or (kind == "tables" and words[0] not in TABLES)
-    ):
+    no_table = kind == "tables" and "".join(words[:1]) not in TABLES
+    if kind not in KINDS or not words or os.pardir in words or no_table:
         known = ", ".join([*KINDS, *(f"tables/{table}" for table in TABLES)])
         raise ValueError(f"no target is called {name!r:.80}; there are {known}")
     return kind, words

@@ -1,9 +1,10 @@
-"""An accelerator that the processor imitates, to see that nothing computes with tensors of two devices.
+"""An accelerator that the processor imitates, to see that nothing computes with tensors of two
+devices.
 
-Its tensors say that they are on the device "meta" and hold their numbers in a tensor of the processor. As on CUDA, an
-operation fails that meets one of them beside a tensor of the processor, but for a single number in elementwise
-operations and for the index in ``x[index]``; and so does drawing on it from a generator of the processor. There is no
-half precision on it.
+Its tensors say that they are on the device "meta" and hold their numbers in a tensor of the
+processor. As on CUDA, an operation fails that meets one of them beside a tensor of the processor,
+but for a single number in elementwise operations and for the index in ``x[index]``; and so does
+drawing on it from a generator of the processor. There is no half precision on it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch.optim import optimizer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-DEVICE = "meta"  # the one device without numbers of its own that every build of torch can differentiate on
+DEVICE = "meta"  # of every build of torch, without numbers of its own, and differentiable
 INDEXED = (
     "aten::index",
     "aten::_unsafe_index",
@@ -62,7 +63,7 @@ class There(Tensor):
 
 
 class Accelerator(TorchDispatchMode):
-    """Within it, "meta" is the accelerator, for autocast (which does nothing) and Adam too. count: operations on it."""
+    """Within it, "meta" is the accelerator, for autocast and Adam too. count: of operations."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -99,7 +100,7 @@ class Accelerator(TorchDispatchMode):
 
 
 def _run(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """The operation on the numbers; the result on the device that it was asked for on, or where its tensors are."""
+    """The operation on the numbers; the result on the device that was asked for."""
     name = operation._schema.name
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
     there = any(isinstance(tensor, There) for tensor in tensors)
@@ -109,7 +110,7 @@ def _run(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
             single = not tensor.ndim and torch.Tag.pointwise in operation.tags
             if not (isinstance(tensor, There) or single or any(tensor is index for index in free)):
                 raise RuntimeError(
-                    f"{name}: a tensor of the processor, {tuple(tensor.shape)}, beside the accelerator's"
+                    f"{name}: a tensor of the processor, {tuple(tensor.shape)}, beside others"
                 )
     if kwargs.get("device") is not None:
         there, kwargs = torch.device(kwargs["device"]).type == DEVICE, {**kwargs, "device": "cpu"}

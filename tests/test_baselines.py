@@ -1,4 +1,4 @@
-"""What makes each baseline the model it claims to be; what holds for all models is in test_axioms.py."""
+"""What makes each baseline the model it claims to be; test_axioms.py has what holds for all."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_an_lstm_remembers_the_past_that_its_last_state_does_not_show() -> None:
 
 
 def test_an_lstm_learns_what_one_state_does_not_tell() -> None:
-    """A world that shows each action one step late: a network of the last state cannot know what comes."""
+    """A world that shows each action one step late: the last state does not say what comes."""
     torch.manual_seed(0)
     actions = torch.rand(64, 14, DU) * 2 - 1
     late = torch.cat([torch.zeros(64, 1, DU), actions[:, :-1]], 1)

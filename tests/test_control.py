@@ -200,7 +200,12 @@ def test_a_controller_behind_noisy_sensors_sees_nothing_else() -> None:
     trial = execute(task, watching)
     assert trial.observed is not None
     whole = Trajectories(
-        trial.observed.numpy(), trial.actions.numpy(), task.env, 0.02, tuple("abcdef"), tuple("abcdef")
+        trial.observed.numpy(),
+        trial.actions.numpy(),
+        task.env,
+        0.02,
+        tuple("abcdef"),
+        tuple("abcdef"),
     ).segment(10)
     assert len(seen) == 20
     for t, past in enumerate(seen):
@@ -242,9 +247,7 @@ def test_with_late_actions_the_states_are_those_of_shifted_torques(env: str) -> 
     assert not torch.allclose(trial.states, at_once.states, atol=1e-3)
 
 
-def test_a_closed_loop_behind_noisy_sensors_plans_from_what_they_say_and_is_scored_by_true_states() -> (
-    None
-):
+def test_a_closed_loop_plans_from_what_noisy_sensors_say_and_is_scored_by_true_states() -> None:
     task, model = imperfect_task(noise=NOISE), Wrong()
     trial = mpc(task, model, DirectActions(20, rms=0.1), as_it_is, every=10)  # type: ignore[arg-type]
     assert trial.observed is not None

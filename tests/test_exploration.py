@@ -180,7 +180,7 @@ def test_episodes_that_no_plan_made_take_the_place_of_plans(tmp_path: Path) -> N
 
 def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as_it_was() -> None:
     (model, prior), worse = learners(), replace(options().model, lr=1.0, warmup=0)
-    tsmlib.fit(model, model.loss, data(), data(), replace(options().model, steps=100, lr=1e-2))
+    tsmlib.fit(model, data(), data(), replace(options().model, steps=100, lr=1e-2))
     before = bits(model)
     found = explored(model, prior, options=options(rounds=1, model=worse))
     assert bits(model) == before
@@ -188,7 +188,7 @@ def test_training_that_makes_a_model_no_better_on_held_out_episodes_leaves_it_as
     assert found.records[0]["validation"] == validate(model.loss, windows, 3 + 1)
     other = learners()[0]
     other.load_state_dict(model.state_dict())
-    tsmlib.fit(other, other.loss, found.train, found.held_out, worse, seed=3 + 1)
+    tsmlib.fit(other, found.train, found.held_out, worse, seed=3 + 1)
     assert (
         validate(other.loss, windows, 3 + 1) > found.records[0]["validation"]
     )  # it was worse indeed
@@ -199,9 +199,9 @@ def test_a_model_is_trained_on_the_augmented_data_and_a_prior_on_the_episodes(
 ) -> None:
     fine_tune, seen = exploration.fine_tune, []
 
-    def watched(part: Any, loss: Any, train: tsmlib.Trajectories, *given: Any, **named: Any) -> Any:
+    def watched(part: Any, train: tsmlib.Trajectories, *given: Any, **named: Any) -> Any:
         seen.append((type(part), len(train)))
-        return fine_tune(part, loss, train, *given, **named)
+        return fine_tune(part, train, *given, **named)
 
     monkeypatch.setattr(exploration, "fine_tune", watched)
     explored(*learners(), options=options(rounds=1), augmented=lambda data: data.joined(data))
@@ -398,7 +398,7 @@ def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
 
 
 def test_a_measure_by_a_name_that_the_record_has_is_refused() -> None:
-    said = "measure gave 'lost', 'success', which the record of a round has of its own episodes.*'tested_lost'"
+    said = "measure gave 'lost', 'success', which the record of a round has.*'tested_lost'"
     with pytest.raises(ValueError, match=said):
         explored(*learners(), measure=lambda model, prior: {"success": 1.0, "lost": 0.0})
 

@@ -1,4 +1,4 @@
-"""A gradient that is wrong is found, and a signal is as strong as the noise around it lets it be."""
+"""A gradient that is wrong is found, and a signal is as strong as its noise lets it be."""
 
 from __future__ import annotations
 
@@ -59,9 +59,7 @@ def prior() -> ActionPrior:
     return ActionPrior(2, channels=8).fit_scale(0.1 * torch.randn(50, 30, 2))
 
 
-def test_a_return_through_model_prior_and_reward_is_differentiable_in_codes_torques_and_weights() -> (
-    None
-):
+def test_a_return_is_differentiable_in_codes_torques_and_weights() -> None:
     torch.manual_seed(0)
     model = TSM(6, 2, channels=8)
     model.features.fit(torch.randn(20, 30, 6).cumsum(1) * 0.01)

@@ -1,4 +1,4 @@
-"""Minari data sets of any shape of lengths and metadata are read as they are, or refused by name."""
+"""Minari data sets of any lengths and metadata are read as they are, or refused by name."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def written(
     change: Callable[[list[Any]], Any] = lambda episodes: None,
     **options: Any,
 ) -> Path:
-    """A data set that Minari itself wrote. Episode i has the states i + 0.01 t and draws its actions from the space."""
+    """A data set that Minari itself wrote. Episode i has the states i + 0.01 t."""
     observed = observations or Box(-np.inf, np.inf, (DX,), dtype)
     acted = actions or Box(-1, 1, (DU,), np.float32)
     acted.seed(0)

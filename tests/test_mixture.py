@@ -133,10 +133,7 @@ def test_gradients_reach_the_actions() -> None:
 def test_shipped_models_of_any_kinds_plan_and_execute_together() -> None:
     env = "tsm/Reacher-v0"
     mixture = tsmlib.Mixture(
-        [
-            tsmlib.load_pretrained(word, env=env)
-            for word in ("rtsm", "onestep", "tsm", "lstm")
-        ]
+        [tsmlib.load_pretrained(word, env=env) for word in ("rtsm", "onestep", "tsm", "lstm")]
     )
     task, prior = tsmlib.load_task(env).take(2), tsmlib.load_pretrained("prior", env=env)
     past, space = task.past(mixture.past_len), tsmlib.LatentActions(prior, task.horizon)

@@ -1,4 +1,4 @@
-"""A task of one's own is one torch function; where it is wrong, the error says what and what to do."""
+"""A task of one's own is one torch function; where it is wrong, the error says what to do."""
 
 from __future__ import annotations
 
@@ -259,6 +259,6 @@ def test_a_target_in_the_hole_around_the_shoulder_is_refused() -> None:
     dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.24, 0.0]]))
     with pytest.raises(
         ValueError,
-        match=r"target 1 at \(0.000, 0.100\) m is out of reach: .* the hole around it, expected 0.11 to 0.24 m",
+        match=r"target 1 at \(0.000, 0.100\) m is out of reach: .* expected 0.11 to 0.24 m",
     ):
         dataclasses.replace(task, target=torch.tensor([[0.11, 0.0], [0.0, 0.1]]))

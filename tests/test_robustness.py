@@ -32,7 +32,7 @@ def episodes(states: np.ndarray, actions: np.ndarray, env: str = REACHER) -> Tra
         actions.astype(np.float32),
         env,
         0.02,
-        ("x",) * dims,
+        [f"x{d}" for d in range(dims)],
         ("m",) * dims,
     )
 

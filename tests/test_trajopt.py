@@ -29,7 +29,6 @@ from tsmlib.planning.planners import (
     cem,
     iterations_to,
     mppi,
-    plan_at,
     reevaluate,
     sampled_starts,
 )
@@ -277,22 +276,6 @@ def test_a_plan_is_never_worse_than_the_best_of_its_starts(planner: str) -> None
     plan = plan_by(planner, predictor(), reward, 2, start=start)
     torch.testing.assert_close(plan.predicted_return, value)
     assert plan.curve.shape == (3, B)
-
-
-@pytest.mark.parametrize("planner", PLANNERS)
-def test_a_plan_can_be_had_as_it_was_along_the_way(planner: str) -> None:
-    predict, space = predictor(0.1, 2), DirectActions(T, 1, rms=0.5)
-    plan = plan_by(planner, predict, reward, 6)
-    nothing = torch.zeros(1, B, T, 1)
-    torch.testing.assert_close(plan_at(plan, 0, predict, reward, space).actions, nothing[0])
-    torch.testing.assert_close(plan.curve[0], expected_return(predict(nothing), nothing, reward)[0])
-    early, shorter = plan_at(plan, 2, predict, reward, space), plan_by(planner, predict, reward, 2)
-    torch.testing.assert_close(early.actions, shorter.actions)
-    torch.testing.assert_close(early.predicted_return, shorter.predicted_return)
-    torch.testing.assert_close(early.curve, shorter.curve)
-    torch.testing.assert_close(plan_at(plan, 6, predict, reward, space).actions, plan.actions)
-    with pytest.raises(ValueError, match="took 6 iterations; there is no plan as of iteration 7"):
-        plan_at(plan, 7, predict, reward, space)
 
 
 def test_a_curve_is_nearly_done_when_it_has_95_of_100_of_its_gain() -> None:

@@ -6,6 +6,6 @@ M = TypeVar("M", bound=Any)
 
 
 def in_units(model: M) -> M:
-    """The model with the statistics of data of which each dimension changes by one standard unit in a step."""
+    """The model with statistics of data that change by one standard unit in a step."""
     model.features.step_std.fill_(1.0)
     return model

@@ -4,11 +4,11 @@ from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop
 from .collection import smooth_torques as smooth_torques
 from .evaluation.prediction import score as score
-from .films import episode_film as episode_film
-from .films import film as film
+from .exploration.explore import explore as explore
 from .exploration.options import Exploration as Exploration
 from .exploration.options import ExplorationOptions as ExplorationOptions
-from .exploration.explore import explore as explore
+from .films import episode_film as episode_film
+from .films import film as film
 from .models.action_prior import ActionPrior as ActionPrior
 from .models.base import DynamicsModel as DynamicsModel
 from .models.base import rollout as rollout
@@ -34,10 +34,10 @@ from .planning.predictors import simulator_predictor as simulator_predictor
 from .planning.search_spaces import DirectActions as DirectActions
 from .planning.search_spaces import LatentActions as LatentActions
 from .planning.tasks import Task as Task
-from .policies.options import LearningOptions as LearningOptions
 from .policies.learning import learn_policy as learn_policy
 from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy
+from .policies.options import LearningOptions as LearningOptions
 from .pretrained import load_pretrained as load_pretrained
 from .pretrained import load_pusht as load_pusht
 from .pretrained import load_task as load_task

@@ -127,5 +127,5 @@ def require_no_jumps(increments: np.ndarray, steps: np.ndarray, robot: Robot) ->
             f"the angle '{robot.names[robot.angles[column]]}' jumps by more than pi at "
             f"{jumps.sum()} step(s), the first in episode {episode} after step "
             f"{row - ends[episode] + steps[episode]}; expected an angle that goes on. unwrap=True "
-            "takes the jumps out of one that was wrapped"
+            "takes the jumps out of one that was wrapped; jumps=True takes them as they are"
         )

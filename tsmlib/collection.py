@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 
 from tsmlib.checks import as_tensor, require_count, require_number
-from tsmlib.envs.stepping import Seeds, Simulation, make_simulation, simulation
+from tsmlib.envs.stepping import Arms, Seeds, Simulation, make_simulation, simulation
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
 Controller = Callable[[Segment], Tensor]  # the past (N, L, .) -> the next K actions (N, K, du)
@@ -94,6 +94,7 @@ def collect(
         run.angles,
         lengths=run.steps.tolist(),
         terminated=run.terminated.tolist(),
+        jumps=isinstance(run, Arms),
     )
 
 

@@ -58,6 +58,8 @@ class Trajectories(FromLogs):
             cosine and sine.
         lengths: steps of each episode, where arrays are padded beyond them.
         terminated: whether the environment ended each episode, as opposed to a limit of time.
+        jumps: whether angles may jump by more than pi, as those of noisy sensors do, and of an arm
+            that spins; ``collect`` says so of our own arms, whose angles are never wrapped.
         unwrap: take the jumps out of angles that were wrapped.
 
     Raises:
@@ -74,6 +76,7 @@ class Trajectories(FromLogs):
     angles: tuple[int, ...]
     lengths: tuple[int, ...]
     terminated: tuple[bool, ...]
+    jumps: bool
     if TYPE_CHECKING:
         robot: Robot
         flat_states: np.ndarray  # (sum of T_i + 1, dx), one episode after the other
@@ -91,6 +94,7 @@ class Trajectories(FromLogs):
         lengths: Sequence[int] | None = None,
         terminated: Sequence[bool] | None = None,
         *,
+        jumps: bool = False,
         unwrap: bool = False,
     ) -> None:
         x, u = casting.episodes("states", states), casting.episodes("actions", actions)
@@ -129,9 +133,11 @@ class Trajectories(FromLogs):
             casting.float32("actions", u, tuple(f"action {k}" for k in range(du))),
             tuple(map(len, u)),
             tuple(map(bool, casting.one_each("terminated", ended, len(u), np.bool_))),
+            bool(jumps),
         )
         casting.require_bounds(self.flat_actions, env)
-        casting.require_no_jumps(self.increments(), self.steps, robot)
+        if not jumps:
+            casting.require_no_jumps(self.increments(), self.steps, robot)
 
     @classmethod
     def ragged(
@@ -154,6 +160,8 @@ class Trajectories(FromLogs):
         lengths: Sequence[int],
         robot: Robot,
         terminated: Sequence[bool] | None = None,
+        *,
+        jumps: bool = False,
     ) -> Trajectories:
         """Episodes that lie one after the other.
 
@@ -163,6 +171,7 @@ class Trajectories(FromLogs):
             lengths: the steps T_i of each episode.
             robot: what the numbers mean.
             terminated: whether the environment ended each episode.
+            jumps: whether angles may jump by more than pi.
         """
         steps = np.asarray(casting.one_each("lengths", lengths, len(lengths), np.integer))
         ends = np.cumsum(steps)
@@ -177,7 +186,7 @@ class Trajectories(FromLogs):
         x = np.split(states, ends[:-1] + np.arange(1, len(ends)))
         u = np.split(actions, ends[:-1])
         about = (robot.env, robot.dt, robot.names, robot.units, robot.angles)
-        return cls(x, u, *about, terminated=terminated)
+        return cls(x, u, *about, terminated=terminated, jumps=jumps)
 
     def _fill(
         self,
@@ -186,10 +195,12 @@ class Trajectories(FromLogs):
         flat_actions: np.ndarray,
         lengths: tuple[int, ...],
         terminated: tuple[bool, ...],
+        jumps: bool,
     ) -> Trajectories:
         fill = self.__dict__
         fill.update(robot=robot, env=robot.env, dt=robot.dt, names=robot.names, units=robot.units)
         fill.update(angles=robot.angles, lengths=lengths, terminated=terminated)
+        fill["jumps"] = jumps
         fill.update(flat_states=flat_states, flat_actions=flat_actions)
         if len(set(lengths)) == 1:
             fill["states"] = flat_states.reshape(len(lengths), -1, robot.state_dim)
@@ -264,6 +275,7 @@ class Trajectories(FromLogs):
             np.concatenate([u[begins[i] - i + a : begins[i] - i + b] for i, a, b in parts]),
             tuple(b - a for _, a, b in parts),
             tuple(self.terminated[i] and b == self.lengths[i] for i, _, b in parts),
+            self.jumps,
         )
 
     def split(self, share: float = 0.9, *, seed: int = 0) -> tuple[Trajectories, Trajectories]:
@@ -312,6 +324,7 @@ class Trajectories(FromLogs):
             np.concatenate([self.flat_actions, other.flat_actions]),
             self.lengths + other.lengths,
             self.terminated + other.terminated,
+            self.jumps or other.jumps,
         )
 
     def padded(self, horizon: int | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -133,6 +133,7 @@ def save_minari(
             description=f"{t.env}, {t.dt} s per step. Observations: {fields}.",
         )
         about = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
+        about["jumps"] = t.jumps
         made.storage.update_metadata({"tsmlib": about})
     return Path(made.spec.data_path).parent
 
@@ -189,7 +190,8 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
     if not isinstance(about["env"], str):
         raise ValueError(f"env is {about['env']!r:.80}, expected a text")
     lists = {name: tuple(about[name]) for name in ("names", "units", "angles")}
-    return {"env": about["env"], "dt": about["dt"]} | lists
+    jumps = bool(about.get("jumps"))
+    return {"env": about["env"], "dt": about["dt"], "jumps": jumps} | lists
 
 
 def _episodes(

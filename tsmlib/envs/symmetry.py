@@ -53,4 +53,5 @@ def symmetric(data: Trajectories) -> Trajectories:
         data.lengths * COPIES,
         data.robot,
         data.terminated * COPIES,
+        jumps=data.jumps,
     )

@@ -248,7 +248,7 @@ class Task:
     @property
     def robot(self) -> Robot:
         """What the numbers of states and actions mean."""
-        return _robot(self.env, find_spec(self.env).entry_point)
+        return _robot(self.env, find_spec(self.env).entry_point)  # type: ignore[arg-type]
 
     @property
     def begins_by_seed(self) -> bool:

@@ -173,9 +173,10 @@ class _Learner:
         both = self.draw(n, generator)
         require_type("what draw gave", both, tuple, "two tensors, starts and targets")
         start, target = both
-        sizes = (n, self.policy.state_dim), (n, self.policy.target_dim)
-        return as_tensor("draw's starts", start, sizes[0]), as_tensor(
-            "draw's targets", target, sizes[1]
+        dtype = next(self.policy.parameters()).dtype
+        return (
+            as_tensor("draw's starts", start, (n, self.policy.state_dim), dtype=dtype),
+            as_tensor("draw's targets", target, (n, self.policy.target_dim), dtype=dtype),
         )
 
     def rewards(self, iteration: int, n: int) -> Tensor:

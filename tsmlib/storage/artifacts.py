@@ -187,6 +187,8 @@ def save_trajectories(
     about = {field.name: getattr(t, field.name) for field in fields(Robot)[:-1]}
     if any(t.terminated):
         about["terminated"] = t.terminated
+    if t.jumps:
+        about["jumps"] = True
     arrays = {"states": t.flat_states, "actions": t.flat_actions}
     if len(set(t.lengths)) > 1:
         about["lengths"] = t.lengths
@@ -212,15 +214,16 @@ def load_trajectories(path: PathLike, *, expect: Mapping[str, Json] | None = Non
         about: Any = header["trajectories"]
         states, actions = tensors["states"].numpy(), tensors["actions"].numpy()
         ends = {name: about.get(name) for name in ("lengths", "terminated")}
+        jumps = bool(about.get("jumps"))
         known = {field.name: about[field.name] for field in fields(Robot)[:-1]}
         robot = Robot(**known, action_dim=actions.shape[-1])
         if states.ndim == 2:
             trajectories = Trajectories.from_rows(
-                states, actions, ends["lengths"], robot, ends["terminated"]
+                states, actions, ends["lengths"], robot, ends["terminated"], jumps=jumps
             )
         else:
             meaning = (robot.env, robot.dt, robot.names, robot.units, robot.angles)
-            trajectories = Trajectories(states, actions, *meaning, **ends)
+            trajectories = Trajectories(states, actions, *meaning, jumps=jumps, **ends)
         stated: Any = header.get("fingerprint", {})
         found = {**stated, **about}
     except (KeyError, IndexError, TypeError, ValueError) as error:

@@ -156,9 +156,9 @@ def checked(
         loss, data, validation, options = cast(Any, (data, validation, options, loss))
     if not any(weight.requires_grad for weight in model.parameters()):
         raise ValueError("model has no weight to train; expected one with requires_grad")
+    require_type("data", data, Trajectories, f"Trajectories, {CALL}")
     loss = cast(Loss, getattr(model, "loss", None) if loss is None else loss)
     require_callable("loss", loss, f"a function (window, generator) -> scalar, {CALL}")
-    require_type("data", data, Trajectories, f"Trajectories, {CALL}")
     if validation is None:
         data, validation = data.split(0.9)
     require_type("validation", validation, Trajectories, f"Trajectories, {CALL}")
