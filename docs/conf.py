@@ -1,7 +1,7 @@
-"""The documentation site: ``make docs``. Nothing is fetched and no notebook is executed.
+"""The documentation site: ``make docs``. Nothing is fetched or executed while it is built.
 
-A notebook's page shows its outputs where runs/laptop/seed0, or the run of ``make docs
-RUN=runs/paper/seed0``, has executed it as it is stored now.
+A notebook's page shows its outputs where runs/laptop/seed0 has executed it as it is stored now;
+``make docs RUN=runs/paper/seed0`` names another run.
 """
 
 import sys
@@ -17,6 +17,7 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "pages",  # beside this file
@@ -30,9 +31,7 @@ myst_heading_anchors = 3
 myst_heading_slug_func = "pages.anchor"
 nb_execution_mode = "off"
 nitpicky = True
-nitpick_ignore_regex = [
-    (r"py:.*", r"(?!tsmlib\.).*|.*\.[A-Z]")
-]  # types of other libraries, and type variables
+nitpick_ignore_regex = [(r"py:.*", r"(?!tsmlib\.\w+$).*")]  # what has no page of its own
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # a slider without its kernel shows nothing new
 suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets of executed notebooks
 

@@ -1,17 +1,11 @@
-"""Sphinx extension of this site: pages of notebooks and modules, links into them, docstrings,
-formulas.
+"""Sphinx extension of this site: pages of notebooks with their outputs, and formulas as MathML.
 
-Formulas become MathML, which browsers show by themselves, so that no page loads a script from
-elsewhere.
-
-Docstrings of tsmlib are plain text with ``code``, paragraphs and indented formulas. Read as
-reStructuredText, ``(C, B, *shape)`` would open an emphasis and ``E|X - x|`` a substitution.
+Browsers show MathML by themselves, so no page loads a script from elsewhere.
 """
 
 import os
 import re
 import shutil
-from itertools import groupby
 from pathlib import Path
 from typing import NoReturn
 
@@ -23,38 +17,7 @@ from sphinx.writers.html5 import HTML5Translator
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-MARKUP = re.compile(r"(``.+?``)")
 MATHML = LatexToMathML(fancy_error=False)  # LatexError ends the build
-SPECIAL = re.compile(r"([\\*|_`])")
-
-
-def process(
-    app: object, what: str, name: str, found: object, options: object, lines: list[str]
-) -> None:
-    """Turn the ``lines`` of a docstring into reStructuredText, by Sphinx's own signature."""
-    paragraphs = [
-        list(part) for filled, part in groupby(lines, key=lambda line: bool(line.strip())) if filled
-    ]
-    lines[:] = [line for paragraph in paragraphs for line in [*converted(paragraph), ""]]
-
-
-def converted(paragraph: list[str]) -> list[str]:
-    """One paragraph: indented is a formula, a list keeps its lines, all else is text."""
-    indents = [len(line) - len(line.lstrip()) for line in paragraph]
-    if min(indents):
-        return ["::", "", *("    " + line for line in paragraph)]
-    if max(indents) or paragraph[0].startswith(("- ", "1. ")):
-        return [
-            "| " + " " * indent + escaped(line.strip())
-            for indent, line in zip(indents, paragraph, strict=True)
-        ]
-    return [escaped(line) for line in paragraph]
-
-
-def escaped(line: str) -> str:
-    """The line without markup, but for ``code``."""
-    parts = MARKUP.split(line)
-    return "".join(part if MARKUP.fullmatch(part) else SPECIAL.sub(r"\\\1", part) for part in parts)
 
 
 def anchor(title: str) -> str:
@@ -68,36 +31,6 @@ def linked(text: str) -> str:
     return re.sub(r"\]\((?:\.\./)+notebooks/", "](/notebooks/", text)
 
 
-def public_names() -> dict[str, list[str]]:
-    """Module -> names of it that ``import tsmlib`` gives, which have pages of their own."""
-    found: dict[str, list[str]] = {}
-    stub = (ROOT / "tsmlib" / "__init__.pyi").read_text()
-    for module, name in re.findall(r"^from \.([\w.]+) import (\w+) as", stub, re.MULTILINE):
-        found.setdefault(f"tsmlib.{module}", []).append(name)
-    return found
-
-
-def write_modules() -> None:
-    """docs/api/modules/ anew: a page for each module, of the names that have no page."""
-    target, public = HERE / "api" / "modules", public_names()
-    shutil.rmtree(target, ignore_errors=True)
-    target.mkdir()
-    for path in sorted((ROOT / "tsmlib").rglob("*.py")):
-        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        if name in ("tsmlib", "tsmlib.__main__"):
-            continue
-        lines = [name.replace("_", r"\_"), "=" * len(2 * name), "", f".. automodule:: {name}"]
-        if not path.with_suffix(".pyi").exists():  # what a facade gives has its page already
-            lines += ["   :members:", f"   :exclude-members: {', '.join(public.get(name, []))}"]
-        if name in public:
-            lines += [
-                "",
-                "On pages of their own: "
-                + ", ".join(f":py:obj:`~tsmlib.{one}`" for one in public[name]),
-            ]
-        (target / f"{name}.rst").write_text("\n".join([*lines, ""]))
-
-
 def copy_notebooks() -> None:
     """docs/notebooks/ anew: as the run of $TSM_DOCS_RUN executed them, or as they are stored."""
     target, run = HERE / "notebooks", os.environ.get("TSM_DOCS_RUN") or "runs/laptop/seed0"
@@ -108,7 +41,7 @@ def copy_notebooks() -> None:
 
 
 def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
-    """A notebook with the outputs of ``executed`` where that was made from it as it is now."""
+    """A notebook with the outputs of ``executed`` where that is of the notebook as it is now."""
     notebook, said = nbformat.read(stored, 4), "Not executed for this page"
     if executed.exists():
         own = nbformat.read(executed, 4)
@@ -140,7 +73,7 @@ def inline_formula(page: HTML5Translator, node: nodes.math) -> NoReturn:
 
 
 def display_formula(page: HTML5Translator, node: nodes.math_block) -> NoReturn:
-    """A formula on a line of its own, with the paper's number where it has one."""
+    """A formula on a line of its own, with its number where it has one."""
     tex = node.astext()
     if r"\tag" in tex:
         tex = rf"\begin{{equation}}{tex}\end{{equation}}"
@@ -155,7 +88,7 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
-    """Sphinx's event build-finished: the explorer's page, or how to build it."""
+    """Sphinx's event build-finished: the page of the explorer, or how to build it."""
     built, target = ROOT / "explorer" / "dist", Path(app.outdir) / "explorer"
     shutil.rmtree(target, ignore_errors=True)
     if (built / "index.html").exists():
@@ -170,9 +103,7 @@ def copy_explorer(app: Sphinx, failed: Exception | None) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     copy_notebooks()
-    write_modules()
     app.add_html_math_renderer("mathml", (inline_formula, None), (display_formula, None))
     app.connect("source-read", read)
-    app.connect("autodoc-process-docstring", process)
     app.connect("build-finished", copy_explorer)
     return {"parallel_read_safe": True}
