@@ -20,6 +20,16 @@ ROOT = HERE.parent
 MATHML = LatexToMathML(fancy_error=False)  # LatexError ends the build
 
 
+def escape(
+    app: object, what: str, name: str, documented: object, options: object, lines: list[str]
+) -> None:
+    """Stars and bars in docstrings are mathematics here, not markup. Sphinx's own signature."""
+    for i, line in enumerate(lines):
+        parts = re.split(r"(``.+?``)", line)
+        parts[::2] = [re.sub(r"([*|])", r"\\\1", part) for part in parts[::2]]
+        lines[i] = "".join(parts)
+
+
 def anchor(title: str) -> str:
     """Anchor of a heading as Jupyter makes it, so that a link into a notebook works in both."""
     return title.strip().replace(" ", "-")
@@ -51,7 +61,9 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
             said += f": `{os.path.relpath(executed, ROOT)}` is of another version of it"
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
-            cell.source = linked(cell.source.replace("](../docs/", "](../"))
+            cell.source = linked(
+                cell.source.replace("](../docs/", "](../").replace("../figures/", "../../figures/")
+            )
     command = f"`python -m tsmlib run {stored.stem.partition('_')[2]}`, then `make docs`"
     notebook.cells.insert(
         1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*")
@@ -105,5 +117,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     copy_notebooks()
     app.add_html_math_renderer("mathml", (inline_formula, None), (display_formula, None))
     app.connect("source-read", read)
+    app.connect("autodoc-process-docstring", escape, priority=400)  # before napoleon
     app.connect("build-finished", copy_explorer)
     return {"parallel_read_safe": True}
