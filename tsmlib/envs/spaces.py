@@ -23,7 +23,7 @@ from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.spaces import Box, Dict, Space, Tuple
 
 from tsmlib.envs.pusht_field import pusht_physics
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import CONTROL_IDS, EnvSpec, is_arm
 
 SUPPORTED = (
     "supported are observations that are a Box of numbers, or a Dict or Tuple of these, and "
@@ -57,7 +57,9 @@ def find_spec(env_id: str) -> GymnasiumSpec:
         name = plain
     if name.startswith("tsm/PushT-") and not bracket:
         pusht_physics(name)  # registers a variant
-    elif name.startswith("tsm/") and not bracket:
+    elif name.startswith("tsm/dmc-") and name not in CONTROL_IDS:
+        raise gymnasium.error.NameNotFound(f"{name!r:.80} is none of {', '.join(CONTROL_IDS)}")
+    elif is_arm(name) and not bracket:
         EnvSpec.parse(name)
     spec = gymnasium.spec(name)
     if not bracket:

@@ -116,6 +116,15 @@ class EnvSpec:
         return 10 if self.has_block else 6
 
 
+CONTROL = ("reacher-easy", "reacher-hard", "cartpole-swingup", "pendulum-swingup", "cup-catch")
+CONTROL_IDS = tuple(f"tsm/dmc-{name}-v0" for name in CONTROL)  # see ``dmc``
+
+
+def is_arm(env_id: str) -> bool:
+    """Whether an id is of an arm, or is meant to be, as opposed to what else is ours or foreign."""
+    return env_id.startswith("tsm/") and not env_id.startswith(("tsm/PushT-", "tsm/dmc-"))
+
+
 _VECTOR_ARMS = {
     "mujoco": "tsmlib.envs.mujoco_arm:MujocoArm",
     "pymunk": "tsmlib.envs.pymunk_arm:PymunkArm",

@@ -102,7 +102,7 @@ def make_simulation(env_id: str, n: int) -> Simulation:
         UnsupportedEnvironment: its spaces are not supported, or the id does not say how to make it.
     """
     spec = find_spec(env_id)
-    if spec.namespace == "tsm" or spec.entry_point is None:
+    if (spec.namespace == "tsm" and spec.vector_entry_point) or spec.entry_point is None:
         return simulation(gymnasium.make_vec(spec, num_envs=n))
     envs = copies(env_id, n)
     try:

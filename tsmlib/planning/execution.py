@@ -260,8 +260,8 @@ def mpc(
     _require_task(task)
     every = require_count("every", every)
     ahead = task.horizon if lookahead is None else require_count("lookahead", lookahead, most=MOST)
-    if lookahead is not None and ahead < every:
-        raise ValueError(f"lookahead is {ahead}; expected at least the {every} steps of every")
+    if lookahead is not None and ahead <= every:
+        raise ValueError(f"lookahead is {ahead}; expected more than the {every} steps of every")
     seed = require_seed("seed", seed)
     require_space(space)
     planned = space.decode(torch.zeros(1, len(task), *space.shape)).shape[2]

@@ -18,7 +18,7 @@ from torch import Tensor
 from tsmlib.checks import MOST, as_tensor, described, require_count, require_seed
 from tsmlib.collection import collect, open_loop
 from tsmlib.envs.snapshots import Oracle
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import EnvSpec, is_arm
 from tsmlib.envs.stepping import UnsupportedEnvironment, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.models.mixture import Mixture
@@ -296,7 +296,7 @@ def simulator_predictor(
         return _of_seeds(task, done)
     name = task.env if task is not None else str(env)
     pusht = name.startswith("tsm/PushT-")
-    if not pusht and name.startswith("tsm/") and name != (arm := EnvSpec.parse(name).arm.id):
+    if is_arm(name) and name != (arm := EnvSpec.parse(name).arm.id):
         raise UnsupportedEnvironment(
             f"{name} hides its states behind noisy sensors or delays actions, so what would follow "
             f"is no function of what is seen; the true simulator of {arm} can be asked"

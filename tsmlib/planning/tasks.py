@@ -30,9 +30,9 @@ from tsmlib.checks import (
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.spaces import find_spec
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import EnvSpec, is_arm
 from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
-from tsmlib.rewards import Reward, require_reward, rewarded
+from tsmlib.rewards import Reward, require_reward, reward_of, rewarded
 from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Robot, Segment, initial_past
 
@@ -97,7 +97,7 @@ class Task:
         *,
         n: int,
         horizon: int,
-        reward: Reward,
+        reward: Reward | None = None,
         seed: int = 1000,
         success: Success | None = None,
         tolerance: float | None = None,
@@ -114,7 +114,8 @@ class Task:
                 states, from one reset of ``seed``.
             horizon: T, steps.
             reward: a torch function of states (..., B, T, dx) and actions (..., B, T, du), one
-                number per step. ``rewards.until`` says what counts where episodes end early.
+                number per step; None for the environment's own (``rewards.reward_of``).
+                ``rewards.until`` says what counts where episodes end early.
             seed: of the first reset, 0 or above.
             success: of executed states (B, T + 1, dx) a bool, or a distance: (B,).
             tolerance: the distance that counts as a success; needed where ``success`` is one.
@@ -129,15 +130,16 @@ class Task:
         """
         require_type("env", env, str, "an id, such as 'Pendulum-v1'")
         n, seed = require_count("n", n, most=MOST), require_seed("seed", seed)
-        require_reward(reward)
         if tolerance is not None:
             tolerance = require_number("tolerance", tolerance, 0)
-        plain = EnvSpec.parse(env).arm.id if env.startswith("tsm/") else env
+        plain = EnvSpec.parse(env).arm.id if is_arm(env) else env
         require_type("name", name, str, "a text")
         try:
             episodes = make_simulation(plain, n)
         except gymnasium.error.Error as error:
             raise ValueError(f"env is {env!r:.80}, which cannot be made: {error}") from error
+        scored = reward_of(env) if reward is None else reward
+        require_reward(scored)
         with closing(episodes) as begun:
             start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
         _require_repeated(env, begun.names, start, again)
@@ -146,7 +148,7 @@ class Task:
             env=env if isinstance(begun, Arms) else begun.id,
             start=start,
             target=torch.zeros(n, 0),
-            reward_for=lambda _: reward,
+            reward_for=lambda _: scored,
             horizon=horizon,
             tolerance=tolerance or 0.0,
             # An arm begins in any state.

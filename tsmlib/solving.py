@@ -1,0 +1,314 @@
+"""From the id of an environment to a controller: collect, fit, plan, collect where plans lead.
+
+    repeat: fit the model to all data; run episodes in closed loop through it; append them
+
+A thin loop over ``collect_random``, ``fit`` and ``cem``. The planner is given the reward as a
+function, which agents without a model of it have to learn.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm.auto import tqdm
+
+from tsmlib.checks import require_count, require_number, require_seed, require_type
+from tsmlib.collection import collect_random
+from tsmlib.envs.spaces import find_spec, said
+from tsmlib.envs.stepping import make
+from tsmlib.exploration.rounds import RoundFiles
+from tsmlib.films import film
+from tsmlib.models.baselines import OneStep
+from tsmlib.planning.execution import Trial, execute
+from tsmlib.planning.planners import cem
+from tsmlib.planning.predictors import model_predictor
+from tsmlib.planning.search_spaces import DirectActions
+from tsmlib.planning.tasks import Task
+from tsmlib.rewards import Reward, fingerprint, reward_of
+from tsmlib.storage.files import PathLike, encode_nonfinite, writer_lock
+from tsmlib.training.fit import TrainingOptions, fit
+from tsmlib.trajectory import Segment, Trajectories
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Settings of ``solve``, the same for every environment.
+
+    Args:
+        episodes: of a round, run side by side.
+        ahead: seconds that a plan looks ahead. What pays later than that is not planned for.
+        every: seconds after which it is planned again.
+        candidates: of each plan (``cem``).
+        iterations: of each plan.
+        rms: of the actions that are searched and of the first, random ones, of full action.
+        hidden: size of the model's hidden layers.
+        first: updates of the model before the first plan.
+        updates: in each round after it.
+    """
+
+    episodes: int = 5
+    ahead: float = 1.2
+    every: float = 0.1
+    candidates: int = 64
+    iterations: int = 3
+    rms: float = 0.6
+    hidden: int = 128
+    first: int = 600
+    updates: int = 300
+
+    def __post_init__(self) -> None:
+        least = {"episodes": 2, "candidates": 8, "iterations": 1, "hidden": 1, "first": 1}
+        for name, low in (least | {"updates": 1}).items():
+            require_count(name, getattr(self, name), least=low)
+        for name in ("ahead", "every", "rms"):
+            require_number(name, getattr(self, name), 0, above=True)
+        if self.every >= self.ahead:
+            raise ValueError(f"every is {self.every} s; expected less than ahead, {self.ahead} s")
+
+
+@dataclass
+class Controller:
+    """Plan through a model every few steps of one run of episodes, from the plan before.
+
+    Attributes:
+        model: what plans are made through.
+        reward: of each step, of its state and action alone.
+        space: of the steps that are looked ahead.
+        every: steps that a plan is followed.
+        options: of the planner.
+        seed: of the candidates.
+    """
+
+    model: OneStep
+    reward: Reward
+    space: DirectActions
+    every: int
+    options: SolveOptions
+    seed: int = 0
+    left: Tensor | None = None  # (1, B, T, du), of the plan before
+
+    def __call__(self, past: Segment) -> Tensor:
+        """The next actions (B, every, du) after ``past`` (B, L, .)."""
+        start = len(past.states) if self.left is None else self.left
+        plan = cem(
+            model_predictor(self.model, past),
+            self.reward,
+            self.space,
+            start,
+            candidates=self.options.candidates,
+            elites=max(2, self.options.candidates // 8),
+            iterations=self.options.iterations,
+            seed=self.seed,
+        )
+        self.seed += 1
+        self.left = F.pad(plan.parameters[:, self.every :], (0, 0, 0, self.every))[None]
+        return plan.actions[:, : self.every]
+
+
+@dataclass(repr=False)
+class Solved:
+    """What ``solve`` leaves.
+
+    Attributes:
+        model: fitted to all data.
+        data: all episodes.
+        records: the learning curve, one per round: ``round``, ``env_steps`` until its end,
+            ``return`` and its ``spread``, mean and deviation over the episodes by the
+            environment's own reward, where it keeps one, ``planned_return`` by the reward of the
+            planner, and ``cpu_seconds`` from the beginning, training included.
+    """
+
+    env: str
+    model: OneStep
+    data: Trajectories
+    reward: Reward
+    horizon: int
+    options: SolveOptions
+    records: list[dict[str, float]] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        last = self.records[-1]
+        return (
+            f"Solved({self.env!r}, return {last['return']:.4g} after {last['env_steps']:.0f} "
+            f"steps, {last['cpu_seconds'] / 60:.1f} core minutes)"
+        )
+
+    def controller(self, *, seed: int = 0) -> Controller:
+        """The controller of one run of episodes, as ``collect`` and ``execute`` take it."""
+        return _controller(self.model, self.reward, self.data, self.options, seed)
+
+    def play(self, episodes: int = 1, *, seed: int = 10_000) -> Trial:
+        """Run episodes that begin by the resets of ``seed`` and those after it."""
+        return execute(self._task(episodes, seed), self.controller(), past_len=1)
+
+    def film(self, *, seed: int = 10_000) -> np.ndarray:
+        """Frames (T, H, W, 3) uint8 of one episode."""
+        return film(self._task(1, seed), self.play(seed=seed), 0)
+
+    def _task(self, n: int, seed: int) -> Task:
+        return Task.from_env(self.env, n=n, horizon=self.horizon, reward=self.reward, seed=seed)
+
+
+def solve(
+    env: str,
+    steps: int = 50_000,
+    *,
+    reward: Reward | None = None,
+    horizon: int | None = None,
+    seed: int = 0,
+    options: SolveOptions | None = None,
+    folder: PathLike | None = None,
+    progress: bool = True,
+    callback: Callable[[dict[str, float]], None] | None = None,
+) -> Solved:
+    """Learn to control an environment, from random actions to plans through a learned model.
+
+    Args:
+        env: id of the environment.
+        steps: of the environment, at most, the random ones included; where one ``step`` stands for
+            several, as in DMControl with an ``action_repeat``, each of these counts.
+        reward: of states (..., B, T, dx) and actions (..., B, T, du), one number per step, a
+            function of the step alone; None for the one that the environment offers to plan by.
+        horizon: steps of an episode; None for the environment's limit.
+        seed: of everything.
+        options: settings; None for the same defaults everywhere.
+        folder: of its own, from which a run that was stopped goes on; more ``steps`` continue it.
+        progress: whether to show a bar with the last return.
+        callback: called with every record.
+
+    Returns:
+        Model, data, learning curve and controller.
+
+    Raises:
+        ValueError: the environment offers no reward, or has no limit of time; or fewer steps than
+            two rounds take.
+        StoreError: ``folder`` is of another run, or in use.
+    """
+    o = SolveOptions() if options is None else options
+    require_type("options", o, SolveOptions, "tsmlib.SolveOptions(...)")
+    steps, seed = require_count("steps", steps), require_seed("seed", seed)
+    limit = find_spec(env).max_episode_steps
+    if horizon is None and limit is None:
+        raise ValueError(f"{env} has no limit of time; give the steps of an episode, horizon=200")
+    horizon = require_count("horizon", limit if horizon is None else horizon)
+    aim = reward_of(env, guided=True) if reward is None else reward
+    made = make(env)
+    repeat = said(made, "action_repeat") or 1
+    made.close()
+    if steps < 2 * (per_round := o.episodes * horizon * repeat):
+        raise ValueError(f"steps is {steps}; expected at least two rounds of {per_round}")
+    data = collect_random(env, o.episodes, horizon=horizon, seed=_draw(seed, 0), rms=o.rms)
+    model = _made(data, o, seed)
+    solved = Solved(env, model, data, aim, horizon, o)
+    start = torch.from_numpy(data.flat_states[data.offsets])
+    identity = {"settings": asdict(o), "seed": seed, "env": data.env, "horizon": horizon}
+    identity["reward of chance"] = list(fingerprint(aim, start, horizon, data.robot.action_dim))
+    spent, taken, k = 0.0, repeat * int(data.steps.sum()), 0
+    with ExitStack() as stack:
+        if folder is not None:
+            stack.enter_context(writer_lock(Path(folder), f"solve, seed {seed}"))
+        bar = stack.enter_context(tqdm(total=steps, desc=env, disable=not progress))
+        bar.update(taken)
+        while True:
+            files = None
+            if folder is not None:
+                files = RoundFiles(Path(folder) / f"round-{k:03d}", encode_nonfinite(identity))
+            record = {"round": float(k)}
+            if k:
+                new, own = _episodes(solved, k, seed, files)
+                solved.data = solved.data.joined(new)
+                taken += repeat * int(new.steps.sum())
+                record |= own | {"env_steps": float(taken)}
+            record = _fitted(solved, k, seed, record, files)
+            spent += record["cpu_seconds"]
+            if k:
+                solved.records.append(record | {"cpu_seconds": spent})
+                bar.update(taken - bar.n)
+                bar.set_postfix({"return": f"{record['return']:.4g}"})
+                if callback is not None:
+                    callback(solved.records[-1])
+            k += 1
+            if taken + per_round > steps:
+                return solved
+
+
+def _draw(seed: int, k: int) -> int:
+    """A seed of round k, from which its resets count up."""
+    return (seed * 1_000_003 + 1000 * k) % 2**31
+
+
+def _made(data: Trajectories, o: SolveOptions, seed: int) -> OneStep:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return OneStep.for_data(data, hidden=o.hidden)
+
+
+def _controller(
+    model: OneStep, reward: Reward, data: Trajectories, o: SolveOptions, seed: int
+) -> Controller:
+    every = max(1, round(o.every / data.dt))
+    ahead = max(every + 1, round(o.ahead / data.dt))
+    space = DirectActions(ahead, data.robot.action_dim, rms=o.rms)
+    return Controller(model, reward, space, every, o, seed)
+
+
+def _episodes(
+    solved: Solved, k: int, seed: int, files: RoundFiles | None
+) -> tuple[Trajectories, dict[str, float]]:
+    """The episodes of round k, and what is said of them."""
+    stored = None if files is None else files.episodes()
+    if stored is not None and stored[0] is not None:
+        return stored[0], stored[1]
+    began = time.process_time()
+    task = solved._task(solved.options.episodes, _draw(seed, k))
+    trial = execute(task, solved.controller(seed=_draw(seed, k)), past_len=1)
+    assert trial.own_return is not None
+    assert trial.seen is not None
+    own = torch.where(trial.own_return.isnan(), trial.executed_return, trial.own_return)
+    record = {"return": float(own.mean()), "spread": float(own.std())}
+    record["planned_return"] = float(trial.executed_return.mean())
+    record["cpu_seconds"] = time.process_time() - began
+    if files is not None:
+        files.keep_episodes(trial.seen, record)
+    return trial.seen, record
+
+
+def _fitted(
+    solved: Solved, k: int, seed: int, record: dict[str, float], files: RoundFiles | None
+) -> dict[str, float]:
+    """The record of round k, the model now fitted to all data, or loaded."""
+    if files is not None and (stored := files.models(solved.model, None)) is not None:
+        return stored
+    began, o = time.process_time(), solved.options
+    train, held_out = solved.data.split(0.9, seed=seed)
+    solved.model.features.fit(train)
+    fit(
+        solved.model,
+        train,
+        held_out,
+        TrainingOptions(
+            future_len=min(20, min(solved.data.lengths)),
+            steps=o.updates if k else o.first,
+            batch_size=128,
+            lr=2e-3,
+            muon=0.01,
+            validate_every=100,
+        ),
+        solved.model.multi_step_loss,
+        seed=seed + k,
+        checkpoint=None if files is None else files.folder / "model.checkpoint",
+        progress=False,
+    )
+    spent = time.process_time() - began
+    record = record | {"cpu_seconds": record.get("cpu_seconds", 0.0) + spent}
+    if files is not None:
+        files.keep_models(solved.model, None, record)
+    return record
