@@ -538,3 +538,40 @@ def test_an_episode_that_is_not_finite_is_told_with_its_step_since_reset() -> No
 
 def test_a_copy_of_ones_own_is_stepped_without_an_id() -> None:
     assert Stepping([Cart(), Cart()]).id == "Cart"
+
+
+def test_nothing_counts_after_an_episode_ended_and_success_is_a_yes_or_a_distance() -> None:
+    def fallen(x: Tensor) -> Tensor:
+        return (x[..., 0] < 0.7) | (x[..., 1].abs() > 0.2)
+
+    reward = tsmlib.rewards.until(fallen, lambda x, u: x[..., 5] + 1)
+    task = tsmlib.Task.from_env(
+        "Hopper-v5", n=3, horizon=60, reward=reward, seed=0, success=lambda x: ~fallen(x[:, -1])
+    )
+    actions = random_actions(3, 60, 3)
+    trial, predicted = (
+        tsmlib.execute(task, actions),
+        tsmlib.simulator_predictor(task)(actions[None]),
+    )
+    assert max(trial.lengths) < 60
+    slow = [float((trial.states[i, 1 : n + 1, 5] + 1).sum()) for i, n in enumerate(trial.lengths)]
+    np.testing.assert_allclose(trial.executed_return, slow, rtol=1e-4)
+    foretold = task.reward(predicted[0], actions[None]).sum(-1)[0]
+    np.testing.assert_allclose(foretold, slow, rtol=1e-4)
+    assert trial.success.tolist() == [False] * 3
+    near = dict(success=lambda x: (x[:, -1, 0] - 1).abs(), tolerance=0.5)
+    pose = tsmlib.Task.from_env(
+        "Pendulum-v1", n=3, horizon=4, reward=lambda x, u: x[..., 0], **near
+    )
+    trial = tsmlib.execute(pose, pose.idle_actions())
+    torch.testing.assert_close(trial.final_distance, (trial.states[:, -1, 0] - 1).abs())
+    assert trial.success.tolist() == (trial.final_distance <= 0.5).tolist()
+
+
+def test_zeros_that_are_half_thrust_are_said_aloud(made: Made) -> None:
+    class Thruster(Cart):
+        action_space = Box(np.float32([0]), np.float32([10]))
+
+    task = tsmlib.Task.from_env(made(Thruster), n=1, horizon=4, reward=lambda x, u: x[..., 0])
+    with pytest.warns(UserWarning, match=r"actions are zeros, .* nothing there is \[-1.0\]"):
+        tsmlib.execute(task, torch.zeros(1, 4, 1))

@@ -27,7 +27,7 @@ from tsmlib.planning.execution import execute, mpc
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques
-from tsmlib.pretrained import draw_task
+from tsmlib.pretrained import TASK_SEED, draw_task, load_task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories
@@ -88,6 +88,23 @@ def test_what_is_recorded_is_what_the_arm_received() -> None:
 
 
 # Smooth torques
+
+
+def test_torques_start_near_zero_and_settle_to_their_strength() -> None:
+    drawn = smooth_torques(4000, 60, generator=torch.Generator().manual_seed(0), rms=0.1)
+    strength = drawn.square().mean((0, 2)).sqrt()  # (60,)
+    assert strength[0] < 0.07
+    assert (strength[:5].diff() > 0).all()
+    assert (strength[20:] - 0.1).abs().max() < 0.003
+    assert drawn.mean().abs() < 1e-3
+
+
+def test_torques_are_smooth_and_bounded() -> None:
+    drawn = torques(2000, 60)
+    now, later = drawn[:, 20:-1].flatten(), drawn[:, 21:].flatten()
+    assert torch.corrcoef(torch.stack([now, later]))[0, 1] > 0.7
+    strong = smooth_torques(500, 50, generator=torch.Generator().manual_seed(0), rms=2.0)
+    assert strong.abs().max() == 1
 
 
 # Executing
@@ -431,3 +448,12 @@ def test_pushing_without_an_object_is_refused() -> None:
         dataclasses.replace(
             some_task(), name="push", reward_for=rewards.push, position=rewards.BLOCK
         )
+
+
+@pytest.mark.parametrize("env", ENV_IDS)
+def test_frozen_tasks_are_those_their_seed_draws(env: str) -> None:
+    frozen, drawn = load_task(env), draw_task(env, seed=TASK_SEED["test"])
+    assert (frozen.name, frozen.env, len(frozen)) == (drawn.name, env, 100)
+    np.testing.assert_allclose(frozen.start, drawn.start, rtol=0, atol=1e-6)
+    torch.testing.assert_close(frozen.target, drawn.target, rtol=0, atol=1e-6)
+    assert not np.allclose(frozen.start, load_task(env, "validation").start)

@@ -6,6 +6,7 @@ import itertools
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,6 +20,8 @@ from tsmlib.envs.geometry import HALF_RANGE
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE, EnvSpec
 from tsmlib.envs.stepping import UnsupportedEnvironment
 from tsmlib.planning.predictors import simulator_predictor
+from tsmlib.storage.artifacts import load_trajectories, save_trajectories
+from tsmlib.trajectory import Trajectories, TrajectoryError
 
 REACHER, PUSH = "tsm/Reacher-v0", "tsm/ReacherPush-v1"
 
@@ -145,3 +148,14 @@ def test_the_true_simulator_of_an_arm_that_hides_its_state_is_no_predictor(
         UnsupportedEnvironment, match="the true simulator of tsm/Reacher-v0 can be asked"
     ):
         simulator_predictor(imperfect("tsm/Reacher-v0", **hidden))
+
+
+def test_angles_behind_noise_may_jump_and_those_of_a_log_may_not(tmp_path: Path) -> None:
+    env, rest = gymnasium.make_vec(imperfect(REACHER, noise=10.0), num_envs=2), torch.zeros(2, 9, 2)
+    data = collect(env, open_loop(rest), horizon=9, seed=0)
+    assert np.abs(np.diff(data.states[..., 0])).max() > np.pi
+    save_trajectories(tmp_path / "noisy.safetensors", data.take([1, 0]).joined(data))
+    assert load_trajectories(tmp_path / "noisy.safetensors").take([2, 3]) == data
+    about = (data.names, data.units, data.angles)
+    with pytest.raises(TrajectoryError, match="'joint0' jumps by more than pi"):
+        Trajectories(data.states, data.actions, "log", data.dt, *about)

@@ -10,7 +10,7 @@ import torch
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
 from tsmlib.evaluation.actions import novelty, roughness, spectrum, within
-from tsmlib.evaluation.exploitation import violations
+from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 
@@ -167,3 +167,21 @@ def test_the_range_of_the_data_holds_95_of_100_of_their_steps_and_none_of_what_i
     plan = torch.zeros(1, 4, 2)
     plan[0, 1, 0], plan[0, 3, 1] = 0.5, -0.15  # both far above a tenth, and a tenth of a fifth
     assert within(plan, data).tolist() == [0.5]
+
+
+def test_an_object_that_drifts_slowly_is_found() -> None:
+    states = still(block=(0.0, 0.12))
+    states[0, :, 7] += 0.0012 * np.arange(51)
+    found = violations(states, PUSH)["moves_untouched"][0]
+    np.testing.assert_array_equal(found, 0.0012 * np.arange(1, 51) > 0.005)
+
+
+def test_shares_are_of_the_steps_of_each_plan_and_the_worst_is_a_tenth() -> None:
+    predicted = still(20)
+    predicted[3, 26:, 6] += 0.1  # 25 of its 50 steps
+    found = shares(predicted[:, 0], np.stack([predicted[:, 1:], still(20)[:, 1:]]), PUSH)
+    assert found["moves_untouched"][3] == 0.25  # every other rollout is sound
+    assert found["moves_untouched"].sum() == 0.25
+    error = np.zeros(20)
+    error[[3, 5, 9]] = 2.0, 1.0, -7.0  # predicted less than executed: no exploitation
+    assert sorted(worst(error)) == [3, 5]

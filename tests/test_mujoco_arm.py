@@ -274,3 +274,10 @@ def test_threads_change_nothing_but_time() -> None:
         results.append(env.unwrapped.rollout(actions))
         env.close()
     np.testing.assert_array_equal(*results)
+
+
+def test_random_torques_push_the_object_no_deeper_than_a_centimetre_into_a_wall() -> None:
+    env, _ = arms(PUSH, 300)
+    states = env.rollout(smooth_torques(300, 0.1))
+    room = WALL - BLOCK_RADIUS
+    assert room - 0.002 < np.abs(states[..., 6:8]).max() < room + 0.01  # walls are met

@@ -32,6 +32,7 @@ from tsmlib.policies.learning import (
     episodes_from,
     imagine,
     learn_policy,
+    learning_rate,
 )
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
 from tsmlib.rewards import Reward
@@ -588,3 +589,9 @@ def test_what_is_not_finite_stops_learning_with_the_weights_of_the_last_record(f
         learn(actor, Breaking(), measure=keep)
     assert same(weights(actor), kept[-1])
     assert len(kept) == 2
+
+
+def test_later_rewards_count_less_and_the_rate_decays_to_a_tenth() -> None:
+    assert discounted(torch.tensor([[1.0, 1.0, 1.0]]), 0.5).item() == 1.75
+    rates = [learning_rate(i) for i in (0, 99, 100, 2200, 5000)]
+    assert rates == pytest.approx([1e-3, 1e-3, 9e-4, 1e-4, 1e-4])

@@ -10,6 +10,7 @@ from tsmlib.envs.geometry import (
     BLOCK_MASS,
     BLOCK_RADIUS,
     DT,
+    ELBOW_LIMIT,
     GEAR,
     LINK_LENGTHS,
     WALL,
@@ -196,3 +197,18 @@ def test_after_a_fault_the_sound_part_of_the_episode_can_be_continued() -> None:
     with pytest.raises(SimulationUnstable, match="episode 0 at step 10"):
         env.rollout(actions[:, 10:])
     np.testing.assert_array_equal(env.rollout(actions[:, 10:]), whole[:, 10:])
+
+
+def test_nothing_escapes_under_full_random_torque() -> None:
+    env, _ = arms(PUSH, n=100)
+    states = env.rollout(full_torques(100, 150, seed=1))
+    assert np.isfinite(states).all()
+    assert np.abs(states[..., 6:8]).max() < WALL - BLOCK_RADIUS / 2
+    assert np.abs(states[..., 1]).max() < ELBOW_LIMIT + 0.2
+
+
+def test_a_pushed_object_moves_ahead_of_the_arm() -> None:
+    env, _ = arms(PUSH, n=1)
+    env.reset(options={"states": at_rest((0.0, 0.0), (0.18, 0.06))})
+    states = env.rollout(np.tile([0.05, 0.0], (1, 40, 1)))
+    assert states[0, -1, 7] > 0.1

@@ -715,3 +715,26 @@ def test_a_past_of_numpy_arrays_is_taken_and_a_short_one_named() -> None:
     net = in_units(LSTM(2, 1, hidden=8))
     with pytest.raises(ValueError, match="past holds 1 steps of 3 targets; expected at least"):
         model_predictor(net, PAST)
+
+
+def test_each_target_keeps_its_best_restart() -> None:
+    starts = torch.zeros(3, B, T, 1)
+    starts[0], starts[2] = -3.0, 3.0  # poor places to begin
+    space = DirectActions(T, 1, rms=0.5)
+    many = adam(predictor(), reward, space, starts, iterations=5)
+    for start in starts:
+        alone = adam(predictor(), reward, space, start[None], iterations=5)
+        assert (many.predicted_return >= alone.predicted_return - 1e-5).all()
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_model_that_diverges_on_some_candidates_is_planned_around(planner: str) -> None:
+    def fragile(actions: Tensor) -> Tensor:
+        """Any force above 0.4 ends the world."""
+        return predictor()(actions) / (actions.amax((2, 3)) < 0.4)[None, ..., None, None]
+
+    plan = plan_by(planner, fragile, reward, 30)
+    assert torch.isfinite(plan.curve).all()
+    assert (plan.predicted_return > plan.curve[0]).all()
+    assert plan.actions.max() < 0.4
+    assert plan.actions[0].max() > 0.2  # the first target needs force

@@ -73,7 +73,8 @@ def test_it_is_light(module: str) -> None:
 
 
 def test_every_public_name_is_what_it_is_called() -> None:
-    assert {getattr(tsmlib, name).__name__ for name in tsmlib.__all__} == set(tsmlib.__all__)
+    names = set(tsmlib.__all__) - {"plots"}  # a module
+    assert {getattr(tsmlib, name).__name__ for name in names} == names
 
 
 def test_what_ships_is_loaded_by_word_and_environment_and_knows_its_robot() -> None:

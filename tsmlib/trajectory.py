@@ -143,7 +143,7 @@ class Trajectories(FromLogs):
     def ragged(
         cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], **robot: Any
     ) -> Trajectories:
-        """Episodes of different lengths, (T_i + 1, dx) and (T_i, du): the constructor takes them too.
+        """Episodes of several lengths, (T_i + 1, dx) and (T_i, du), as the constructor takes them.
 
         Args:
             states: an array for each episode.

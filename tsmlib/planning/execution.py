@@ -9,6 +9,7 @@ Letters in shapes: B targets, T horizon, L past length, dx, du size of state and
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -148,6 +149,12 @@ def _open_loop_actions(task: Task, plan: object) -> Tensor:
         raise ValueError(
             f"{name} go up to {most:g}; expected them within [-1, 1], the bounds of the action "
             "space: divide by its bounds, or clip, actions.clamp(-1, 1)"
+        )
+    if not actions.any() and task.idle_actions().any():
+        warnings.warn(
+            f"{name} are zeros, the middle of the bounds of {task.env}; doing nothing there is "
+            f"{task.idle_actions()[0, 0].tolist()}: task.idle_actions()",
+            stacklevel=3,
         )
     return actions
 
