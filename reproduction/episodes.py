@@ -58,6 +58,8 @@ def make_model(run: Run, name: str, word: str, path: Path) -> torch.nn.Module:
     if spec.group != "prior" and copies(env) > 1:
         train = symmetric(train)
     net = spec.load().for_data(train, seed=run.seed, **spec.arguments(EnvSpec.parse(env)))
+    if spec.begins:
+        net.take_decoder(load_model(run, name, spec.begins))
     stages = spec.schedule(EnvSpec.parse(env), run.pick(0.0, 0.5, 1.0))
     checkpoints = []
     for key, stage in zip(zoo.keys(stages), stages, strict=True):

@@ -160,7 +160,8 @@ def _data_of(arm: str, *splits: str) -> list[str]:
 
 
 def _model_inputs(run: Run, words: list[str]) -> list[str]:
-    return _data_of(words[0], "train", "validation")
+    begins = [f"models/{words[0]}/{first}"] if (first := zoo.find(words[1]).begins) else []
+    return begins + _data_of(words[0], "train", "validation")
 
 
 def _prior_of(arm: str) -> str:

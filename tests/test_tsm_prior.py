@@ -147,6 +147,20 @@ def test_a_code_carries_what_nobody_can_know_and_no_more() -> None:
     assert (ends[:, 1].abs() > 0.5 * H).float().mean() > 0.8
 
 
+def test_a_decoder_that_is_taken_predicts_as_before_until_codes_come_alive() -> None:
+    first = model(prior="normal", full_encoder=False)
+    with torch.no_grad():
+        first.decoder.codes.weight.zero_()  # dead codes
+    net, (past, future) = model(), window()
+    v = net.decoder.codes.weight.clone()
+    net.take_decoder(first)
+    expected = first.predict_segment(past, future.actions)
+    torch.testing.assert_close(net.predict_segment(past, future.actions), expected)
+    torch.testing.assert_close(net.decoder.codes.weight, 0.2 * v)
+    with pytest.raises(ValueError, match="the decoders differ in size"):
+        net.take_decoder(model(channels=4))
+
+
 def test_a_wrong_word_and_an_encoder_that_sees_more_are_named() -> None:
     with pytest.raises(ValueError, match="normal.*learned"):
         TSM(DX, DU, prior="learnt")

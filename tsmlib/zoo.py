@@ -120,6 +120,7 @@ class ModelSpec:
         budget: seconds of training of its own, in place of the environment's.
         planned: whether figure 6 plans with it.
         pushing: its stages there, where they differ.
+        begins: word of the model whose decoder it begins with (``TSM.take_decoder``).
     """
 
     word: str
@@ -131,6 +132,7 @@ class ModelSpec:
     budget: float | None = None
     planned: bool = False
     pushing: tuple[Stage, ...] = ()
+    begins: str = ""
 
     def load(self) -> type[torch.nn.Module]:
         """The class."""
@@ -181,6 +183,12 @@ def _wide(env: EnvSpec) -> dict[str, Json]:
     return {"channels": 64, "head_channels": 128} if env.has_block else {}
 
 
+def _alive(env: EnvSpec) -> dict[str, Json]:
+    """Codes that carry something."""
+    learned = {"prior": "learned", "full_encoder": True, "residual": "distance", "beta": 0.05}
+    return _wide(env) | learned
+
+
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any
 # colour vision ----------------------------------------------------------------------------------
 
@@ -200,6 +208,10 @@ _H20 = _choice(  # receptive field 2 H
     "tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)
 )
 _LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
+_REVIVED = (
+    Stage(Updates("loss", 1, lr=1e-3, batch=128, muon=_SLOW), (16, 10), 0.5),
+    Stage(Updates("energy_loss", 1, lr=1e-3, batch=128, muon=_SLOW), (8, 5), 0.5),
+)
 _MODELS = (
     ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
     ModelSpec(
@@ -209,6 +221,16 @@ _MODELS = (
         _recurrent(0.01),
         planned=True,
         pushing=_recurrent(0.005),
+    ),
+    ModelSpec(  # codes with a learned prior, then the energy score of samples from it
+        "tsm+prior",
+        Look("TSM + code prior", "#2E86C1", ">"),
+        _TSM,
+        _REVIVED,
+        _alive,
+        "ablation",
+        budget=200.0,
+        begins="tsm",
     ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy",

@@ -15,6 +15,8 @@ et al., 2021); a smaller beta makes codes carry more. The distance |f(x) - f(x^)
 square is the bound of a density with heavier tails, exp(-distance / beta).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Literal, cast
 
@@ -119,6 +121,27 @@ class TSM(StateModel):
     def code_statistics(self) -> nn.Linear:
         """The last layer of the encoder."""
         return self.encoder.project
+
+    def take_decoder(self, other: TSM) -> None:
+        """Take the decoder and statistics of a trained model whose codes carry nothing yet.
+
+        V, by which the decoder knows codes, is drawn anew and small, so that they matter a little.
+
+        Args:
+            other: a model of the same robot and sizes; its encoder and prior stay behind.
+
+        Raises:
+            ValueError: the two are of other robots or sizes.
+        """
+        if other.robot is not None and self.robot is not None:
+            self.robot.require_same(other.robot, "the model and the one whose decoder it takes")
+        v = 0.2 * self.decoder.codes.weight.detach()
+        try:
+            self.decoder.load_state_dict(other.decoder.state_dict())
+        except RuntimeError as error:
+            raise ValueError(f"the decoders differ in size: {error}") from error
+        self.features.load_state_dict(other.features.state_dict())
+        self.decoder.codes.weight.data.copy_(v)
 
     def begin(
         self, past: Segment, *, planned: Tensor | None = None, generator: Noise | None = None
