@@ -20,6 +20,7 @@ import tsmlib
 from reproduction.episodes import random_data
 from reproduction.runs import env_id
 from tsmlib.evaluation import latent, scoring
+from tsmlib.pretrained import PRETRAINED
 from tsmlib.trajectory import Trajectories
 
 TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "64_codes.csv"
@@ -68,6 +69,8 @@ def rows() -> Iterator[dict[str, str]]:
     for arm in ARMS:
         data = random_data(env_id(arm), EPISODES, seed=SEED)
         for word in MODELS:
+            if not (PRETRAINED / arm / f"{word}.safetensors").exists():
+                continue
             model = tsmlib.load_pretrained(word, env=env_id(arm))
             found = scores(model, data)
             if isinstance(model, tsmlib.TSM):
