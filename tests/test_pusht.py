@@ -106,12 +106,16 @@ def test_starts_lie_within_the_walls_and_apart():
     assert (PushT(2).reset(seed=3)[0] == states[:2]).all()  # episode i does not depend on N
 
 
-def test_the_physics_commute_with_quarter_turns_and_mirrors(data):
-    copies = symmetric_copies(data.states.astype(float), data.actions.astype(float))
-    assert len(copies) == 8
+@pytest.mark.parametrize(("shape", "n"), [("T", 8), ("L", 4), ("plus", 8)])
+def test_the_physics_commute_with_quarter_turns_and_mirrors(shape, n):
+    name = pusht_variant(shape=shape)
+    data, env = play(env_id=name), PushT(12, name)
+    copies = symmetric_copies(data.states.astype(float), data.actions.astype(float), shape)
+    assert len(copies) == n
     assert (copies[0][0] == data.states).all()
     for states, actions in copies:
-        apart = np.abs(begun(states[:, 0]).rollout(actions) - states[:, 1:]).max((1, 2))
+        env.reset(options={"states": states[:, 0]})
+        apart = np.abs(env.rollout(actions) - states[:, 1:]).max((1, 2))
         assert np.median(apart) < 0.01
 
 

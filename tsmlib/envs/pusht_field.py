@@ -34,6 +34,7 @@ SHAPES = {
     "I": ((-0.5, -2.0, 0.5, 2.0),),
     "plus": ((-1.5, -0.5, 1.5, 0.5), (-0.5, -1.5, 0.5, 1.5)),
 }
+HANDED = ("L", "Z")  # not their own mirror image
 GREY, GREEN, BLUE = "#778899", "#90EE90", "#4169E1"  # the colours that the field knows
 
 
@@ -165,11 +166,14 @@ def require_in_field(name: str, states: np.ndarray, physics: PushTPhysics | None
 
 
 def symmetric_copies(
-    states: np.ndarray, actions: np.ndarray
+    states: np.ndarray, actions: np.ndarray, shape: str = "T"
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """States (..., 7) and actions (..., 2), turned by quarters and mirrored: eight of each."""
+    """States (..., 7) and actions (..., 2), turned by quarters and mirrored: eight of each.
+
+    An L or a Z is another shape in the mirror, so of them there are four.
+    """
     centre, copies = (LOW + HIGH) / 2, []
-    for mirror in (1.0, -1.0):
+    for mirror in (1.0,) if shape in HANDED else (1.0, -1.0):
         for quarters in range(4):
             cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters]
             turn = np.array([[cosine, sine], [-sine, cosine]], states.dtype)

@@ -139,7 +139,8 @@ def random_play(
         episodes: simulated.
         horizon: steps of each.
         seed: of starts and actions.
-        symmetries: whether to add the quarter turns and mirror images, eight copies in all.
+        symmetries: whether to add the quarter turns and mirror images, eight copies in all; of
+            shapes that differ from their mirror image four.
         env: id of the field.
 
     Returns:
@@ -154,7 +155,7 @@ def random_play(
     ends = np.where(outside.any(1), outside.argmax(1) - 1, horizon)
     pairs = [(played.states, played.actions)]
     if symmetries:
-        pairs = symmetric_copies(played.states, played.actions)
+        pairs = symmetric_copies(played.states, played.actions, physics.shape)
     for x, u in pairs:
         kept = [i for i, end in enumerate(ends) if end >= min(30, horizon)]
         states += [x[i, : ends[i] + 1] for i in kept]
