@@ -10,12 +10,8 @@ import numpy as np
 import torch
 
 from reproduction.episodes import load_data, load_model
-from reproduction.runs import Run, env_id
-from reproduction.scores import OPEN, SEGMENTS, sizes
-from reproduction.tables import Row, place
-from tsmlib.envs.spec import EnvSpec
-from tsmlib.evaluation import filtering, latent
-from tsmlib.evaluation.contacts import (
+from reproduction.measures import filtering, latent
+from reproduction.measures.contacts import (
     Deflections,
     contacts,
     deflections,
@@ -23,10 +19,14 @@ from tsmlib.evaluation.contacts import (
     touched,
     windows_before_contact,
 )
-from tsmlib.evaluation.futures import HORIZON, STARTS, SampledFutures, sample_futures
+from reproduction.measures.futures import HORIZON, STARTS, SampledFutures, sample_futures
+from reproduction.measures.statistics import spearman
+from reproduction.runs import Run, env_id
+from reproduction.scores import OPEN, SEGMENTS, sizes
+from reproduction.tables import Row, place
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.models.tsm import TSM
 from tsmlib.rewards import BLOCK
-from tsmlib.statistics import spearman
 
 
 def code_rows(run: Run, name: str, word: str) -> list[Row]:

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 
 import tsmlib
+from reproduction.measures import gradients
+from reproduction.measures.data import autocorrelation, cells_visited, shares
 from reproduction.runs import HELD_OUT, Run, env_id
 from reproduction.tables import Row, place
 from tsmlib import zoo
@@ -19,8 +21,6 @@ from tsmlib.envs import fingerprint
 from tsmlib.envs.geometry import LINK_LENGTHS
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.symmetry import copies, symmetric
-from tsmlib.evaluation import gradients
-from tsmlib.evaluation.data import autocorrelation, cells_visited, shares
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.storage import artifacts
 from tsmlib.trajectory import Trajectories

@@ -11,10 +11,10 @@ import torch
 
 import tsmlib
 from reproduction.episodes import load_data, load_model, load_prior
+from reproduction.measures.actions import within
 from reproduction.runs import Run, env_id
 from reproduction.tables import Row, place
 from tsmlib.envs import fingerprint
-from tsmlib.evaluation.actions import within
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.tasks import Task

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from reproduction.episodes import load_data, load_model
+from reproduction.measures.contacts import after_first, contact_steps
 from reproduction.runs import Run, env_id
 from reproduction.tables import Row, place
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.evaluation.contacts import after_first, contact_steps
 from tsmlib.evaluation.prediction import Scores, cut, score
 from tsmlib.evaluation.scoring import LEVELS
 from tsmlib.models.base import predict_segment

@@ -14,8 +14,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from reproduction.measures import gradients
 from tsmlib.collection import smooth_torques
-from tsmlib.evaluation import gradients
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import predict_segment, rollout
 from tsmlib.models.baselines import LSTM, OneStep

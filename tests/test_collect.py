@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tsmlib.evaluation.data import autocorrelation, cells_visited
+from reproduction.measures.data import autocorrelation, cells_visited
 
 
 def test_points_everywhere_visit_every_cell_and_one_point_one() -> None:

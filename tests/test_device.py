@@ -14,8 +14,8 @@ from accelerator import DEVICE, Accelerator
 from test_axioms import DU, MODELS, Case, motion, new_prior
 from torch import Tensor
 
+from reproduction.measures.actions import reconstruct, sample_actions
 from tsmlib.evaluation import prediction
-from tsmlib.evaluation.actions import reconstruct, sample_actions
 from tsmlib.models.base import rollout
 from tsmlib.planning.base import Planner, SearchSpace
 from tsmlib.planning.planners import adam, cem

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tsmlib.evaluation import contacts, prediction, scoring
+from reproduction.measures import contacts
+from tsmlib.evaluation import prediction, scoring
 from tsmlib.models.features import Features
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Trajectories

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import tsmlib
-from tsmlib.evaluation import gradients
+from reproduction.measures import gradients
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.tsm import TSM
 from tsmlib.planning.search_spaces import DirectActions, LatentActions

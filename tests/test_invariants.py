@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from reproduction.measures.actions import novelty, roughness, spectrum, within
+from reproduction.measures.exploitation import shares, violations, worst
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
-from tsmlib.evaluation.actions import novelty, roughness, spectrum, within
-from tsmlib.evaluation.exploitation import shares, violations, worst
 
 PUSH, PYMUNK = "tsm/ReacherPush-v1", "tsm/PymunkPush-v1"
 

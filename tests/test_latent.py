@@ -11,11 +11,12 @@ import pytest
 import torch
 from untrained import in_units
 
+from reproduction.measures import contacts, exploitation, futures, latent
+from reproduction.measures.contacts import Deflections
+from reproduction.measures.futures import SampledFutures
 from tsmlib.collection import collect_random
 from tsmlib.envs.geometry import BLOCK_RADIUS, WALL, closest_gap, fingertip
-from tsmlib.evaluation import contacts, exploitation, futures, latent, prediction
-from tsmlib.evaluation.contacts import Deflections
-from tsmlib.evaluation.futures import SampledFutures
+from tsmlib.evaluation import prediction
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_from_standard_normal
 from tsmlib.models.tsm import TSM

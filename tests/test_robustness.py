@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from reproduction.measures import filtering
+from reproduction.measures.filtering import KalmanFilter, errors, rmse
 from tsmlib.collection import collect_random
 from tsmlib.envs import imperfect
 from tsmlib.envs.geometry import HALF_RANGE, fingertip
 from tsmlib.envs.spec import NOISE
-from tsmlib.evaluation import filtering
-from tsmlib.evaluation.filtering import KalmanFilter, errors, rmse
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories
 

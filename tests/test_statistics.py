@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from reproduction.measures.statistics import spearman, two_sample_auc
 from tsmlib import statistics
 
 
@@ -22,21 +23,19 @@ def test_a_half_interval_is_student_s_t_times_the_standard_error() -> None:
 
 def test_a_rank_correlation_sees_order_alone() -> None:
     x = torch.tensor([0.5, -1.0, 2.0, 3.0])
-    assert statistics.spearman(x, x**3) == pytest.approx(1)
-    assert statistics.spearman(x, -x) == pytest.approx(-1)
-    assert statistics.spearman(x, torch.ones(4)) == 0
-    assert statistics.spearman([1, 2, 2, 3], [1, 2, 2, 3]) == pytest.approx(
-        1
-    )  # ties share their rank
-    assert statistics.spearman([1, 2, 2, 3], [1, 3, 2, 4]) == pytest.approx(0.9486833)
+    assert spearman(x, x**3) == pytest.approx(1)
+    assert spearman(x, -x) == pytest.approx(-1)
+    assert spearman(x, torch.ones(4)) == 0
+    assert spearman([1, 2, 2, 3], [1, 2, 2, 3]) == pytest.approx(1)  # ties share their rank
+    assert spearman([1, 2, 2, 3], [1, 3, 2, 4]) == pytest.approx(0.9486833)
 
 
 def test_samples_of_one_distribution_are_not_distinguished_and_planted_differences_are() -> None:
     draw = torch.Generator().manual_seed(0)
     first, second = (torch.randn(400, 3, generator=draw, dtype=torch.double) for _ in range(2))
-    assert statistics.two_sample_auc(first, second) == pytest.approx(0.5, abs=0.06)
-    assert statistics.two_sample_auc(first + torch.tensor([2.0, 0, 0]), second) > 0.85
-    assert statistics.two_sample_auc(0.2 * first, second) > 0.85  # the same mean, only narrower
-    assert statistics.two_sample_auc(first[:20] + 2, second) > 0.85  # sides of different size
+    assert two_sample_auc(first, second) == pytest.approx(0.5, abs=0.06)
+    assert two_sample_auc(first + torch.tensor([2.0, 0, 0]), second) > 0.85
+    assert two_sample_auc(0.2 * first, second) > 0.85  # the same mean, only narrower
+    assert two_sample_auc(first[:20] + 2, second) > 0.85  # sides of different size
     with pytest.raises(ValueError, match="9 and 400 rows are too few"):
-        statistics.two_sample_auc(first[:9], second)
+        two_sample_auc(first[:9], second)

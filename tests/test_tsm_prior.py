@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from reproduction.measures import latent
 from tsmlib import TSM
-from tsmlib.evaluation import latent
 from tsmlib.models.base import rollout, stepper
 from tsmlib.models.layers import kl_divergence, kl_from_standard_normal
 from tsmlib.trajectory import Segment, Window

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reproduction.measures.exploitation import NEAR
+from reproduction.measures.futures import HORIZON, Coded, SampledFutures
 from tsmlib.envs.geometry import DT, closest_gap, room, slide_time
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.evaluation.exploitation import NEAR
-from tsmlib.evaluation.futures import HORIZON, Coded, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.rewards import BLOCK
 from tsmlib.trajectory import Trajectories

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from reproduction.measures.futures import Coded, SampledFutures
 from tsmlib.evaluation import prediction, scoring
-from tsmlib.evaluation.futures import Coded, SampledFutures
 from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_divergence, sample_posterior

@@ -1,0 +1,1 @@
+"""What the paper and the tables measure of data, plans, codes and predictions."""
