@@ -25,7 +25,6 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.storage import artifacts
 from tsmlib.trajectory import Trajectories
 
-SPLITS = ("train", "validation", "test")
 LAGS = (5, 10, 20, 40)  # steps
 CHECKED = 2  # starts of the gradients that are checked
 

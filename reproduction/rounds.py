@@ -197,7 +197,6 @@ def _measured(
 
 # Adaptation -------------------------------------------------------------------------------------
 
-VARIANTS = ("mass0.5", "mass2", "damping0.5", "damping2", "links0.12x0.11", "gain0.7")
 UPDATES = {"rtsm": (120, 300), "lstm": (300, 800), "ensemble+mse": (300, 800)}  # tuned, scratch
 RATES = {"all": 1e-3, "head": 1e-3, "codes": 0.1}
 FEW_SEED = 2_000_000  # of the few episodes, which no shipped model has seen

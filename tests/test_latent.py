@@ -160,18 +160,6 @@ def test_a_touch_is_an_event_once_and_a_bounce_between_two_states_is_seen() -> N
     assert contacts.contacts(seen)["wall"][0][0].nonzero().flatten().tolist() == [8]
 
 
-def test_the_first_episode_with_and_without_a_touch_are_told_apart(test_data: Trajectories) -> None:
-    found = contacts.first_episodes(test_data, after=10)
-    near = closest_gap(found["contact"].states, PUSH)[0] < 0.001
-    assert near.any()
-    assert not near[:11].any()
-    assert closest_gap(found["free"].states, PUSH).min() >= 0.001
-    assert [len(episode) for episode in found.values()] == [1, 1]
-    assert list(
-        contacts.first_episodes(collect_random("tsm/Reacher-v0", 2, seed=0, rms=0.1), after=10)
-    ) == ["free"]
-
-
 def test_an_event_is_foretold_up_to_two_steps_early_or_late() -> None:
     truth = torch.zeros(2, 20, dtype=torch.bool)
     truth[0, 5] = truth[1, 15] = True
@@ -218,22 +206,6 @@ def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -
     torch.testing.assert_close(codes.square().mean((1, 2)), torch.ones(5), atol=0.03, rtol=0)
     with pytest.raises(ValueError, match="at least 2"):
         latent.interpolate(first, second, 1)
-
-
-def test_one_code_is_one_future_and_codes_close_by_are_futures_close_by(
-    model: TSM, test_data: Trajectories
-) -> None:
-    seen = futures.sample_futures(model, test_data.take(slice(1)), samples=1, horizon=30)
-    window = Window(*(Segment(*(part[:1] for part in side)) for side in seen.window))
-    z = torch.randn(1, 3, generator=rng())
-    once = latent.decode_codes(model, window, z, 30)
-    assert torch.equal(once, latent.decode_codes(model, window, z, 30))
-    assert torch.equal(once[:, :10], latent.decode_codes(model, window, z, 10))
-    torch.testing.assert_close(
-        latent.decode_codes(model, window, z.expand(2, -1), 30), once.expand(2, -1, -1)
-    )
-    near = latent.decode_codes(model, window, z + 1e-3, 30)
-    assert 0 < (near - once).abs().max() < 0.1
 
 
 def test_the_directions_that_move_an_outcome_are_found() -> None:

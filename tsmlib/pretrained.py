@@ -20,7 +20,10 @@ from tsmlib.planning.tasks import Task
 from tsmlib.storage import artifacts
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from tsmlib.models.base import DynamicsModel
+    from tsmlib.storage.files import Json
 
 _PACKAGE = Path(__file__).resolve().parent
 INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
@@ -54,7 +57,7 @@ def load_pretrained(model: str, *, env: str) -> DynamicsModel:
             f"no pretrained {model} of {env} in {folder}: {known}. To train one, type: "
             f"python -m tsmlib make {name} --scale paper"
         )
-    expect = tsmlib.envs.fingerprint(trained_on)
+    expect = cast("Mapping[str, Json]", tsmlib.envs.fingerprint(trained_on))
     cls = zoo.find(model).load()
     return cast("DynamicsModel", artifacts.load_model(path, cls, expect=expect))
 

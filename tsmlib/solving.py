@@ -33,7 +33,7 @@ from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, fingerprint, reward_of
-from tsmlib.storage.files import PathLike, encode_nonfinite, writer_lock
+from tsmlib.storage.files import Json, PathLike, encode_nonfinite, writer_lock
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Segment, Trajectories
 
@@ -209,7 +209,12 @@ def solve(
     model = _made(data, o, seed)
     solved = Solved(env, model, data, aim, horizon, o)
     start = torch.from_numpy(data.flat_states[data.offsets])
-    identity = {"settings": asdict(o), "seed": seed, "env": data.env, "horizon": horizon}
+    identity: dict[str, Json] = {
+        "settings": asdict(o),
+        "seed": seed,
+        "env": data.env,
+        "horizon": horizon,
+    }
     identity["reward of chance"] = list(fingerprint(aim, start, horizon, data.robot.action_dim))
     spent, taken, k = 0.0, repeat * int(data.steps.sum()), 0
     with ExitStack() as stack:

@@ -185,8 +185,8 @@ def _wide(env: EnvSpec) -> dict[str, Json]:
 
 def _alive(env: EnvSpec) -> dict[str, Json]:
     """Codes that carry something."""
-    learned = {"prior": "learned", "full_encoder": True, "residual": "distance", "beta": 0.05}
-    return _wide(env) | learned
+    options: dict[str, Json] = {"prior": "learned", "residual": "distance", "beta": 0.05}
+    return _wide(env) | options | {"full_encoder": True}
 
 
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any

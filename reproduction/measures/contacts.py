@@ -35,26 +35,10 @@ def after_first(steps: Tensor) -> Tensor:
     return steps.cummax(1).values
 
 
-def first_episodes(test: Trajectories, *, after: int) -> dict[str, Trajectories]:
-    """The first episode in which the arm meets the block, but not in its first ``after`` steps
-    ("contact"), and the first in which it never does ("free"); where there is no block, or no such
-    episode, only the other.
-    """
-    touched = np.zeros((len(test), 1), dtype=bool)
-    if EnvSpec.parse(test.env).has_block:
-        touched = closest_gap(test.states, test.env) < 0.001
-    ever = touched.any(1)
-    chosen = {"contact": ever & ~touched[:, : after + 1].any(1), "free": ~ever}
-    return {
-        kind: test.take(np.flatnonzero(among)[:1]) for kind, among in chosen.items() if among.any()
-    }
-
-
 WITHIN = 2  # steps by which a predicted contact may be early or late
 # steps before the first touch at which the windows of figure 9 begin: the arm is about to swing
 LEAD = 5
 AHEAD = 5  # steps after the touch at which a deflection is read
-EVENTS = ("object", "wall")  # the arm touches the object, the object touches a wall
 
 
 @torch.no_grad()

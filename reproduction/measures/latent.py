@@ -14,7 +14,6 @@ from torch import Tensor
 
 from reproduction.measures.futures import Coded, SampledFutures
 from tsmlib.evaluation import prediction, scoring
-from tsmlib.models.base import rollout
 from tsmlib.models.features import Features
 from tsmlib.models.layers import kl_divergence, sample_posterior
 from tsmlib.models.tsm import TSM
@@ -125,23 +124,6 @@ def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
     codes = angle.cos() * first + angle.sin() * second
     codes[0], codes[-1] = first, second  # exactly
     return codes
-
-
-@torch.no_grad()
-def decode_codes(model: Coded, window: Window, codes: Tensor, steps: int) -> Tensor:
-    """Futures of codes (n, dz) for one window: states (n, T, dx). One code, then the mode (z = 0)
-    in later segments.
-
-    window: N = 1. steps: T, at most as long as its future.
-    """
-    n, actions = len(codes), window.future.actions[:, :steps]
-    past = Segment(*(part.expand(n, -1, -1) for part in window.past))
-    actions, first = actions.expand(n, -1, -1), min(steps, model.segment_len)
-    states = model.decode(past, actions[:, :first], codes)
-    if steps <= first:
-        return states
-    past = past.then(Segment(states, actions[:, :first])).last(model.past_len)
-    return torch.cat([states, rollout(model, past, actions[:, first:])], dim=1)
 
 
 def directions(codes: Tensor, outcome: Tensor) -> tuple[Tensor, float]:

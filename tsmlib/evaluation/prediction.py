@@ -21,9 +21,6 @@ from tsmlib.planning.tasks import warn_of_other_env
 from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Segment, Trajectories
 
-# raise it when a score changes: scores that are kept are found again only by the version that made
-# them
-VERSION = 2
 ROWS = 800  # samples times trajectories that are rolled out and scored at once
 # where a sample that is not finite, or beyond, is kept: it counts as worst, and every score stays
 # finite

@@ -11,7 +11,6 @@ from typing import ParamSpec
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
@@ -163,12 +162,6 @@ def legend(figure: Figure, handles: Sequence[Line2D]) -> None:
             figure.set_figheight(figure.get_figheight() + 0.14 * rows)
             return
         drawn.remove()
-
-
-def tint(colour: str, share: float = 0.5) -> tuple[float, float, float]:
-    """``colour`` mixed with ``share`` of white."""
-    red, green, blue = (1 - share * (1 - part) for part in to_rgb(colour))
-    return red, green, blue
 
 
 def scene(ax: Axes) -> None:
