@@ -27,7 +27,8 @@ from tsmlib.trajectory import Trajectories
 EPISODES, HELD_OUT = 5800, 60  # of 100 steps
 STAGES = ((1, 1024, 7000, (0.0, 0.35)), (4, 384, 5000, (0.35, 0.65)), (10, 192, 3000, (0.65, 1.0)))
 CANDIDATES, ELITES, ITERATIONS = 128, 12, 4
-LOOKAHEAD, EVERY, RMS = 25, 5, 0.6  # steps, steps, of full action: uniform actions have 0.58
+EVERY, RMS = 5, 0.6  # steps; of full action, of which uniform actions have 0.58
+AHEAD = {"A": (40, 1.0), "B": (25, 0.0), "C": (25, 0.0)}  # steps of a plan, smoothness of the noise
 
 
 def train(
@@ -54,13 +55,15 @@ def trial(
     model: tsmlib.DynamicsModel | None, protocol: str, pairs: int, *, seed: int
 ) -> tsmlib.Trial:
     """Planning again every five steps on the first frozen pairs; None plans in the simulator."""
-    task = load_pusht("test", protocol).take(pairs)
-    space = tsmlib.DirectActions(LOOKAHEAD, rms=RMS, smoothness=0)
+    task = load_pusht("test", protocol)
+    task = task.take(min(pairs, len(task)))
+    ahead, smoothness = AHEAD[protocol]
+    space = tsmlib.DirectActions(ahead, rms=RMS, smoothness=smoothness)
     planner = partial(
         tsmlib.cem, candidates=CANDIDATES, elites=ELITES, iterations=ITERATIONS, seed=seed
     )
     return tsmlib.mpc(
-        task, model, space, planner, every=EVERY, lookahead=LOOKAHEAD, until_success=True, seed=seed
+        task, model, space, planner, every=EVERY, lookahead=ahead, until_success=True, seed=seed
     )
 
 
@@ -89,6 +92,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--pairs", type=int, default=500)
     parser.add_argument("--simulator", type=int, default=100, help="pairs planned in the simulator")
+    parser.add_argument("--protocols", default="BCA")
     parser.add_argument("--models", type=Path, default=Path("runs/pusht"))
     parser.add_argument("--out", type=Path, default=Path("data/results/11_pusht.csv"))
     given = parser.parse_args()
@@ -115,13 +119,14 @@ def main() -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             tsmlib.save_model(path, model)
         model = tsmlib.load_model(path, Egocentric)
-        for protocol in "BC":
-            task = load_pusht("test", protocol).take(given.pairs)
+        for protocol in given.protocols:
+            task = load_pusht("test", protocol)
+            task = task.take(min(given.pairs, len(task)))
             play = weak_policy(torch.Generator().manual_seed(seed))
             add("random play", protocol, seed, partial(tsmlib.execute, task, play))
             plans = partial(trial, model, protocol, given.pairs, seed=seed)
             add("egocentric", protocol, seed, plans)
-    for protocol in "BC" if given.simulator else "":
+    for protocol in given.protocols if given.simulator else "":
         plans = partial(trial, None, protocol, given.simulator, seed=0)
         add("simulator", protocol, 0, plans)
 

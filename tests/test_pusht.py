@@ -25,6 +25,7 @@ from tsmlib.envs.stepping import make_simulation
 from tsmlib.models.egocentric import Egocentric
 from tsmlib.planning.pusht import (
     coverage,
+    distance,
     pusht_task,
     random_play,
     solved_b,
@@ -33,6 +34,7 @@ from tsmlib.planning.pusht import (
     success_b,
     success_c,
 )
+from tsmlib.trajectory import initial_past
 
 
 def play(n=12, horizon=30, env_id="tsm/PushT-v0", seed=0):
@@ -285,6 +287,25 @@ def test_random_play_ends_where_the_t_leaves_the_picture():
     corners = placed(pusht_physics(seen.env).boxes.reshape(-1, 2), seen.flat_states)
     assert corners.min() >= -0.01
     assert corners.max() <= 512.01
+
+
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_frozen_pairs_lie_in_the_field_and_ask_for_a_push(split):
+    task = tsmlib.load_pusht(split)
+    start, goal = task.start, task.target.numpy()
+    assert len(task) == {"test": 500, "validation": 200}[split]
+    assert in_field(start).all()
+    assert in_field(goal).all()
+    assert (np.linalg.norm(start[:, 2:4] - goal[:, 2:4], axis=1) >= 10).all()
+    assert len(tsmlib.load_pusht(split, "A")) == 100
+
+
+def test_the_shipped_model_predicts_a_second_of_play_within_pixels(data):
+    model = tsmlib.load_pretrained("egocentric", env="tsm/PushT-v0")
+    past = initial_past(torch.from_numpy(data.states[:, 0]), model.past_len, 2)
+    predicted = model.predict(past, torch.from_numpy(data.actions[:, :10]))
+    off = distance(predicted, torch.from_numpy(data.states[:, 1:11]))
+    assert off.median() < 2
 
 
 def test_bad_pairs_are_named():

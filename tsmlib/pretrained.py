@@ -14,6 +14,7 @@ import torch
 import tsmlib.envs
 from tsmlib import zoo
 from tsmlib.envs.physics import Physics
+from tsmlib.envs.pusht_field import GOAL
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.pusht import pusht_task
 from tsmlib.planning.tasks import Task
@@ -97,7 +98,8 @@ def load_pusht(
     """The pairs (start, goal) of PushT: 500 frozen ones for tests, 200 to make choices on.
 
     A goal is what random play came to 25 steps after the start. No pair is solved at the start, in
-    each the T moves by at least 10 px, and goals lie in the field.
+    each the T moves by at least 10 px, and goals lie in the field. Protocol A has one goal, and
+    100 starts of each kind, which are resets of ``gym-pusht``.
 
     Args:
         split: "test", which no choice was made on, or "validation".
@@ -107,9 +109,13 @@ def load_pusht(
     Returns:
         The task.
     """
-    tensors, _ = artifacts.load(TASKS / "PushT.safetensors", kind="task")
+    name = "PushT-A" if protocol == "A" else "PushT"
+    tensors, _ = artifacts.load(TASKS / f"{name}.safetensors", kind="task")
     word = "validation_" if split == "validation" else ""
-    start, goal = tensors[f"{word}start"].numpy(), tensors[f"{word}target"].numpy()
+    start = tensors[f"{word}start"].numpy()
+    goal = np.tile(GOAL, (len(start), 1))
+    if protocol != "A":
+        goal = tensors[f"{word}target"].numpy()
     return pusht_task(start, goal, protocol, env=env)
 
 
