@@ -18,8 +18,9 @@ import torch
 
 import tsmlib
 from reproduction.episodes import random_data
+from reproduction.measures import latent
 from reproduction.runs import env_id
-from tsmlib.evaluation import latent, scoring
+from tsmlib.evaluation import scoring
 from tsmlib.pretrained import PRETRAINED
 from tsmlib.trajectory import Trajectories
 

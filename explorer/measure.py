@@ -33,7 +33,8 @@ from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import rollout
 from tsmlib.models.recurrent import RecurrentTSM
-from tsmlib.planning.execution import Trial, execute, mpc
+from tsmlib.planning.closed_loop import mpc
+from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import cem, reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor
 from tsmlib.planning.search_spaces import LatentActions

@@ -25,7 +25,8 @@ from torch import Tensor
 import tsmlib
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import stepping
-from tsmlib.envs.spaces import environment_id, idle_action, stated_id, within_bounds
+from tsmlib.envs.ids import environment_id, stated_id
+from tsmlib.envs.spaces import idle_action, within_bounds
 from tsmlib.envs.stepping import (
     Stepping,
     UnsupportedEnvironment,

@@ -23,7 +23,8 @@ from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.planning import predictors
 from tsmlib.planning.base import Plan, Predictor, SearchSpace
-from tsmlib.planning.execution import execute, mpc
+from tsmlib.planning.closed_loop import mpc
+from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task, random_torques

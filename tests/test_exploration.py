@@ -250,7 +250,7 @@ def test_disagreement_is_worth_the_bonus_and_one_rollout_has_none() -> None:
     def nothing(states: Tensor, actions: Tensor) -> Tensor:
         return states[..., 0] * 0
 
-    rewarded = exploration._with_bonus(nothing, weight=3.0, scale=torch.tensor([0.5, 0.0]))
+    rewarded = exploration.with_bonus(nothing, weight=3.0, scale=torch.tensor([0.5, 0.0]))
     assert rewarded(states, actions)[:, 0, 0].tolist() == [[0, 6, 0]] * 2  # 3 (2 / 0.5 + 0) / 2
     assert not rewarded(states[0, 0], actions[0]).any()
 
@@ -390,7 +390,7 @@ def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
         made.append((planner, deviation, generator))
         return planner
 
-    monkeypatch.setattr(exploration, "_Perturbed", perturbed)
+    monkeypatch.setattr(exploration, "Perturbed", perturbed)
     explored(*learners(), options=options(rounds=1, noise=0.5))
     ((planner, _, generator),) = made
     searched = torch.Generator().manual_seed(planner.keywords["seed"])

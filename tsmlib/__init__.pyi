@@ -20,9 +20,9 @@ from .models.mixture import Mixture as Mixture
 from .models.recurrent import RecurrentTSM as RecurrentTSM
 from .models.tsm import TSM as TSM
 from .planning.base import Plan as Plan
+from .planning.closed_loop import mpc as mpc
 from .planning.execution import Trial as Trial
 from .planning.execution import execute as execute
-from .planning.execution import mpc as mpc
 from .planning.planners import adam as adam
 from .planning.planners import cem as cem
 from .planning.planners import mppi as mppi

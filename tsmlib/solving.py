@@ -22,7 +22,8 @@ from tqdm.auto import tqdm
 
 from tsmlib.checks import require_count, require_number, require_seed, require_type
 from tsmlib.collection import collect_random
-from tsmlib.envs.spaces import find_spec, said
+from tsmlib.envs.ids import find_spec
+from tsmlib.envs.spaces import said
 from tsmlib.envs.stepping import make
 from tsmlib.exploration.rounds import RoundFiles
 from tsmlib.films import film

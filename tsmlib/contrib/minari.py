@@ -177,7 +177,7 @@ def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
         stated: Any = metadata.get("env_spec")
         env = metadata["dataset_id"]
         if stated is not None:
-            from tsmlib.envs.spaces import stated_id
+            from tsmlib.envs.ids import stated_id
 
             env = stated_id(json.loads(stated))
         about = {

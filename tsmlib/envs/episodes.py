@@ -12,13 +12,8 @@ import gymnasium
 import numpy as np
 
 from tsmlib.checks import require_count
-from tsmlib.envs.spaces import (
-    Description,
-    UnsupportedEnvironment,
-    flat,
-    layers,
-    within_bounds,
-)
+from tsmlib.envs.ids import UnsupportedEnvironment, layers
+from tsmlib.envs.spaces import Description, flat, within_bounds
 from tsmlib.envs.unstable import SimulationUnstable
 
 TRIED = 10  # steps of a copy, before the first episode

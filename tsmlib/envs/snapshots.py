@@ -29,7 +29,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
-from tsmlib.envs.spaces import UnsupportedEnvironment, layers
+from tsmlib.envs.ids import UnsupportedEnvironment, layers
 from tsmlib.envs.stepping import Stepping, canonical, copies
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic, enum.Enum, PurePath)

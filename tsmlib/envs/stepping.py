@@ -19,18 +19,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 
 from tsmlib.checks import require_count
-from tsmlib.envs import spaces
 from tsmlib.envs.episodes import Episodes, Seeds, require_steady, reset_once, step_once
-from tsmlib.envs.spaces import (
+from tsmlib.envs.ids import (
+    HARMLESS,
     UnsupportedEnvironment,
     canonical,
-    describe,
     environment_id,
     find_spec,
-    idle_action,
     layers,
-    said,
 )
+from tsmlib.envs.spaces import describe, idle_action, require_actions, said, state_names
 from tsmlib.envs.spaces import within_bounds as within_bounds
 from tsmlib.envs.unstable import import_mujoco, without_log
 
@@ -119,8 +117,8 @@ def copies(env_id: str, n: int) -> list[gymnasium.Env]:
     try:
         for _ in range(require_count("episodes", n)):
             made.append(make(env_id))
-            spaces.state_names(env_id, made[0].observation_space)
-            spaces.require_actions(env_id, made[0].action_space)
+            state_names(env_id, made[0].observation_space)
+            require_actions(env_id, made[0].action_space)
     except BaseException:
         for env in made:
             env.close()
@@ -240,7 +238,7 @@ class Vectorised(Episodes):
             env_id = common_id([one, *others])
             if makers:
                 words = [type(layer).__name__ for layer in wrappers]
-                env_id += "".join(f"+{word}" for word in words if word not in spaces.HARMLESS)
+                env_id += "".join(f"+{word}" for word in words if word not in HARMLESS)
             for layer in (env, one):
                 require_steady(env_id, layer)
             robot = describe(env_id, one, env.single_observation_space, env.single_action_space)

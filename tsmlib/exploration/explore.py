@@ -13,13 +13,13 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm.auto import tqdm
 
 from tsmlib.checks import (
@@ -27,17 +27,19 @@ from tsmlib.checks import (
     require_seed,
     require_type,
 )
+from tsmlib.exploration.curiosity import Perturbed, with_bonus
 from tsmlib.exploration.options import Exploration, ExplorationOptions
 from tsmlib.exploration.rounds import RoundFiles, Trainable
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics, require_robot
-from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
-from tsmlib.planning.execution import Trial, mpc, without_unstable
+from tsmlib.planning.base import Judge, Plan, Planner, SearchSpace
+from tsmlib.planning.closed_loop import mpc
+from tsmlib.planning.execution import Trial, without_unstable
 from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import expected_predictor, model_predictor
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
 from tsmlib.planning.tasks import Task
-from tsmlib.rewards import Reward, fingerprint, rewarded
+from tsmlib.rewards import fingerprint
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, PathLike, encode_nonfinite, writer_lock
 from tsmlib.training.callbacks import Callback, Progress
@@ -231,7 +233,7 @@ def _collected(
     began, aim = _now(), task
     if options.bonus:
         scale = torch.from_numpy(like.flat_states.std(0))
-        bonus = partial(_with_bonus, weight=options.bonus, scale=scale)
+        bonus = partial(with_bonus, weight=options.bonus, scale=scale)
         aim = replace(task, reward_for=lambda target: bonus(task.reward_for(target)))
     space: SearchSpace
     if prior is not None:
@@ -251,7 +253,7 @@ def _collected(
     )
     if options.noise:  # of no search
         generator = torch.Generator().manual_seed(-1 - draw)
-        planner = _Perturbed(planner, options.noise, generator)
+        planner = Perturbed(planner, options.noise, generator)
     judge: Judge = model_predictor
     if options.bonus:
         judge = partial(model_predictor, samples=options.samples)
@@ -343,39 +345,3 @@ def _means(task: Task, trial: Trial | None, *, bonus: bool) -> dict[str, float]:
     if not distance.isnan().any():
         values["final_distance"] = distance
     return {k: math.nan if trial is None else float(v.mean()) for k, v in values.items()}
-
-
-def _with_bonus(reward: Reward, *, weight: float, scale: Tensor) -> Reward:
-    """``reward`` plus ``weight`` times the disagreement of sampled states (S, C, B, T, dx); one
-    rollout has none.
-
-    scale (dx,): the data's standard deviation, in which disagreement is measured where the data
-    move.
-    """
-
-    def total(states: Tensor, actions: Tensor) -> Tensor:
-        plain = rewarded(reward, states, actions)
-        if states.ndim < 5:
-            return plain
-        spread = states.std(0, unbiased=False, keepdim=True) / scale.where(scale > 0, torch.inf)
-        return plain + weight * spread.mean(-1)
-
-    return total
-
-
-@dataclass
-class _Perturbed:
-    """A planner whose plans are disturbed before they are executed."""
-
-    planner: Planner
-    deviation: float
-    generator: torch.Generator
-
-    def __call__(
-        self, predict: Predictor, reward: Reward, space: SearchSpace, start: Tensor | int, /
-    ) -> Plan:
-        plan = self.planner(predict, reward, space, start)
-        noise = space.noise(1, len(plan.parameters), self.generator)[0]
-        parameters = plan.parameters + self.deviation * space.scale * noise
-        with torch.no_grad():
-            return replace(plan, parameters=parameters, actions=space.decode(parameters[None])[0])

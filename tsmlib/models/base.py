@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.checks import LARGEST, as_tensor, require_count, require_seed
+from tsmlib.checks import as_tensor
 from tsmlib.models.features import Features
 from tsmlib.sampling import Noise, NoNoise, by_generator
 from tsmlib.storage.files import Json
-from tsmlib.trajectory import Robot, Segment, Window, initial_past
+from tsmlib.trajectory import Robot, Segment, Window
 
 Step = Callable[[Tensor], Tensor]  # an action (B, du) -> the state (B, dx) that it leads to
 Numbers = Tensor | np.ndarray | list  # of any number type
@@ -204,62 +204,13 @@ def rollout(
             past that is too short, or a model that was never fitted.
     """
     dynamics, predicted = as_dynamics(model), []
-    past, actions, home = _inputs(model, past, actions)
+    past, actions, home = inputs(model, past, actions)
     for segment_actions in actions.split(dynamics.segment_len, dim=1):
         past = past.last(dynamics.past_len)
         states = predict_segment(model, past, segment_actions, generator=generator)
         predicted.append(states)
         past = past.then(Segment(states, segment_actions))
     return torch.cat(predicted, dim=1).to(home)
-
-
-@torch.no_grad()
-def predict(
-    model: Model,
-    past: Segment | tuple[Numbers, Numbers] | Numbers,
-    actions: Numbers,
-    samples: int | None = None,
-    *,
-    seed: int = 0,
-) -> Tensor:
-    """Predict the states that follow ``past`` under ``actions``.
-
-    Args:
-        past: states (B, L, dx), physical units, and the actions (B, L, du) that led to them, as a
-            Segment or a pair; or states (B, dx) in which episodes begin.
-        actions: (B, T, du) in [-1, 1], for any number of steps. Without B, and the past as well,
-            they are of one episode.
-        samples: None for the mode; a number S for as many draws.
-        seed: of the draws.
-
-    Returns:
-        States (B, T, dx) or samples (S, B, T, dx), physical units, without gradients; without B
-        where the actions have none. ``tsmlib.rollout`` has gradients.
-
-    Raises:
-        TypeError: what is given holds no numbers.
-        ValueError: shapes that do not fit, values that are not finite, or a past that is too short.
-    """
-    moves = _array("actions", actions)
-    one = moves.ndim == 2
-    if isinstance(past, tuple):
-        given = tuple(_array("past", part) for part in past)
-        seen = tuple(part[None] for part in given) if one else given
-    else:
-        dx = getattr(model, "state_dim", "dx")
-        start = as_tensor("past", past, (dx,) if one else ("B", dx))
-        du = moves.shape[-1] if moves.ndim else 1
-        seen = initial_past(start[None] if one else start, as_dynamics(model).past_len, du)
-    seen, moves, home = _inputs(model, seen, moves[None] if one else moves)
-    if samples is None:
-        states = rollout(model, seen, moves).to(home)
-    else:
-        copies = require_count("samples", samples, most=LARGEST)
-        repeated = Segment(*(part.repeat(copies, 1, 1) for part in seen))
-        draw = torch.Generator().manual_seed(require_seed("seed", seed))
-        states = rollout(model, repeated, moves.repeat(copies, 1, 1), generator=draw).to(home)
-        states = states.unflatten(0, (copies, -1))  # (S, B, T, dx)
-    return states.squeeze(-3) if one else states
 
 
 def stepper(model: Model, past: Segment, *, generator: Noise | None = None) -> Step:
@@ -326,7 +277,7 @@ def require_robot(model: object, robot: Robot, what: str, *, but: tuple[str, ...
             )
 
 
-def _inputs(
+def inputs(
     model: Model, past: Segment | tuple[Numbers, ...], actions: Numbers
 ) -> tuple[Segment, Tensor, torch.device]:
     """Past and actions as the model's own kind of tensors; and the device that actions are on."""
@@ -368,11 +319,3 @@ def _past_len(model: DynamicsModel, past: Segment, name: str) -> int:
             f"tsmlib.trajectory.initial_past(states, {needed}, action_dim)"
         )
     return needed
-
-
-def _array(name: str, value: Numbers) -> Tensor | np.ndarray:
-    """A tensor as it is, all else as an array; TypeError for what is uneven."""
-    try:
-        return value if isinstance(value, Tensor) else np.asarray(value)
-    except ValueError as error:
-        raise TypeError(f"{name} is uneven; expected an array of numbers: {error}") from error

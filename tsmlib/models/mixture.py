@@ -10,16 +10,9 @@ from typing import NoReturn, TypeVar
 import torch
 from torch import Tensor, nn
 
-from tsmlib.models.base import (
-    EnsembleModel,
-    Model,
-    Step,
-    as_dynamics,
-    predict,
-    rollout,
-    stepper,
-)
+from tsmlib.models.base import EnsembleModel, Model, Step, as_dynamics, rollout, stepper
 from tsmlib.models.features import Features
+from tsmlib.models.predict import predict
 from tsmlib.sampling import Noise, SeparateNoise, SharedNoise, draw_members
 from tsmlib.trajectory import Robot, Segment
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Self, cast
 
 from tsmlib.checks import require_counts, require_type
-from tsmlib.models.base import predict
 from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.features import Features
+from tsmlib.models.predict import predict
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Robot, Trajectories
 

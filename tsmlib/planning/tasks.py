@@ -29,7 +29,7 @@ from tsmlib.checks import (
 )
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import hole, room
-from tsmlib.envs.spaces import find_spec
+from tsmlib.envs.ids import find_spec
 from tsmlib.envs.spec import EnvSpec, is_arm
 from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
 from tsmlib.rewards import Reward, require_reward, reward_of, rewarded
