@@ -13,15 +13,15 @@ import tsmlib
 from reproduction.episodes import load_data, load_model, load_prior
 from reproduction.measures import actions, gradients
 from reproduction.measures.exploitation import shares, worst
+from reproduction.measures.planning import iterations_to, random_torques, sampled_starts
 from reproduction.measures.statistics import two_sample_auc
 from reproduction.runs import Run, env_id
 from reproduction.tables import Row, place
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial
-from tsmlib.planning.planners import iterations_to, sampled_starts
 from tsmlib.planning.predictors import JUDGING, expected_predictor, fresh_predictor
-from tsmlib.planning.tasks import Task, random_torques
+from tsmlib.planning.tasks import Task
 from tsmlib.storage import artifacts
 
 KEPT = 4  # samples of the predicted states that a file holds

@@ -9,10 +9,11 @@ from functools import partial
 import torch
 
 import tsmlib
+from reproduction.measures.planning import random_torques
 from reproduction.runs import Run
 from reproduction.tables import Row
 from tsmlib import rewards, zoo
-from tsmlib.planning.tasks import Task, random_torques
+from tsmlib.planning.tasks import Task
 from tsmlib.trajectory import Trajectories
 
 MODELS = {"rtsm": {"hidden": 96}, "onestep": {}, "lstm": {"hidden": 96}, "ensemble+mse": {}}

@@ -16,6 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from reproduction.measures.planning import random_torques
 from tsmlib import rewards
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import imperfect
@@ -27,7 +28,7 @@ from tsmlib.planning.closed_loop import mpc
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import adam, cem, mppi
 from tsmlib.planning.search_spaces import DirectActions, LatentActions
-from tsmlib.planning.tasks import Task, random_torques
+from tsmlib.planning.tasks import Task
 from tsmlib.pretrained import TASK_SEED, draw_task, load_task
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from reproduction.measures.actions import novelty, roughness, spectrum, within
+from reproduction.measures.actions import novelty, roughness, within
 from reproduction.measures.exploitation import shares, violations, worst
 from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import BLOCK_DECAY, closest_gap, fingertip
@@ -115,18 +115,6 @@ def test_states_without_an_object_or_a_number_are_refused() -> None:
 
 
 # Actions ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("steps", [49, 50])
-def test_the_power_density_integrates_to_the_mean_square_without_the_constant_part(
-    steps: int,
-) -> None:
-    torques = torch.randn(3, steps, 2, generator=torch.Generator().manual_seed(0)).double()
-    frequency, density = spectrum(torques)
-    varying = torques - torques.mean(1, keepdim=True)
-    assert density.sum() * (frequency[1] - frequency[0]) == pytest.approx(
-        varying.square().mean().item()
-    )
 
 
 def test_the_roughness_of_waves_is_known() -> None:

@@ -198,16 +198,6 @@ def test_intervals_of_honest_directions_hold_the_truth_as_often_as_they_should()
     assert found.spread.median() == pytest.approx(math.degrees(0.4), rel=0.05)
 
 
-def test_codes_on_a_walk_begin_and_end_where_they_should_and_keep_their_size() -> None:
-    first, second = torch.randn(2, 5000, 8, generator=rng())
-    codes = latent.interpolate(first, second, 5)
-    assert torch.equal(codes[0], first)
-    assert torch.equal(codes[-1], second)
-    torch.testing.assert_close(codes.square().mean((1, 2)), torch.ones(5), atol=0.03, rtol=0)
-    with pytest.raises(ValueError, match="at least 2"):
-        latent.interpolate(first, second, 1)
-
-
 def test_the_directions_that_move_an_outcome_are_found() -> None:
     codes = torch.randn(500, 6, generator=rng())
     outcome = torch.stack([3 * codes[:, 2], codes[:, 4]], 1) + 0.01 * torch.randn(

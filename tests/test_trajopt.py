@@ -16,6 +16,7 @@ from torch import Tensor
 from untrained import in_units
 
 import tsmlib.envs  # noqa: F401 - registers the environments
+from reproduction.measures.planning import iterations_to, sampled_starts
 from tsmlib import rewards
 from tsmlib.collection import collect_random, smooth_torques
 from tsmlib.models.action_prior import ActionPrior
@@ -27,10 +28,8 @@ from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import (
     adam,
     cem,
-    iterations_to,
     mppi,
     reevaluate,
-    sampled_starts,
 )
 from tsmlib.planning.predictors import (
     EnsemblePredictor,

@@ -11,8 +11,8 @@ import torch
 from wrong_calls import COUNT_OR_ZERO, NOT_NEGATIVE, OPTIONAL, POSITIVE, Call, Made, call, finding
 
 import tsmlib
+from reproduction.measures.planning import sampled_starts
 from tsmlib import rewards
-from tsmlib.planning.planners import sampled_starts
 from tsmlib.policies.learning import episodes_from, learn_policy
 
 B, T, ARM = 2, 10, "tsm/Reacher-v0"

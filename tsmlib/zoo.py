@@ -292,7 +292,6 @@ _MODELS = (
     replace(_H20, stages=(_LONG, _PAPER[1])),
 )
 ZOO = {spec.word: spec for spec in _MODELS}
-PAPERS, OURS = "tsm", "rtsm"  # the model of the paper, and the one that goes beyond it
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method
     "ppo": Look("PPO", "#999933"),
     "trpo": Look("TRPO", "#7B4B2A"),

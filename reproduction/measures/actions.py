@@ -4,7 +4,6 @@
 Letters in shapes: B plans or episodes, T steps, F frequencies, q traits.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,15 +22,6 @@ def traits(actions: Tensor, *, shape: bool = False) -> Tensor:
         actions = actions / actions.square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-9)
     found = roughness(actions)
     return torch.stack([found[name] for name in TRAITS], dim=1).double()
-
-
-def spectrum(actions: Tensor, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (F,) in Hz and the mean power density (F,) of torques (B, T, du), per Hz; it
-    integrates to the mean square torque (without the constant part, which is left out).
-    """
-    frequency, power = _power(actions, dt)
-    density = power.mean(0) * (dt / (actions.shape[1] * actions.shape[2]))
-    return frequency.numpy()[1:], density.numpy()[1:]
 
 
 def _power(actions: Tensor, dt: float) -> tuple[Tensor, Tensor]:

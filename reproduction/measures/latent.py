@@ -111,21 +111,6 @@ def root_mean(squares: Tensor, where: Tensor | None = None) -> float:
     return math.sqrt(by_step.mean()) if some.any() else math.nan
 
 
-def interpolate(first: Tensor, second: Tensor, n: int) -> Tensor:
-    """n codes from ``first`` to ``second`` (..., dz) along cos(a) first + sin(a) second: (n, ...,
-    dz).
-
-    If both are drawn from N(0, I), so is every code in between, which is not true of a straight
-    line.
-    """
-    if n < 2:
-        raise ValueError(f"n is {n}; a walk from one code to another has at least 2 codes")
-    angle = torch.linspace(0, math.pi / 2, n).reshape(n, *[1] * first.ndim)
-    codes = angle.cos() * first + angle.sin() * second
-    codes[0], codes[-1] = first, second  # exactly
-    return codes
-
-
 def directions(codes: Tensor, outcome: Tensor) -> tuple[Tensor, float]:
     """The directions (2, dz) of codes (N, dz) along which an outcome (N, 2) changes most,
     orthonormal, most first.

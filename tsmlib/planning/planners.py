@@ -253,43 +253,6 @@ def _require_gradient(states: Tensor, returns: Tensor) -> None:
 
 
 @torch.no_grad()
-def sampled_starts(
-    predict: Predictor,
-    reward: Reward,
-    space: SearchSpace,
-    n_targets: int,
-    *,
-    candidates: int = 256,
-    keep: int = 4,
-    seed: int = 0,
-) -> Tensor:
-    """The best of random candidates, to begin ``adam`` at.
-
-    Where nothing is pushed before contact there is no gradient either, so a start must touch.
-
-    Args:
-        predict: of actions (C, B, T, du) the states (S, C, B, T, dx).
-        reward: of states and actions, one number per step.
-        space: what is searched, and what draws the candidates.
-        n_targets: B.
-        candidates: drawn for each target.
-        keep: how many of them are kept.
-        seed: of the candidates, 0 or above.
-
-    Returns:
-        (keep, B, *shape), the best first.
-    """
-    candidates = require_count("candidates", candidates, most=MOST)
-    if require_count("keep", keep, most=MOST) > candidates:
-        raise ValueError(f"keep is {keep}; expected at most the {candidates} candidates")
-    search = Search(predict, reward, space, require_count("n_targets", n_targets, most=MOST))
-    generator = torch.Generator().manual_seed(require_seed("seed", seed))
-    parameters = space.scale * space.noise(candidates, n_targets, generator)
-    returns = search.returns_of(parameters)
-    return best_of(parameters, returns.where(torch.isfinite(returns), -torch.inf), keep)
-
-
-@torch.no_grad()
 def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
     """The same plan with its return and states from fresh samples, which had no part in the choice.
 
@@ -307,17 +270,3 @@ def reevaluate(plan: Plan, predict: Predictor, reward: Reward) -> Plan:
     states = predicted(predict, plan.actions[None])
     predicted_return = expected_return(states, plan.actions[None], reward)[0]
     return replace(plan, states=states[:, 0], predicted_return=predicted_return)
-
-
-def iterations_to(curve: Tensor, share: float = 0.95) -> Tensor:
-    """Iterations after which a planner has gained most of all that it gains (claim C15).
-
-    Args:
-        curve: (iterations + 1, B), of a plan; it begins with its first finite value.
-        share: of the gain.
-
-    Returns:
-        (B,); 0 for a curve that gains nothing.
-    """
-    first = curve.gather(0, curve.isfinite().int().argmax(0, keepdim=True))[0]
-    return (curve >= first + share * (curve[-1] - first)).int().argmax(0)

@@ -27,18 +27,15 @@ from tsmlib.checks import (
     require_seed,
     require_type,
 )
-from tsmlib.collection import smooth_torques
 from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.ids import find_spec
 from tsmlib.envs.spec import EnvSpec, is_arm
 from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
 from tsmlib.rewards import Reward, require_reward, reward_of, rewarded
-from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Robot, Segment, initial_past
 
 HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
-RANDOM_TORQUES = 1  # first part of the key of their random numbers, which no data are drawn from
 
 # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
 Success = Callable[[Tensor], Tensor]
@@ -449,17 +446,3 @@ def require_reachable(env: str, start: np.ndarray, target: Tensor, position: sli
         raise ValueError(
             f"target {i} at ({x:.3f}, {y:.3f}) m is out of reach: the {what} gets as far as {limit}"
         )
-
-
-def random_torques(task: Task, *, seed: int = 0) -> Tensor:
-    """Torques like the arm's training data's.
-
-    Args:
-        task: of an arm.
-        seed: of the torques.
-
-    Returns:
-        (B, T, du).
-    """
-    generator = generator_of(RANDOM_TORQUES, seed)
-    return smooth_torques(len(task), task.horizon, generator=generator, action_dim=task.action_dim)
