@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass, fields
 
@@ -109,3 +110,13 @@ def columns_of(angles: object, names: tuple[str, ...]) -> tuple[int, ...]:
             f"{', '.join(names):.200}"
         )
     return tuple(sorted(column for column in found if column is not None))
+
+
+def warn_of_other_env(one: Robot | None, other: Robot, what: str) -> None:
+    """Say aloud that two robots whose states have the same names are of two environments."""
+    if one is not None and one.env != other.env:
+        warnings.warn(
+            f"{what} are of two environments, {one.env} and {other.env}, whose states have the "
+            "same names; predictions hold as far as the two are alike",
+            stacklevel=4,
+        )

@@ -17,7 +17,7 @@ from tsmlib.checks import MOST, require_count, require_seed, require_type
 from tsmlib.evaluation.scoring import LEVELS, Fitted, coverage, fit, measure
 from tsmlib.models.base import Model, as_dynamics, require_robot, rollout
 from tsmlib.models.features import Features
-from tsmlib.planning.tasks import warn_of_other_env
+from tsmlib.robot import warn_of_other_env
 from tsmlib.sampling import generator_of
 from tsmlib.trajectory import Segment, Trajectories
 

@@ -5,8 +5,7 @@ Letters in shapes: B starts, T horizon, dx, du, dg size of state, action and tar
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
@@ -27,15 +26,23 @@ from tsmlib.checks import (
     require_seed,
     require_type,
 )
-from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.ids import find_spec
 from tsmlib.envs.spec import EnvSpec, is_arm
-from tsmlib.envs.stepping import Arms, UnsupportedEnvironment, make_simulation
+from tsmlib.envs.stepping import Arms, make_simulation
+from tsmlib.planning.starts import (
+    chosen_indices,
+    require_reachable,
+    require_repeated,
+    require_same_starts,
+    require_within_limit,
+)
 from tsmlib.rewards import Reward, require_reward, reward_of, rewarded
+from tsmlib.robot import warn_of_other_env
 from tsmlib.trajectory import Robot, Segment, initial_past
 
 HORIZON = {"reach": 50, "push": 100}  # steps of 0.02 s
 TOLERANCE = {"reach": 0.03, "push": 0.05}  # metres: a trial that ends within it is a success
+
 
 # states (B, T + 1, dx) -> (B,): bool, or a distance to be within the tolerance
 Success = Callable[[Tensor], Tensor]
@@ -139,7 +146,7 @@ class Task:
         require_reward(scored)
         with closing(episodes) as begun:
             start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
-        _require_repeated(env, begun.names, start, again)
+        require_repeated(env, begun.names, start, again)
         task = cls(
             name=name or begun.id,
             env=env if isinstance(begun, Arms) else begun.id,
@@ -213,14 +220,8 @@ class Task:
         }
         for field, value in checked.items():
             object.__setattr__(self, field, value)
-        base = self.env.partition("(")[0]
-        spec = gymnasium.registry.get(base) if self.seeds else None  # an arm goes on
-        if spec and (limit := spec.max_episode_steps) and self.horizon > limit:
-            raise ValueError(
-                f"horizon is {self.horizon}, but {self.env} ends episodes after {limit} steps; "
-                f"give horizon={limit} or less, or register a longer one: gymnasium.register(id, "
-                f"..., max_episode_steps={self.horizon})"
-            )
+        if self.seeds:  # an arm goes on
+            require_within_limit(self.env, self.horizon)
         if self.seeds and len(self.seeds) != len(self):
             raise ValueError(
                 f"{len(self.seeds)} seeds for {len(self)} starts of {self.env}; expected one each"
@@ -344,20 +345,7 @@ class Task:
         Raises:
             ValueError: there is none, or not as many.
         """
-        require_type("chosen", chosen, (int, np.integer, Iterable), "a number or indices")
-        if isinstance(chosen, int | np.integer):
-            count = require_count("the number of targets", chosen)
-            if count > len(self):
-                raise ValueError(
-                    f"{chosen} targets of {self.env} asked for; choose a number from 1 to "
-                    f"{len(self)}"
-                )
-            chosen = range(count)
-        indices = [require_count("an index of a target", i, least=0) for i in np.atleast_1d(chosen)]
-        if not indices or max(indices) >= len(self):
-            raise ValueError(
-                f"targets {indices} of {self.env} asked for; choose some from 0 to {len(self) - 1}"
-            )
+        indices = chosen_indices(chosen, len(self), self.env)
         seeds = tuple(self.seeds[i] for i in indices) if self.seeds else ()
         return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
 
@@ -373,31 +361,8 @@ class Task:
 
     def require_start(self, states: Tensor, what: str) -> None:
         """ValueError unless ``states`` (B, dx) are this task's starts, up to rounding."""
-        start = torch.from_numpy(self.start)
-        if states.shape != start.shape:
-            raise ValueError(
-                f"{what} begins in states {tuple(states.shape)}, task {self.name!r} in "
-                f"{tuple(start.shape)}; expected the same starts"
-            )
-        off = (states - start).abs()
-        rounding = 1e-5 * torch.maximum(start.abs(), states.abs()).amax(0)
-        if (off > rounding).any():
-            i, d = (off > rounding).nonzero()[0].tolist()
-            raise ValueError(
-                f"{what} begins with {float(states[i, d]):.6g} in dimension {d} of target {i}, "
-                f"task {self.name!r} of {self.env} with {float(start[i, d]):.6g}; expected the "
-                "same starts"
-            )
-
-
-def warn_of_other_env(one: Robot | None, other: Robot, what: str) -> None:
-    """Say aloud that two robots whose states have the same names are of two environments."""
-    if one is not None and one.env != other.env:
-        warnings.warn(
-            f"{what} are of two environments, {one.env} and {other.env}, whose states have the "
-            "same names; predictions hold as far as the two are alike",
-            stacklevel=4,
-        )
+        name = f"task {self.name!r} of {self.env}"
+        require_same_starts(states, torch.from_numpy(self.start), what, name)
 
 
 @cache
@@ -405,44 +370,3 @@ def _robot(env: str, made_by: object) -> Robot:
     """The robot of an id, until something else is registered under it."""
     with closing(make_simulation(env, 1)) as run:
         return Robot(run.id, run.dt, run.names, run.units, run.angles, run.action_dim)
-
-
-def _require_repeated(env: str, names: Sequence[str], start: np.ndarray, again: np.ndarray) -> None:
-    """UnsupportedEnvironment unless resets of the same seeds gave the same starts."""
-    differs = np.argwhere(start != again)
-    if len(differs):
-        i, d = differs[0]
-        raise UnsupportedEnvironment(
-            f"{env} does not repeat itself: the same seed gave {names[d]} = {start[i, d]:.6g} and "
-            f"then {again[i, d]:.6g} at start {i}. A task needs starts that come back: seed all "
-            "random numbers by reset(seed=...), and leave out wrappers that normalise by what was "
-            "seen before, such as gymnasium.wrappers.NormalizeObservation"
-        )
-
-
-def require_reachable(env: str, start: np.ndarray, target: Tensor, position: slice) -> None:
-    """ValueError unless there is one target (B, 2) per start, in metres, where the arm gets."""
-    if position.stop > start.shape[1]:
-        raise ValueError(f"there is nothing to push in {env}; its task is 'reach'")
-    if target.shape != (len(start), 2):
-        raise ValueError(
-            f"target is {tuple(target.shape)}; expected ({len(start)}, 2), one per start"
-        )
-    physics = EnvSpec.parse(env).physics
-    if position == rewards.TIP:
-        what, outer, inner = "fingertip", sum(physics.link_lengths), hole(physics)
-        away = target.norm(dim=1)
-        within = (away <= outer + 1e-6) & (away >= inner - 1e-6)
-        limit = f"{outer:g} m from the shoulder"
-        if inner:
-            limit += f" and not into the hole around it, expected {inner:g} to {outer:g} m"
-    else:
-        what, outer = "object", room(physics)
-        within = target.abs().amax(1) <= outer + 1e-6
-        limit = f"{outer:g} m along x and y, where the walls are"
-    if not within.all():
-        i = int((~within).nonzero()[0])
-        x, y = target[i].tolist()
-        raise ValueError(
-            f"target {i} at ({x:.3f}, {y:.3f}) m is out of reach: the {what} gets as far as {limit}"
-        )
