@@ -37,6 +37,31 @@ def episodes(name: str, values: Arrays) -> list[np.ndarray]:
     return parts
 
 
+def pairs(
+    states: Arrays, actions: Arrays, lengths: Sequence[int] | None
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """States (T + 1, dx) and actions (T, du) of each episode, cut to ``lengths``."""
+    x, u = episodes("states", states), episodes("actions", actions)
+    if len(x) != len(u):
+        raise TrajectoryError(f"{len(x)} episodes of states, but {len(u)} of actions")
+    if lengths is not None:
+        ends = one_each("lengths", lengths, len(u), np.integer)
+        if any(not 1 <= n <= len(part) for n, part in zip(ends, u, strict=True)):
+            raise TrajectoryError(
+                f"lengths is {lengths!r:.80}; expected at least 1, and no more than the "
+                f"{max(map(len, u))} steps of the arrays"
+            )
+        x = [part[: n + 1] for n, part in zip(ends, x, strict=True)]
+        u = [part[:n] for n, part in zip(ends, u, strict=True)]
+    for i, (a, b) in enumerate(zip(x, u, strict=True)):
+        if len(a) != len(b) + 1 or not len(b):
+            raise TrajectoryError(
+                f"states {a.shape} and actions {b.shape} of episode {i} do not fit: expected "
+                "(T + 1, dx) and (T, du), one state more than actions and at least one action"
+            )
+    return x, u
+
+
 def _array(tensor: Tensor) -> np.ndarray:
     whole = tensor.detach().cpu().to_dense()
     return (whole.float() if whole.dtype == torch.bfloat16 else whole).numpy()

@@ -17,11 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from tsmlib import casting
 from tsmlib.casting import Arrays
@@ -37,11 +35,11 @@ from tsmlib.segments import initial_past as initial_past
 from tsmlib.segments import real_steps as real_steps
 from tsmlib.segments import states_before as states_before
 from tsmlib.segments import window_at as window_at
-from tsmlib.segments import window_counts
+from tsmlib.windows import Windows
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Trajectories(FromLogs):
+class Trajectories(FromLogs, Windows):
     """Episodes of one robot: cast and checked once, and kept without padding.
 
     ``states`` (N, T + 1, dx) and ``actions`` (N, T, du) are there where all episodes have one
@@ -97,24 +95,7 @@ class Trajectories(FromLogs):
         jumps: bool = False,
         unwrap: bool = False,
     ) -> None:
-        x, u = casting.episodes("states", states), casting.episodes("actions", actions)
-        if len(x) != len(u):
-            raise TrajectoryError(f"{len(x)} episodes of states, but {len(u)} of actions")
-        if lengths is not None:
-            ends = casting.one_each("lengths", lengths, len(u), np.integer)
-            if any(not 1 <= n <= len(part) for n, part in zip(ends, u, strict=True)):
-                raise TrajectoryError(
-                    f"lengths is {lengths!r:.80}; expected at least 1, and no more than the "
-                    f"{max(map(len, u))} steps of the arrays"
-                )
-            x = [part[: n + 1] for n, part in zip(ends, x, strict=True)]
-            u = [part[:n] for n, part in zip(ends, u, strict=True)]
-        for i, (a, b) in enumerate(zip(x, u, strict=True)):
-            if len(a) != len(b) + 1 or not len(b):
-                raise TrajectoryError(
-                    f"states {a.shape} and actions {b.shape} of episode {i} do not fit: expected "
-                    "(T + 1, dx) and (T, du), one state more than actions and at least one action"
-                )
+        x, u = casting.pairs(states, actions, lengths)
         dx, du = x[0].shape[1], u[0].shape[1]
         names = [f"x{d}" for d in range(dx)] if names is None else names
         units = [""] * dx if units is None else units
@@ -138,6 +119,19 @@ class Trajectories(FromLogs):
         casting.require_bounds(self.flat_actions, env)
         if not jumps:
             casting.require_no_jumps(self.increments(), self.steps, robot)
+
+    @classmethod
+    def ragged(
+        cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], **robot: Any
+    ) -> Trajectories:
+        """Episodes of several lengths, (T_i + 1, dx) and (T_i, du), as the constructor takes them.
+
+        Args:
+            states: an array for each episode.
+            actions: an array for each episode.
+            robot: env, dt and what else the constructor takes.
+        """
+        return cls(list(states), list(actions), **robot)
 
     @classmethod
     def from_rows(
@@ -205,9 +199,6 @@ class Trajectories(FromLogs):
         episodes = f"{len(self)} episodes, {steps} steps"
         return f"Trajectories({self.env!r}, {episodes}, {len(self.names)} states)"
 
-    def __len__(self) -> int:
-        return len(self.lengths)
-
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Trajectories):
             return NotImplemented
@@ -218,29 +209,6 @@ class Trajectories(FromLogs):
         )
 
     __hash__ = None  # type: ignore[assignment] # arrays can be changed
-
-    @property
-    def horizon(self) -> int:
-        """Steps of the longest episode, T."""
-        return max(self.lengths)
-
-    @property
-    def steps(self) -> np.ndarray:
-        """Steps of each episode (N,)."""
-        return np.array(self.lengths, np.int64)
-
-    @property
-    def offsets(self) -> np.ndarray:
-        """Row of ``flat_states`` at which each episode begins (N,)."""
-        return np.cumsum(self.steps + 1) - self.steps - 1
-
-    def episode(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """States (T_i + 1, dx) and actions (T_i, du) of episode ``i``."""
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"there is no episode {i}; expected one of the {len(self)} from 0 on")
-        i, row = i % len(self), int(self.offsets[i])
-        steps = self.lengths[i]
-        return self.flat_states[row : row + steps + 1], self.flat_actions[row - i : row - i + steps]
 
     def take(self, index: slice | Sequence[int] | np.ndarray) -> Trajectories:
         """Some of the episodes: a slice, their numbers, or one bool for each."""
@@ -332,83 +300,7 @@ class Trajectories(FromLogs):
         actions = self.flat_actions[first + np.minimum(at[:-1], ends - 1)]
         return states, np.where((at[:-1] < ends)[..., None], actions, np.float32(0))
 
-    def segment(self, past_len: int = 0) -> Segment:
-        """All episodes, of one length, as one segment (N, L + T, .) that begins at rest.
-
-        Column past_len + t holds u_t and x_{t+1}.
-        """
-        self.require_equal_lengths("data.segment(...)")
-        every = torch.arange(len(self))
-        window = self.windows(every, torch.zeros_like(every), past_len, self.horizon)
-        return window.past.then(window.future)
-
     def increments(self) -> np.ndarray:
         """x_{t+1} - x_t of all steps (sum of T_i, dx), in float64."""
         steps = np.diff(self.flat_states.astype(np.float64), axis=0)
         return np.delete(steps, self.offsets[1:] - 1, axis=0)
-
-    def tensors(self) -> Episodes:
-        """The episodes as tensors, which share the memory of the arrays."""
-        arrays = (self.flat_states, self.flat_actions, self.steps)
-        return Episodes(*(torch.from_numpy(array) for array in arrays))
-
-    def windows(self, episodes: Tensor, starts: Tensor, past_len: int, future_len: int) -> Window:
-        """One window per pair of an episode and a start.
-
-        Args:
-            episodes: (B,) numbers of episodes.
-            starts: (B,) steps t; the past ends with x_t, and is at rest before the episode.
-            past_len: L, steps of the past.
-            future_len: K, steps of the future, u_t to u_{t+K-1}; they end within the episode.
-
-        Returns:
-            The past (B, L, .) and the future (B, K, .).
-        """
-        for name, length in (("past_len", past_len), ("future_len", future_len)):
-            require_count(name, length, least=0)
-        episodes, starts = _indices("episodes", episodes), _indices("starts", starts)
-        if not bool(((episodes >= 0) & (episodes < len(self))).all()):
-            raise TrajectoryError(f"episodes are {episodes!s:.80}; expected 0 to {len(self) - 1}")
-        lengths = torch.from_numpy(self.steps)[episodes]
-        if not bool(((starts >= 0) & (starts + future_len <= lengths)).all()):
-            raise TrajectoryError(
-                f"windows of {future_len} steps from steps {starts.tolist()!s:.80} leave their "
-                f"episodes of {lengths.tolist()!s:.80} steps; expected them to end within"
-            )
-        return self.tensors().window(episodes, starts, past_len, future_len)
-
-    def past(self, episode: int, past_len: int) -> Segment:
-        """The end of an episode, for a plan that goes on from there.
-
-        Args:
-            episode: its number.
-            past_len: L, as many steps as the model looks back: ``model.past_len``.
-
-        Returns:
-            States (1, L, dx) and actions (1, L, du), at rest before the episode.
-        """
-        steps = len(self.episode(episode)[1])
-        at, end = torch.tensor([episode % len(self)]), torch.tensor([steps])
-        return self.windows(at, end, require_count("past_len", past_len), 0).past
-
-    def window_counts(self, future_len: int, what: str) -> np.ndarray:
-        """Windows of ``future_len`` steps in each episode (N,); a warning counts those left out."""
-        return window_counts(
-            torch.from_numpy(self.steps), future_len, f"{what} of {self.env}"
-        ).numpy()
-
-    def require_equal_lengths(self, purpose: str) -> None:
-        """TrajectoryError where episodes differ in length, for a ``purpose`` that needs it."""
-        if len(set(self.lengths)) > 1:
-            raise TrajectoryError(
-                f"{purpose} needs episodes of equal length; those of {self.env} have "
-                f"{min(self.lengths)} to {self.horizon} steps. data.cut(steps) takes the beginning "
-                "of those that are long enough, data.episode(i) gives one, data.padded() pads them"
-            )
-
-
-def _indices(name: str, values: Tensor) -> Tensor:
-    indices = torch.as_tensor(values)
-    if indices.ndim != 1 or indices.dtype.is_floating_point or indices.dtype.is_complex:
-        raise TrajectoryError(f"{name} are {values!s:.80}; expected whole numbers (B,)")
-    return indices.long()

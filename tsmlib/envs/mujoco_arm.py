@@ -334,14 +334,12 @@ class MujocoArm(ArmVectorEnv):
         stopped = np.abs(physics[..., 0] - clock) > self.model.opt.timestep / 2
         stopped[:, -1] |= warned
         with np.errstate(invalid="ignore"):
-            reasons = (
-                ("the state is not finite", ~np.isfinite(physics).all(axis=-1)),
-                (
-                    f"speed above {MAX_SPEED:g} rad/s",
-                    (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1),
-                ),
-                ("MuJoCo stopped it", stopped),
-            )
+            fast = (np.abs(physics[..., 1 + nq :]) > MAX_SPEED).any(axis=-1)
+        reasons = (
+            ("the state is not finite", ~np.isfinite(physics).all(axis=-1)),
+            (f"speed above {MAX_SPEED:g} rad/s", fast),
+            ("MuJoCo stopped it", stopped),
+        )
         wrong = reasons[0][1] | reasons[1][1] | reasons[2][1]
         if wrong.any():
             episode, step = np.argwhere(wrong)[0]

@@ -25,15 +25,7 @@ from tsmlib.checks import described, require_type
 from tsmlib.robot import Robot
 from tsmlib.storage.digests import digest as digest
 from tsmlib.storage.digests import trajectories_digest as trajectories_digest
-from tsmlib.storage.files import (
-    Json,
-    PathLike,
-    StoreError,
-    dumps,
-    loads,
-    read_bytes,
-    write_bytes,
-)
+from tsmlib.storage.files import Json, PathLike, StoreError, dumps, loads, read_bytes, write_bytes
 from tsmlib.storage.provenance import provenance
 from tsmlib.trajectory import Trajectories
 
