@@ -57,9 +57,37 @@ def plans(table: pd.DataFrame) -> str:
     return _markdown(lines)
 
 
+PUBLISHED = {  # environment steps 100 k / 500 k, of tdmpc2's results: TD-MPC2, DreamerV3, SAC
+    "reacher-easy": ("937 / 919", "872 / 940", "540 / 918"),
+    "reacher-hard": ("414 / 914", "813 / 867", "161 / 517"),
+    "cartpole-swingup": ("839 / 876", "677 / 789", "835 / 835"),
+    "pendulum-swingup": ("724 / 842", "699 / 740", "96 / 408"),
+    "cup-catch": ("981 / 985", "870 / 958", "958 / 978"),
+}
+
+
+def control(table: pd.DataFrame) -> str:
+    """Returns of ``solve`` after 10, 25 and 50 thousand steps, beside published agents."""
+    lines = []
+    for task, agents in PUBLISHED.items():
+        line = {"task": task}
+        for steps in (10_000, 25_000, 50_000):
+            rows = select(table, task=task, env_steps=steps)
+            values = select(rows, metric="return")["value"]
+            word = f"{_spelled(values, 0)} ({len(values)})" if len(values) else "not run"
+            line[f"{steps // 1000} k"] = word
+        minutes = select(table, task=task, metric="core_minutes")
+        per_step = minutes["value"].astype(float) / minutes["env_steps"].astype(float)
+        line["core min. for 25 k"] = f"{25_000 * per_step.mean():.1f}" if len(minutes) else ""
+        names = ("TD-MPC2", "DreamerV3", "SAC")
+        lines.append(line | dict(zip(names, agents, strict=True)))
+    return _markdown(lines)
+
+
 TABLES: dict[str, tuple[Callable[[pd.DataFrame], str], str]] = {  # and the rows they are made of
     "predictions": (predictions, "03_predict"),
     "plans": (plans, "05_control"),
+    "control": (control, "dmc"),
 }
 
 

@@ -9,10 +9,10 @@ function, which agents without a model of it have to learn.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -85,7 +85,7 @@ class Controller:
         space: of the steps that are looked ahead.
         every: steps that a plan is followed.
         options: of the planner.
-        seed: of the candidates.
+        seed: of the candidates of the next plan.
     """
 
     model: OneStep
@@ -98,12 +98,11 @@ class Controller:
 
     def __call__(self, past: Segment) -> Tensor:
         """The next actions (B, every, du) after ``past`` (B, L, .)."""
-        start = len(past.states) if self.left is None else self.left
         plan = cem(
             model_predictor(self.model, past),
             self.reward,
             self.space,
-            start,
+            len(past.states) if self.left is None else self.left,
             candidates=self.options.candidates,
             elites=max(2, self.options.candidates // 8),
             iterations=self.options.iterations,
@@ -119,8 +118,12 @@ class Solved:
     """What ``solve`` leaves.
 
     Attributes:
+        env: id of the environment.
         model: fitted to all data.
         data: all episodes.
+        reward: that plans are made by.
+        horizon: steps of an episode.
+        options: settings.
         records: the learning curve, one per round: ``round``, ``env_steps`` until its end,
             ``return`` and its ``spread``, mean and deviation over the episodes by the
             environment's own reward, where it keeps one, ``planned_return`` by the reward of the
@@ -144,18 +147,25 @@ class Solved:
 
     def controller(self, *, seed: int = 0) -> Controller:
         """The controller of one run of episodes, as ``collect`` and ``execute`` take it."""
-        return _controller(self.model, self.reward, self.data, self.options, seed)
+        o, dt = self.options, self.data.dt
+        every = max(1, round(o.every / dt))
+        ahead = max(every + 1, round(o.ahead / dt))
+        space = DirectActions(ahead, self.data.robot.action_dim, rms=o.rms)
+        return Controller(self.model, self.reward, space, every, o, seed)
 
-    def play(self, episodes: int = 1, *, seed: int = 10_000) -> Trial:
-        """Run episodes that begin by the resets of ``seed`` and those after it."""
-        return execute(self._task(episodes, seed), self.controller(), past_len=1)
+    def task(self, episodes: int = 1, *, seed: int = 500) -> Task:
+        """Episodes that begin by the resets of ``seed`` and those after it."""
+        return Task.from_env(
+            self.env, n=episodes, horizon=self.horizon, reward=self.reward, seed=seed
+        )
 
-    def film(self, *, seed: int = 10_000) -> np.ndarray:
+    def play(self, episodes: int = 1, *, seed: int = 500) -> Trial:
+        """Run episodes in closed loop; ``own_return`` is by the environment's own reward."""
+        return execute(self.task(episodes, seed=seed), self.controller(seed=seed), past_len=1)
+
+    def film(self, *, seed: int = 500) -> np.ndarray:
         """Frames (T, H, W, 3) uint8 of one episode."""
-        return film(self._task(1, seed), self.play(seed=seed), 0)
-
-    def _task(self, n: int, seed: int) -> Task:
-        return Task.from_env(self.env, n=n, horizon=self.horizon, reward=self.reward, seed=seed)
+        return film(self.task(seed=seed), self.play(seed=seed), 0)
 
 
 def solve(
@@ -168,7 +178,6 @@ def solve(
     options: SolveOptions | None = None,
     folder: PathLike | None = None,
     progress: bool = True,
-    callback: Callable[[dict[str, float]], None] | None = None,
 ) -> Solved:
     """Learn to control an environment, from random actions to plans through a learned model.
 
@@ -183,7 +192,6 @@ def solve(
         options: settings; None for the same defaults everywhere.
         folder: of its own, from which a run that was stopped goes on; more ``steps`` continue it.
         progress: whether to show a bar with the last return.
-        callback: called with every record.
 
     Returns:
         Model, data, learning curve and controller.
@@ -201,13 +209,14 @@ def solve(
         raise ValueError(f"{env} has no limit of time; give the steps of an episode, horizon=200")
     horizon = require_count("horizon", limit if horizon is None else horizon)
     aim = reward_of(env, guided=True) if reward is None else reward
-    made = make(env)
-    repeat = said(made, "action_repeat") or 1
-    made.close()
+    with closing(make(env)) as made:
+        repeat = said(made, "action_repeat") or 1
     if steps < 2 * (per_round := o.episodes * horizon * repeat):
         raise ValueError(f"steps is {steps}; expected at least two rounds of {per_round}")
     data = collect_random(env, o.episodes, horizon=horizon, seed=_draw(seed, 0), rms=o.rms)
-    model = _made(data, o, seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = OneStep.for_data(data, hidden=o.hidden)
     solved = Solved(env, model, data, aim, horizon, o)
     start = torch.from_numpy(data.flat_states[data.offsets])
     identity: dict[str, Json] = {
@@ -215,18 +224,18 @@ def solve(
         "seed": seed,
         "env": data.env,
         "horizon": horizon,
+        "reward of chance": list(fingerprint(aim, start, horizon, data.robot.action_dim)),
     }
-    identity["reward of chance"] = list(fingerprint(aim, start, horizon, data.robot.action_dim))
     spent, taken, k = 0.0, repeat * int(data.steps.sum()), 0
     with ExitStack() as stack:
         if folder is not None:
             stack.enter_context(writer_lock(Path(folder), f"solve, seed {seed}"))
         bar = stack.enter_context(tqdm(total=steps, desc=env, disable=not progress))
-        bar.update(taken)
-        while True:
+        while k == 0 or taken + per_round <= steps:
             files = None
             if folder is not None:
-                files = RoundFiles(Path(folder) / f"round-{k:03d}", encode_nonfinite(identity))
+                part = Path(folder) / f"round-{k:03d}"
+                files = RoundFiles(part, encode_nonfinite(identity))
             record = {"round": float(k)}
             if k:
                 new, own = _episodes(solved, k, seed, files)
@@ -237,77 +246,59 @@ def solve(
             spent += record["cpu_seconds"]
             if k:
                 solved.records.append(record | {"cpu_seconds": spent})
-                bar.update(taken - bar.n)
-                bar.set_postfix({"return": f"{record['return']:.4g}"})
-                if callback is not None:
-                    callback(solved.records[-1])
+                bar.set_postfix({"return": f"{record['return']:.4g}"}, refresh=False)
+            bar.update(taken - bar.n)
             k += 1
-            if taken + per_round > steps:
-                return solved
+    return solved
 
 
 def _draw(seed: int, k: int) -> int:
-    """A seed of round k, from which its resets count up."""
+    """A seed of round k, from which its resets count up; those from 500 on are of no round."""
     return (seed * 1_000_003 + 1000 * k) % 2**31
-
-
-def _made(data: Trajectories, o: SolveOptions, seed: int) -> OneStep:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return OneStep.for_data(data, hidden=o.hidden)
-
-
-def _controller(
-    model: OneStep, reward: Reward, data: Trajectories, o: SolveOptions, seed: int
-) -> Controller:
-    every = max(1, round(o.every / data.dt))
-    ahead = max(every + 1, round(o.ahead / data.dt))
-    space = DirectActions(ahead, data.robot.action_dim, rms=o.rms)
-    return Controller(model, reward, space, every, o, seed)
 
 
 def _episodes(
     solved: Solved, k: int, seed: int, files: RoundFiles | None
 ) -> tuple[Trajectories, dict[str, float]]:
     """The episodes of round k, and what is said of them."""
-    stored = None if files is None else files.episodes()
-    if stored is not None and stored[0] is not None:
+    stored = files and files.episodes()
+    if stored and stored[0] is not None:
         return stored[0], stored[1]
     began = time.process_time()
-    task = solved._task(solved.options.episodes, _draw(seed, k))
-    trial = execute(task, solved.controller(seed=_draw(seed, k)), past_len=1)
-    assert trial.own_return is not None
-    assert trial.seen is not None
-    own = torch.where(trial.own_return.isnan(), trial.executed_return, trial.own_return)
+    trial = solved.play(solved.options.episodes, seed=_draw(seed, k))
+    own = cast(Tensor, trial.own_return)  # of execute, as seen, there always
+    own = torch.where(own.isnan(), trial.executed_return, own)
     record = {"return": float(own.mean()), "spread": float(own.std())}
     record["planned_return"] = float(trial.executed_return.mean())
     record["cpu_seconds"] = time.process_time() - began
-    if files is not None:
-        files.keep_episodes(trial.seen, record)
-    return trial.seen, record
+    seen = cast(Trajectories, trial.seen)
+    if files:
+        files.keep_episodes(seen, record)
+    return seen, record
 
 
 def _fitted(
     solved: Solved, k: int, seed: int, record: dict[str, float], files: RoundFiles | None
 ) -> dict[str, float]:
     """The record of round k, the model now fitted to all data, or loaded."""
-    if files is not None and (stored := files.models(solved.model, None)) is not None:
+    if files and (stored := files.models(solved.model, None)) is not None:
         return stored
     began, o = time.process_time(), solved.options
     train, held_out = solved.data.split(0.9, seed=seed)
     solved.model.features.fit(train)
+    schedule = TrainingOptions(
+        future_len=min(20, *solved.data.lengths),
+        steps=o.updates if k else o.first,
+        batch_size=128,
+        lr=2e-3,
+        muon=0.01,
+        validate_every=100,
+    )
     fit(
         solved.model,
         train,
         held_out,
-        TrainingOptions(
-            future_len=min(20, min(solved.data.lengths)),
-            steps=o.updates if k else o.first,
-            batch_size=128,
-            lr=2e-3,
-            muon=0.01,
-            validate_every=100,
-        ),
+        schedule,
         solved.model.multi_step_loss,
         seed=seed + k,
         checkpoint=None if files is None else files.folder / "model.checkpoint",
@@ -315,6 +306,6 @@ def _fitted(
     )
     spent = time.process_time() - began
     record = record | {"cpu_seconds": record.get("cpu_seconds", 0.0) + spent}
-    if files is not None:
+    if files:
         files.keep_models(solved.model, None, record)
     return record
