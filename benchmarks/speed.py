@@ -18,7 +18,7 @@ import torch
 
 import tsmlib
 from reproduction.episodes import random_data
-from tsmlib.envs.symmetry import symmetric
+from reproduction.symmetry import symmetric
 
 ENV = "tsm/ReacherPush-v1"
 Work = Callable[[], object]

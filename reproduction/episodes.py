@@ -15,12 +15,12 @@ import tsmlib
 from reproduction.measures import gradients
 from reproduction.measures.data import autocorrelation, cells_visited, shares
 from reproduction.runs import HELD_OUT, Run, env_id
+from reproduction.symmetry import copies, symmetric
 from reproduction.tables import Row, place
 from tsmlib import zoo
 from tsmlib.envs import fingerprint
 from tsmlib.envs.geometry import LINK_LENGTHS
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.symmetry import copies, symmetric
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.storage import artifacts
 from tsmlib.trajectory import Trajectories

@@ -10,10 +10,10 @@ from pathlib import Path
 import tsmlib
 from reproduction.episodes import load_model, random_data
 from reproduction.runs import HELD_OUT, Run, env_id
+from reproduction.symmetry import symmetric
 from reproduction.tables import Row, place
 from tsmlib import zoo
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.envs.symmetry import symmetric
 from tsmlib.exploration.options import ExplorationOptions
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import without_unstable

@@ -593,5 +593,5 @@ def test_what_is_not_finite_stops_learning_with_the_weights_of_the_last_record(f
 
 def test_later_rewards_count_less_and_the_rate_decays_to_a_tenth() -> None:
     assert discounted(torch.tensor([[1.0, 1.0, 1.0]]), 0.5).item() == 1.75
-    rates = [learning_rate(i) for i in (0, 99, 100, 2200, 5000)]
+    rates = [learning_rate(i, 1e-3, 0.9, 1e-4) for i in (0, 99, 100, 2200, 5000)]
     assert rates == pytest.approx([1e-3, 1e-3, 9e-4, 1e-4, 1e-4])

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from reproduction.symmetry import COPIES, mirrored, symmetric, turned
 from tsmlib.collection import collect, open_loop, smooth_torques
-from tsmlib.envs.symmetry import COPIES, mirrored, symmetric, turned
 from tsmlib.trajectory import Trajectories
 
 

@@ -12,6 +12,7 @@ import torch
 
 import tsmlib
 from reproduction.measures.exploitation import violations
+from reproduction.symmetry import symmetric
 from tsmlib.collection import collect, open_loop, smooth_torques
 from tsmlib.envs import fingerprint, imperfect, variant
 from tsmlib.envs.geometry import (
@@ -29,7 +30,6 @@ from tsmlib.envs.mujoco_arm import load_model
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.pymunk_arm import ELBOW_MASS
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
-from tsmlib.envs.symmetry import symmetric
 from tsmlib.planning.tasks import Task
 from tsmlib.pretrained import draw_task
 

@@ -31,9 +31,9 @@ from reproduction import tables
 from reproduction.episodes import load_data
 from reproduction.runs import Run, env_id
 from reproduction.scores import OPEN, SEGMENTS, STARTS, summarised
+from reproduction.symmetry import symmetric
 from tsmlib.contrib.mbrl_lib import transition_batch
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
-from tsmlib.envs.symmetry import symmetric
 from tsmlib.evaluation.prediction import score
 from tsmlib.models.features import Features
 from tsmlib.trajectory import Trajectories

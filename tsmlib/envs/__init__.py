@@ -51,7 +51,7 @@ def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
             f"noise is {noise}, delay is {delay}; expected a sigma from 0 to 10 with at most four "
             "decimals, and a whole number of steps from 0 to 100"
         )
-    return EnvSpec.parse(replace(plain, noise=noise, delay=delay).id).id
+    return replace(plain, noise=noise, delay=delay).registered().id
 
 
 def variant(env_id: str, **changes: Unpack[Changes]) -> str:
@@ -70,7 +70,7 @@ def variant(env_id: str, **changes: Unpack[Changes]) -> str:
     Raises:
         ValueError: a value, or it in this task, makes no sense.
     """
-    return EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id).id
+    return EnvSpec.parse(env_id).varied(**changes).registered().id
 
 
 def fingerprint(env_id: str) -> dict[str, object]:

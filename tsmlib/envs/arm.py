@@ -5,9 +5,9 @@ Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A sim
 `ArmVectorEnv` with its abstract methods. One arm, `ArmEnv`, is N = 1 of the same code.
 """
 
-import dataclasses
 import secrets
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from typing import Unpack
 
 import gymnasium
@@ -59,7 +59,7 @@ class ArmVectorEnv(VectorEnv, ABC):
             raise ValueError(f"num_envs is {num_envs}; expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
-        self._arm = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id)
+        self._arm = EnvSpec.parse(env_id).varied(**changes).registered()
         self.num_envs, self.env_id, self.task, self.physics = (
             num_envs,
             self._arm.id,
@@ -263,11 +263,10 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
 
 def _named(made: GymnasiumSpec | None, physics: Physics) -> GymnasiumSpec | None:
     """Gymnasium's record of an environment with the id that says its physics."""
-    if made is None or EnvSpec.parse(made.id).physics == physics:
-        return made
-    return dataclasses.replace(
-        made, id=EnvSpec.parse(dataclasses.replace(EnvSpec.parse(made.id), physics=physics).id).id
-    )
+    if made is None:
+        return None
+    spec = replace(EnvSpec.parse(made.id), physics=physics).registered()
+    return replace(made, id=spec.id)
 
 
 class ArmEnv(gymnasium.Env):
@@ -282,7 +281,7 @@ class ArmEnv(gymnasium.Env):
     def __init__(
         self, env_id: str, render_mode: str | None = None, **changes: Unpack[Changes]
     ) -> None:
-        name = EnvSpec.parse(EnvSpec.parse(env_id).varied(**changes).id).id
+        name = EnvSpec.parse(env_id).varied(**changes).registered().id
         vector = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode).unwrapped
         assert isinstance(vector, ArmVectorEnv)
         self.vector, self.env_id, self.render_mode = vector, name, render_mode

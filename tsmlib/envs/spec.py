@@ -64,8 +64,7 @@ class EnvSpec:
         spec = spec.varied(**physics.parse(changed))
         if any(changed) and spec.id != env_id:
             raise ValueError(f"{env_id} is written {spec.id}")
-        _register(spec)
-        return spec
+        return spec.registered()
 
     def varied(self, **changes: Unpack[Changes]) -> EnvSpec:
         """The same environment with other physics. ValueError where a value, or it in this task,
@@ -78,6 +77,11 @@ class EnvSpec:
                 f"{refused[0]} of {self.id} cannot be chosen: {why}. It takes {', '.join(allowed)}"
             )
         return replace(self, physics=replace(self.physics, **changes))
+
+    def registered(self) -> EnvSpec:
+        """The same environment, which Gymnasium knows from now on."""
+        _register(self)
+        return self
 
     @property
     def name(self) -> str:

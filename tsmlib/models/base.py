@@ -84,6 +84,17 @@ _LEAST = (
 )
 
 
+def repeated(step: Callable[[Tensor, Tensor], Tensor], x: Tensor) -> Step:
+    """The ``begin`` of a one-step model: x (B, dx) goes through ``step`` (x, u) at each action."""
+
+    def following(u: Tensor) -> Tensor:
+        nonlocal x
+        x = step(x, u)
+        return x
+
+    return following
+
+
 class Adapted:
     """A SegmentModel as a DynamicsModel, to roll out: its steps are segments of one action.
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.checks import require_counts
-from tsmlib.models.base import Step, predict_segment
+from tsmlib.models.base import Step, predict_segment, repeated
 from tsmlib.models.layers import chunked
 from tsmlib.models.recurrence import Recurrent
 from tsmlib.models.state_model import StateModel
@@ -57,14 +57,7 @@ class OneStep(StateModel):
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Go on from the last state, for any number of steps. There is nothing to draw."""
-        x = past.states[:, -1]
-
-        def step(u: Tensor) -> Tensor:
-            nonlocal x
-            x = self.step(x, u)
-            return x
-
-        return step
+        return repeated(self.step, past.states[:, -1])
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """(i) Squared error of one-step increments on every (x_t, u_t, x_{t+1}) of the future."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from tsmlib.checks import require_counts
-from tsmlib.models.base import Step, rollout
+from tsmlib.models.base import Step, repeated, rollout
 from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories, Window
@@ -89,21 +89,13 @@ class Egocentric(StateModel):
         s = (self._seen(x, u) - self.seen_mean) / self.seen_std
         d = (self.net(s) + self.linear(s)) * self.step_std
         cosine, sine = x[..., self.angle, None].cos(), x[..., self.angle, None].sin()
-        moved = x.new_zeros(x.shape)
         turned = _turned(d[..., :-1].unflatten(-1, (-1, 2)), cosine, sine).flatten(-2)
         moved = torch.cat([turned, d[..., -1:]], dim=-1)
         return x + moved[..., self._order()]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Go on from the last state, for any number of steps. There is nothing to draw."""
-        x = past.states[:, -1]
-
-        def step(u: Tensor) -> Tensor:
-            nonlocal x
-            x = self.step(x, u)
-            return x
-
-        return step
+        return repeated(self.step, past.states[:, -1])
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
         """Mean distance, in the size of steps, of the states it reaches on its own predictions."""

@@ -42,7 +42,6 @@ def evaluate(
     parameters: Tensor,
     *,
     risk: Risk = mean,
-    rows: int = BLOCK,
 ) -> Tensor:
     """What candidates are judged by.
 
@@ -52,12 +51,11 @@ def evaluate(
         space: decodes the parameters.
         parameters: (C, B, *shape).
         risk: of the samples' returns (S, C, B) one number per candidate.
-        rows: candidates times targets that are rolled out at once.
 
     Returns:
         (C, B).
     """
-    return risk(_returns(predict, reward, _decoded(space, parameters, rows), rows))
+    return risk(_returns(predict, reward, _decoded(space, parameters)))
 
 
 def like(values: Tensor, parameters: Tensor) -> Tensor:
@@ -71,14 +69,14 @@ def best_of(parameters: Tensor, returns: Tensor, n: int) -> Tensor:
     return parameters.gather(0, like(best, parameters).expand(-1, -1, *parameters.shape[2:]))
 
 
-def _decoded(space: SearchSpace, parameters: Tensor, rows: int = BLOCK) -> Tensor:
-    chunks = parameters.split(max(1, rows // parameters.shape[1]))
+def _decoded(space: SearchSpace, parameters: Tensor) -> Tensor:
+    chunks = parameters.split(max(1, BLOCK // parameters.shape[1]))
     return torch.cat([space.decode(chunk) for chunk in chunks])
 
 
-def _returns(predict: Predictor, reward: Reward, actions: Tensor, rows: int = BLOCK) -> Tensor:
-    """The return of each sample (S, C, B), rolled out up to ``rows`` candidates at a time."""
-    chunks = actions.split(max(1, rows // actions.shape[1]))
+def _returns(predict: Predictor, reward: Reward, actions: Tensor) -> Tensor:
+    """The return of each sample (S, C, B), rolled out so many candidates at a time."""
+    chunks = actions.split(max(1, BLOCK // actions.shape[1]))
     returns = [rewarded(reward, predicted(predict, part), part).sum(-1) for part in chunks]
     return torch.cat(returns, dim=1)
 

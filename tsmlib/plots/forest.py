@@ -28,7 +28,6 @@ def forest(
     x_label: str = "",
     reference: float | None = 0.0,
     better: Literal["", "left", "right"] = "",
-    log: bool = False,
     columns: int = 3,
 ) -> Figure:
     """Intervals as rows, side by side in panels that share their rows.
@@ -41,7 +40,6 @@ def forest(
         x_label: what stands along x, with its unit.
         reference: where neither side is ahead; None draws no line.
         better: the side of the reference that is good.
-        log: whether x is logarithmic.
         columns: panels in a row.
 
     Returns:
@@ -69,11 +67,11 @@ def forest(
             place = rows.index(row)
             ax.plot((low, high), (place, place), color=hue, lw=1.6, solid_capstyle="butt", zorder=2)
             ax.plot(middle, place, look.marker if is_model else "o", color=hue, ms=4, zorder=3)
-        ax.set(xlabel=x_label, ylim=(len(rows) - 0.4, -0.6), xscale="log" if log else "linear")
+        ax.set(xlabel=x_label, ylim=(len(rows) - 0.4, -0.6))
         ax.set_yticks(range(len(rows)), [known[row][0].name for row in rows])
         ax.spines["left"].set_visible(False)
         ax.tick_params(axis="y", length=0)
-        ax.locator_params(axis="x", nbins=5) if not log else None
+        ax.locator_params(axis="x", nbins=5)
     figure.set_figwidth(WIDTH)
     return figure
 

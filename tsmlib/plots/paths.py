@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
@@ -30,7 +29,6 @@ def paths(
     panels: Panels,
     *,
     target: Mapping[str, ArrayLike] | ArrayLike | None = None,
-    draw: Callable[[Axes, str], None] | None = None,
     opacity: float | None = None,
     columns: int = 3,
 ) -> Figure:
@@ -39,7 +37,6 @@ def paths(
     Args:
         panels: title -> word -> positions in m, (T, 2) or (S, T, 2).
         target: where something should end (2,), in m; or title -> (2,).
-        draw: draws what lies behind the paths into the axes of a title, a scene for example.
         opacity: of each of many paths, from 0 to 1; by default the more there are the fainter.
         columns: panels in a row.
 
@@ -53,8 +50,6 @@ def paths(
     side = 7.0 / max(2, min(columns, len(panels)))
     figure, axes = grid(panels, columns, side, share="", width=side * min(columns, len(panels)))
     for ax, (title, series) in zip(axes, panels.items(), strict=True):
-        if draw is not None:
-            draw(ax, title)
         for word, given in series.items():
             ways = numbers(f"{word} of panel {title!r}", given, "T 2", "S T 2").reshape(
                 -1, np.shape(given)[-2], 2

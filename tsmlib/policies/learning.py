@@ -270,9 +270,7 @@ def discounted(rewards: Tensor, gamma: float) -> Tensor:
     return (rewards * gamma**steps).sum(-1)
 
 
-def learning_rate(
-    iteration: int, lr: float = 1e-3, decay: float = 0.9, final: float = 1e-4
-) -> float:
+def learning_rate(iteration: int, lr: float, decay: float, final: float) -> float:
     """``lr``, decayed every 100 iterations until it is ``final`` (A.3)."""
     return max(final, lr * decay ** (iteration // 100))
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -68,8 +68,7 @@ def fit(
 
     The weights with the best validation loss are left in ``model``. Windows and noise are functions
     of (seed, step), so a run that is resumed from ``checkpoint`` continues as if it had not
-    stopped. Parameters with ``requires_grad`` False stay as they are. The loss may also stand
-    second, ``fit(model, loss, data, validation, options)``.
+    stopped. Parameters with ``requires_grad`` False stay as they are.
 
     Args:
         model: made by ``TSM.for_data(data)``, say; one that was made without data takes the robot
@@ -152,8 +151,6 @@ def checked(
 ) -> tuple[Loss, Trajectories, Trajectories, TrainingOptions]:
     """Loss, training and held-out data and options, without what is None; see ``fit``."""
     require_type("model", model, nn.Module, f"a model, {CALL}")
-    if callable(data):  # the loss stands second: fit(model, loss, data, validation, options)
-        loss, data, validation, options = cast(Any, (data, validation, options, loss))
     if not any(weight.requires_grad for weight in model.parameters()):
         raise ValueError("model has no weight to train; expected one with requires_grad")
     require_type("data", data, Trajectories, f"Trajectories, {CALL}")

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 # s -> a s + b s^3 + c s^5, the steepest at zero that still ends near 1
 QUINTIC = (3.4445, -4.7750, 2.0315)
+ITERATIONS = 5
 
 
 def matrices(model: nn.Module) -> list[nn.Parameter]:
@@ -42,13 +43,13 @@ def matrices(model: nn.Module) -> list[nn.Parameter]:
     ]
 
 
-def orthogonalised(matrix: Tensor, iterations: int = 5) -> Tensor:
+def orthogonalised(matrix: Tensor) -> Tensor:
     """About U V^T of the singular values U S V^T of (..., n, m): they become 0.7 to 1.2."""
     a, b, c = QUINTIC
     tall = matrix.shape[-2] > matrix.shape[-1]
     x = matrix.mT if tall else matrix
     x = x / x.norm(dim=(-2, -1), keepdim=True).clamp(min=1e-7)
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         gram = x @ x.mT
         x = a * x + (b * gram + c * gram @ gram) @ x
     return x.mT if tall else x
