@@ -18,7 +18,7 @@ from torch import Tensor
 
 from reproduction.measures.planning import random_torques
 from tsmlib import rewards
-from tsmlib.collection import collect, open_loop, smooth_torques
+from tsmlib.collection import collect, collect_random, open_loop, smooth_torques
 from tsmlib.envs import imperfect
 from tsmlib.envs.spec import DELAY, ENV_IDS, NOISE
 from tsmlib.models.action_prior import ActionPrior
@@ -99,6 +99,13 @@ def test_torques_start_near_zero_and_settle_to_their_strength() -> None:
     assert (strength[:5].diff() > 0).all()
     assert (strength[20:] - 0.1).abs().max() < 0.003
     assert drawn.mean().abs() < 1e-3
+
+
+@pytest.mark.parametrize("given", [{"seed": 2**32}, {"time_constant": 0}])
+def test_what_would_count_as_another_value_is_refused(given: dict[str, int]) -> None:
+    name, value = next(iter(given.items()))
+    with pytest.raises(ValueError, match=f"{name} is {value}; expected"):
+        collect_random(REACHER, 1, horizon=3, **given)
 
 
 def test_torques_are_smooth_and_bounded() -> None:

@@ -13,7 +13,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from tsmlib.checks import as_tensor, require_count, require_number
+from tsmlib.checks import as_tensor, require_count, require_number, require_seed
 from tsmlib.envs.stepping import Arms, Seeds, Simulation, make_simulation, simulation
 from tsmlib.trajectory import Segment, Trajectories, initial_past
 
@@ -126,7 +126,7 @@ def collect_random(
     Raises:
         UnsupportedEnvironment: an environment that cannot be collected from; says what it takes.
     """
-    seed = require_count("seed", seed, least=0)
+    seed = require_seed("seed", seed)
     with closing(make_simulation(env_id, episodes)) as run:
         actions = smooth_torques(
             episodes,
@@ -134,7 +134,7 @@ def collect_random(
             generator=torch.Generator().manual_seed(seed),
             action_dim=run.action_dim,
             rms=rms,
-            time_constant=time_constant or 1.5 * run.dt,
+            time_constant=1.5 * run.dt if time_constant is None else time_constant,
             dt=run.dt,
         )
         return collect(run, open_loop(actions), horizon=horizon, seed=seed)
