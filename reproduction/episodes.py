@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 import tsmlib
+from reproduction import schedules
 from reproduction.measures import gradients
 from reproduction.measures.data import autocorrelation, cells_visited, shares
 from reproduction.runs import HELD_OUT, Run, env_id
@@ -59,10 +60,10 @@ def make_model(run: Run, name: str, word: str, path: Path) -> torch.nn.Module:
     net = spec.load().for_data(train, seed=run.seed, **spec.arguments(EnvSpec.parse(env)))
     if spec.begins:
         net.take_decoder(load_model(run, name, spec.begins))
-    stages = spec.schedule(EnvSpec.parse(env), run.pick(0.0, 0.5, 1.0))
+    stages = schedules.schedule(spec, EnvSpec.parse(env), run.pick(0.0, 0.5, 1.0))
     checkpoints = []
-    for key, stage in zip(zoo.keys(stages), stages, strict=True):
-        options = stage.options(net.past_len)
+    for key, stage in zip(schedules.keys(stages), stages, strict=True):
+        options = schedules.options(stage, net.past_len)
         if run.scale == "smoke":
             options = replace(options, batch_size=32, validate_every=10)
         checkpoints.append(path.with_name(f"{word}-{key}.checkpoint"))

@@ -21,7 +21,6 @@ from tsmlib.contrib.mbrl_lib import (
     model_env,
     never,
     reward_function,
-    transition_batch,
 )
 from tsmlib.models.base import rollout, stepper
 from tsmlib.planning.predictors import model_predictor
@@ -209,25 +208,6 @@ def test_another_object_is_refused_by_what_it_lacks() -> None:
         match=r"SimpleNamespace has no input_normalizer, .*model.num_members; expected an mbrl",
     ):
         MbrlModel(SimpleNamespace(model=torch.nn.Linear(2, 2)))  # type: ignore[arg-type]
-
-
-def test_transitions_know_where_episodes_end() -> None:
-    pytest.importorskip("mbrl.types")
-    episodes = [np.arange(3 * (n + 1), dtype=np.float32).reshape(-1, 3) for n in (2, 4)]
-    data = tsmlib.Trajectories(
-        episodes,
-        [np.zeros((len(x) - 1, 1), np.float32) for x in episodes],
-        "cart",
-        0.1,
-        ("a", "b", "c"),
-        ("1",) * 3,
-        terminated=(True, False),
-    )
-    batch = transition_batch(data)
-    np.testing.assert_array_equal(batch.obs, np.concatenate([x[:-1] for x in episodes]))
-    np.testing.assert_array_equal(batch.next_obs, np.concatenate([x[1:] for x in episodes]))
-    assert batch.terminateds.tolist() == [False, True, False, False, False, False]
-    assert batch.truncateds.tolist() == [False, False, False, False, False, True]
 
 
 # Ours behind theirs

@@ -226,7 +226,7 @@ def test_one_long_episode_among_short_ones_costs_what_it_holds() -> None:
     steps = [100] * 300 + [50_000]
     x = [np.zeros((n + 1, 10), np.float32) for n in steps]
     u = [np.zeros((n, 2), np.float32) for n in steps]
-    data = Trajectories.ragged(x, u, env="log", dt=0.1)
+    data = Trajectories(x, u, env="log", dt=0.1)
     given = sum(array.nbytes for array in x + u)
     assert data.flat_states.nbytes + data.flat_actions.nbytes == given
     tensors = data.tensors()

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 import tsmlib
+from reproduction import schedules
 from tsmlib import zoo
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.pretrained import PRETRAINED
@@ -26,22 +28,26 @@ SHIPPED = [
 def test_a_shipped_model_was_trained_by_its_entry(path: Path) -> None:
     header, spec = artifacts.read_header(path), zoo.ZOO[path.stem]
     assert header["class"] == spec.load().__name__
-    planned = spec.schedule(EnvSpec.parse(header["fingerprint"]["env"]))
-    assert list(header["curves"]) == zoo.keys(planned)
-    for key, stage in zip(zoo.keys(planned), planned, strict=True):
+    planned = schedules.schedule(spec, EnvSpec.parse(header["fingerprint"]["env"]))
+    assert list(header["curves"]) == schedules.keys(planned)
+    for key, stage in zip(schedules.keys(planned), planned, strict=True):
         assert header["curves"][key]["step"][-1] == stage.steps
     for found, stage in zip(header.get("schedule", []), planned, strict="schedule" in header):
-        assert stage.stated().items() <= ({"muon": 0.0, "span": [0.0, 1.0]} | found).items()
+        assert (asdict(stage) | {"span": list(stage.span)}).items() <= (
+            {"muon": 0.0, "span": [0.0, 1.0]} | found
+        ).items()
 
 
 def test_a_stage_says_all_that_training_takes_from_it() -> None:
     stage = zoo.Stage(zoo.Updates("loss", 1, 30, lr=1e-3, batch=64, span=(0.2, 0.7)), (10, 5), 0.5)
-    assert stage.within(60, False).steps == 300
-    assert stage.within(60, True).steps == 150
-    options = stage.within(60, False).options(5)
+    assert schedules.within(stage, 60, False).steps == 300
+    assert schedules.within(stage, 60, True).steps == 150
+    options = schedules.options(schedules.within(stage, 60, False), 5)
     assert (options.past_len, options.future_len, options.batch_size) == (5, 30, 64)
     assert (options.lr, options.muon, options.span) == (1e-3, 0.01, (0.2, 0.7))
-    assert zoo.keys(zoo.find("rtsm").schedule(EnvSpec.parse("tsm/Reacher-v0"))) == [
+    assert schedules.keys(
+        schedules.schedule(zoo.find("rtsm"), EnvSpec.parse("tsm/Reacher-v0"))
+    ) == [
         "point_loss",
         "loss",
         "loss-2",
@@ -53,7 +59,7 @@ def test_every_entry_makes_its_model_and_has_its_losses(word: str) -> None:
     spec, env = zoo.find(word), EnvSpec.parse("tsm/ReacherPush-v1")
     sizes = (2,) if spec.group == "prior" else (10, 2)
     model = spec.load()(*sizes, **spec.arguments(env))
-    assert all(hasattr(model, stage.loss) for stage in spec.schedule(env))
+    assert all(hasattr(model, stage.loss) for stage in schedules.schedule(spec, env))
 
 
 def test_every_model_has_a_look_of_its_own_and_none_the_reader_s() -> None:

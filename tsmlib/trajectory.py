@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -119,19 +119,6 @@ class Trajectories(FromLogs, Windows):
         casting.require_bounds(self.flat_actions, env)
         if not jumps:
             casting.require_no_jumps(self.increments(), self.steps, robot)
-
-    @classmethod
-    def ragged(
-        cls, states: Sequence[np.ndarray], actions: Sequence[np.ndarray], **robot: Any
-    ) -> Trajectories:
-        """Episodes of several lengths, (T_i + 1, dx) and (T_i, du), as the constructor takes them.
-
-        Args:
-            states: an array for each episode.
-            actions: an array for each episode.
-            robot: env, dt and what else the constructor takes.
-        """
-        return cls(list(states), list(actions), **robot)
 
     @classmethod
     def from_rows(

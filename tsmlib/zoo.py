@@ -1,12 +1,12 @@
-"""The models of the study by their words: how each is made, trained and drawn.
+"""The models by the words that name them: how each is made, trained and drawn.
 
 The one place where a model is added. Imports nothing heavy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Literal
 
@@ -15,16 +15,7 @@ if TYPE_CHECKING:
 
     from tsmlib.envs.spec import EnvSpec
     from tsmlib.storage.files import Json
-    from tsmlib.training.fit import TrainingOptions
 
-BUDGET = {  # seconds of training on one core, the same for every dynamics model of an environment
-    "Reacher": 320.0,
-    "ReacherObstacle": 480.0,
-    "ReacherPush": 2320.0,
-    "PymunkReacher": 160.0,
-    "PymunkObstacle": 160.0,
-    "PymunkPush": 580.0,
-}
 Marker = str | tuple[int, int, float]  # matplotlib's: a letter, or corners, kind and angle
 
 
@@ -65,24 +56,6 @@ class Updates:
     muon: float = 0.01
     span: tuple[float, float] = (0.0, 1.0)
 
-    def options(self, past_len: int | None = None) -> TrainingOptions:
-        """What ``fit`` takes, for a model with so many steps of past."""
-        from tsmlib.training.fit import TrainingOptions  # heavy
-
-        return TrainingOptions(
-            past_len=past_len,
-            future_len=self.future_len,
-            steps=self.steps,
-            batch_size=self.batch,
-            lr=self.lr,
-            muon=self.muon,
-            span=self.span,
-        )
-
-    def stated(self) -> dict[str, Json]:
-        """The stage as JSON, for the header of a model."""
-        return asdict(self) | {"span": list(self.span)}
-
 
 @dataclass(frozen=True)
 class Stage:
@@ -98,11 +71,6 @@ class Stage:
     updates: Updates
     rates: tuple[float, float]
     share: float = 1.0
-
-    def within(self, seconds: float, block: bool) -> Updates:
-        """The stage in its share of a budget: updates in tens, and never fewer than 20."""
-        steps = 10 * round(seconds * self.share * self.rates[block] / 10)
-        return replace(self.updates, steps=max(20, steps))
 
 
 @dataclass(frozen=True)
@@ -138,15 +106,6 @@ class ModelSpec:
         """The class."""
         module, _, name = self.cls.partition(":")
         return getattr(import_module(module), name)
-
-    def seconds(self, env: EnvSpec) -> float:
-        """Its whole budget, on an imperfect arm as on the plain one."""
-        return BUDGET[env.standard.name] if self.budget is None else self.budget
-
-    def schedule(self, env: EnvSpec, share: float = 1.0) -> list[Updates]:
-        """How the model is trained in a share of its budget."""
-        stages = (env.task == "push" and self.pushing) or self.stages
-        return [stage.within(share * self.seconds(env), env.has_block) for stage in stages]
 
 
 # Training stages and arguments -----------------------------------------------------------------
@@ -305,13 +264,6 @@ LOOKS = {  # of what is run and drawn beside the models; greys for what is no me
     "pets": Look("PETS (mbrl-lib)", "#C2A5CF", "H"),
     "pets+mse": Look("PETS (mbrl-lib), squared error", "#9970AB", "8"),
 }
-
-
-def keys(stages: Sequence[Updates]) -> list[str]:
-    """A word for each stage of a training: its loss, numbered from the second time on."""
-    losses = [stage.loss for stage in stages]
-    counts = [1 + losses[:i].count(loss) for i, loss in enumerate(losses)]
-    return [f"{loss}-{n}" if n > 1 else loss for loss, n in zip(losses, counts, strict=True)]
 
 
 def words(*groups: str) -> tuple[str, ...]:

@@ -32,7 +32,6 @@ from reproduction.episodes import load_data
 from reproduction.runs import Run, env_id
 from reproduction.scores import OPEN, SEGMENTS, STARTS, summarised
 from reproduction.symmetry import symmetric
-from tsmlib.contrib.mbrl_lib import transition_batch
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.evaluation.prediction import score
 from tsmlib.models.features import Features
@@ -130,6 +129,22 @@ def batch_of(data: Trajectories, features: Features) -> Any:
     scaled = data.states / unit_of(features).numpy()
     names = (data.env, data.dt, data.names, data.units, data.angles)
     return transition_batch(Trajectories(scaled, data.actions, *names))
+
+
+def transition_batch(data: Trajectories) -> Any:
+    """All transitions of episodes as an ``mbrl.types.TransitionBatch``, with rewards of zero,
+    episode by episode.
+    """
+    from mbrl.types import TransitionBatch
+
+    last = np.cumsum(data.steps) - 1  # row of the last action of each episode
+    terminated, truncated = np.zeros((2, len(data.flat_actions)), bool)
+    terminated[last] = data.terminated
+    truncated[last] = ~terminated[last]
+    before = np.delete(data.flat_states, data.offsets + data.steps, axis=0)
+    after = np.delete(data.flat_states, data.offsets, axis=0)
+    zeros = np.zeros(len(before), np.float32)
+    return TransitionBatch(before, data.flat_actions, after, zeros, terminated, truncated)
 
 
 def initialise(

@@ -20,11 +20,10 @@ from torch import Tensor
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.models.base import Model, Step, as_dynamics, stepper
 from tsmlib.rewards import Reward, rewarded
-from tsmlib.trajectory import Segment, Trajectories, initial_past
+from tsmlib.trajectory import Segment, initial_past
 
 if TYPE_CHECKING:
     from mbrl.models import ModelEnv
-    from mbrl.types import TransitionBatch
 
 
 class Network(Protocol):
@@ -265,19 +264,3 @@ def model_env(
     )
     made.action_space = Box(-1.0, 1.0, (action_dim,), np.float32)
     return made
-
-
-def transition_batch(data: Trajectories) -> TransitionBatch:
-    """All transitions of episodes as an ``mbrl.types.TransitionBatch``, with rewards of zero,
-    episode by episode.
-    """
-    from mbrl.types import TransitionBatch
-
-    last = np.cumsum(data.steps) - 1  # row of the last action of each episode
-    terminated, truncated = np.zeros((2, len(data.flat_actions)), bool)
-    terminated[last] = data.terminated
-    truncated[last] = ~terminated[last]
-    before = np.delete(data.flat_states, data.offsets + data.steps, axis=0)
-    after = np.delete(data.flat_states, data.offsets, axis=0)
-    zeros = np.zeros(len(before), np.float32)
-    return TransitionBatch(before, data.flat_actions, after, zeros, terminated, truncated)

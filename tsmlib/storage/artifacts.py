@@ -47,14 +47,6 @@ class Model(Protocol):
 M = TypeVar("M", bound=torch.nn.Module)
 
 
-class Misfit(StoreError):
-    """A sound file of something else than expected; ``found`` holds what it is of."""
-
-    def __init__(self, message: str, found: Mapping[str, Json]) -> None:
-        super().__init__(message)
-        self.found = found
-
-
 def save(
     path: PathLike,
     tensors: Mapping[str, Tensor | np.ndarray],
@@ -311,9 +303,9 @@ def require_fit(
     *,
     only_stated: bool = False,
 ) -> None:
-    """Misfit naming both sides of every field of ``expect`` that ``found`` does not hold."""
+    """StoreError naming both sides of every field of ``expect`` that ``found`` does not hold."""
     if differing := differences(found, expect or {}, only_stated=only_stated):
-        raise Misfit(f"{path} does not fit: {'; '.join(differing)}. {_OTHER}", found)
+        raise StoreError(f"{path} does not fit: {'; '.join(differing)}. {_OTHER}")
 
 
 def differences(
