@@ -1,4 +1,5 @@
 from . import plots as plots
+from . import rewards as rewards
 from .collection import collect as collect
 from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop

@@ -6,6 +6,7 @@ Letters in shapes: B starts, dx size of state.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -16,7 +17,8 @@ from tsmlib import rewards
 from tsmlib.checks import require_count, require_type
 from tsmlib.envs.geometry import hole, room
 from tsmlib.envs.ids import UnsupportedEnvironment
-from tsmlib.envs.spec import EnvSpec
+from tsmlib.envs.spec import EnvSpec, is_arm
+from tsmlib.envs.stepping import Simulation, make_simulation
 
 
 def chosen_indices(chosen: int | Sequence[int], n: int, env: str) -> list[int]:
@@ -45,17 +47,24 @@ def require_within_limit(env: str, horizon: int) -> None:
         )
 
 
-def require_repeated(env: str, names: Sequence[str], start: np.ndarray, again: np.ndarray) -> None:
-    """UnsupportedEnvironment unless resets of the same seeds gave the same starts."""
+def begin(env: str, n: int, seed: int) -> tuple[Simulation, np.ndarray]:
+    """The simulation of ``n`` episodes, and their starts (n, dx), which are the same twice."""
+    try:
+        episodes = make_simulation(EnvSpec.parse(env).arm.id if is_arm(env) else env, n)
+    except gymnasium.error.Error as error:
+        raise ValueError(f"env is {env!r:.80}, which cannot be made: {error}") from error
+    with closing(episodes) as begun:
+        start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
     differs = np.argwhere(start != again)
     if len(differs):
         i, d = differs[0]
         raise UnsupportedEnvironment(
-            f"{env} does not repeat itself: the same seed gave {names[d]} = {start[i, d]:.6g} and "
-            f"then {again[i, d]:.6g} at start {i}. A task needs starts that come back: seed all "
+            f"{env} does not repeat itself: the same seed gave {begun.names[d]} = "
+            f"{start[i, d]:.6g} and then {again[i, d]:.6g} at start {i}. A task needs starts that come back: seed all "
             "random numbers by reset(seed=...), and leave out wrappers that normalise by what was "
             "seen before, such as gymnasium.wrappers.NormalizeObservation"
         )
+    return begun, start
 
 
 def require_same_starts(states: Tensor, start: Tensor, what: str, task: str) -> None:

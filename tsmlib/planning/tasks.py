@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,12 +26,12 @@ from tsmlib.checks import (
     require_type,
 )
 from tsmlib.envs.ids import find_spec
-from tsmlib.envs.spec import EnvSpec, is_arm
+from tsmlib.envs.spec import EnvSpec
 from tsmlib.envs.stepping import Arms, make_simulation
 from tsmlib.planning.starts import (
+    begin,
     chosen_indices,
     require_reachable,
-    require_repeated,
     require_same_starts,
     require_within_limit,
 )
@@ -136,17 +135,10 @@ class Task:
         n, seed = require_count("n", n, most=MOST), require_seed("seed", seed)
         if tolerance is not None:
             tolerance = require_number("tolerance", tolerance, 0)
-        plain = EnvSpec.parse(env).arm.id if is_arm(env) else env
         require_type("name", name, str, "a text")
-        try:
-            episodes = make_simulation(plain, n)
-        except gymnasium.error.Error as error:
-            raise ValueError(f"env is {env!r:.80}, which cannot be made: {error}") from error
+        begun, start = begin(env, n, seed)
         scored = reward_of(env) if reward is None else reward
         require_reward(scored)
-        with closing(episodes) as begun:
-            start, again = (begun.reset(seed=seed).astype(np.float32) for _ in range(2))
-        require_repeated(env, begun.names, start, again)
         task = cls(
             name=name or begun.id,
             env=env if isinstance(begun, Arms) else begun.id,
@@ -167,9 +159,8 @@ class Task:
             if not distance.isnan().all():
                 raise ValueError(
                     f"success of task {task.name!r} is a distance, {float(distance[0]):.3g} at the "
-                    "first start, and no tolerance is given; give the distance within which a "
-                    "trial is a success, tolerance=0.05 for example, or a success that is true or "
-                    "false"
+                    "first start, and no tolerance is given; give one, tolerance=0.05 for "
+                    "example, or a success that is true or false"
                 )
         return task
 
