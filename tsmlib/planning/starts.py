@@ -60,7 +60,8 @@ def begin(env: str, n: int, seed: int) -> tuple[Simulation, np.ndarray]:
         i, d = differs[0]
         raise UnsupportedEnvironment(
             f"{env} does not repeat itself: the same seed gave {begun.names[d]} = "
-            f"{start[i, d]:.6g} and then {again[i, d]:.6g} at start {i}. A task needs starts that come back: seed all "
+            f"{start[i, d]:.6g} and then {again[i, d]:.6g} at start {i}. A task needs starts that "
+            "come back: seed all "
             "random numbers by reset(seed=...), and leave out wrappers that normalise by what was "
             "seen before, such as gymnasium.wrappers.NormalizeObservation"
         )
