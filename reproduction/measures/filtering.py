@@ -158,9 +158,8 @@ class KalmanFilter:
         for step in range(noisy.horizon):
             x = self.predicted(x, noisy.actions[:, step])
             covariance = a @ covariance @ a.T + self.weight * self.process
-            h = np.concatenate(
-                [np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1
-            )  # (N, 6, 4)
+            # (N, 6, 4)
+            h = np.concatenate([np.tile(np.eye(4), (len(x), 1, 1)), self._tip_jacobian(x)], 1)
             seen = noisy.states[:, step + 1] - self.with_tip(x)
             gain = covariance @ h.mT @ np.linalg.inv(h @ covariance @ h.mT + noise)
             x = x + (gain @ seen[..., None])[..., 0]

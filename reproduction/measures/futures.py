@@ -16,11 +16,8 @@ from tsmlib.models.tsm import TSM
 from tsmlib.trajectory import Segment, Trajectories, Window
 
 Coded = TSM | RecurrentTSM  # one code for H steps: ``decode``, ``code_len``, ``latent_dim``
-STARTS = (
-    10,
-    40,
-    70,
-)  # steps at which the windows begin; with HORIZON they hold every step of an episode once
+# Steps at which the windows begin; with HORIZON they hold every step of an episode once.
+STARTS = (10, 40, 70)
 HORIZON = 30
 
 

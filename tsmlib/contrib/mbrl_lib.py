@@ -146,10 +146,8 @@ class ForModelEnv:
 
     def __init__(self, model: Model, action_dim: int) -> None:
         self.model, self.action_dim = model, action_dim
-        self._stochastic, self._past_len = (
-            as_dynamics(model).stochastic,
-            as_dynamics(model).past_len,
-        )
+        self._stochastic = as_dynamics(model).stochastic
+        self._past_len = as_dynamics(model).past_len
         weight = next(model.parameters(), None) if isinstance(model, torch.nn.Module) else None
         self.device = torch.device("cpu") if weight is None else weight.device
         self._past: Segment | None = None
@@ -201,10 +199,8 @@ class ForModelEnv:
         with torch.no_grad():
             if run.step is None or run.deterministic != deterministic:
                 generator = None if deterministic or not self._stochastic else rng
-                run.step, run.deterministic = (
-                    stepper(self.model, past, generator=generator),
-                    deterministic,
-                )
+                run.step = stepper(self.model, past, generator=generator)
+                run.deterministic = deterministic
             x = run.step(u)
         run.steps += 1
         past = past.then(Segment(x[:, None], u[:, None])).last(self._past_len)

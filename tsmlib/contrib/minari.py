@@ -121,9 +121,8 @@ def save_minari(
         )
     fields = ", ".join(f"{name} ({unit})" for name, unit in zip(t.names, t.units, strict=True))
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # of author, licence and evaluation, which data need not have
+        # Of author, licence and evaluation, which data need not have.
+        warnings.simplefilter("ignore")
         made = minari.create_dataset_from_buffers(
             dataset_id,
             episodes,
@@ -200,10 +199,8 @@ def _episodes(
     """States (T + 1, dx), actions (T, du) in [-1, 1] and whether it terminated, of each episode."""
     centre, half = (low + high) / 2, (high - low) / 2
     for number, episode in enumerate(dataset.iterate_episodes()):
-        actions, over = (
-            np.asarray(episode.actions, np.float64),
-            np.asarray(episode.terminations).astype(bool),
-        )
+        actions = np.asarray(episode.actions, np.float64)
+        over = np.asarray(episode.terminations).astype(bool)
         if actions.ndim != 2 or actions.shape[1] != len(low) or not len(actions) == len(over) > 0:
             raise ValueError(
                 f"episode {number} has actions {actions.shape} and terminations {over.shape}, "

@@ -37,9 +37,8 @@ class OneStepEnsemble(EnsembleModel, ABC):
         else:
             member = draw_members(self.members, n_rows, generator, start)
             groups = [(member == m).nonzero()[:, 0] for m in range(self.members)]
-            rows = pad_sequence(
-                groups, batch_first=True, padding_value=-1
-            )  # (M, R), -1 where a group is shorter
+            # (M, R), -1 where a group is shorter.
+            rows = pad_sequence(groups, batch_first=True, padding_value=-1)
         real, rows = rows >= 0, rows.clamp(min=0)
         x, states = start[rows], []
         for u in actions.unbind(1):

@@ -26,7 +26,25 @@ from tsmlib.envs.unstable import SimulationUnstable
 Info = dict[str, np.ndarray]  # of reset and step, and the options of reset
 
 
-class ArmVectorEnv(VectorEnv, ABC):
+class Variant:
+    """An environment that Gymnasium's record names by the physics that it has."""
+
+    physics: Physics
+
+    @property
+    def spec(self) -> GymnasiumSpec | None:
+        """Gymnasium's record of how this was made, under the id of the variant that it is."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made: GymnasiumSpec | None) -> None:
+        if made is not None:
+            named = replace(EnvSpec.parse(made.id), physics=self.physics).registered()
+            made = replace(made, id=named.id)
+        self._spec = made
+
+
+class ArmVectorEnv(Variant, VectorEnv, ABC):
     """N independent arms. Episodes are not reset on their own: ``truncated`` turns true after the
     last step.
 
@@ -60,12 +78,10 @@ class ArmVectorEnv(VectorEnv, ABC):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
         self._arm = EnvSpec.parse(env_id).varied(**changes).registered()
-        self.num_envs, self.env_id, self.task, self.physics = (
-            num_envs,
-            self._arm.id,
-            self._arm.task,
-            self._arm.physics,
-        )
+        self.num_envs = num_envs
+        self.env_id = self._arm.id
+        self.task = self._arm.task
+        self.physics = self._arm.physics
         self.max_episode_steps, self.render_mode = max_episode_steps, render_mode
         dx = self._arm.state_dim
         self.names, self.units = geometry.STATE_NAMES[:dx], geometry.STATE_UNITS[:dx]
@@ -78,15 +94,6 @@ class ArmVectorEnv(VectorEnv, ABC):
         self._elapsed: int | None = None  # steps since reset; None before the first
         self._states = np.zeros((num_envs, dx))
         self.target = np.zeros((num_envs, 2))
-
-    @property
-    def spec(self) -> GymnasiumSpec | None:
-        """Gymnasium's record of how this was made, under the id of the variant that it is."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, made: GymnasiumSpec | None) -> None:
-        self._spec = _named(made, self.physics)
 
     @abstractmethod
     def _start(self, states: np.ndarray) -> None:
@@ -261,15 +268,7 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
     return radius * np.array([np.cos(angle), np.sin(angle)])
 
 
-def _named(made: GymnasiumSpec | None, physics: Physics) -> GymnasiumSpec | None:
-    """Gymnasium's record of an environment with the id that says its physics."""
-    if made is None:
-        return None
-    spec = replace(EnvSpec.parse(made.id), physics=physics).registered()
-    return replace(made, id=spec.id)
-
-
-class ArmEnv(gymnasium.Env):
+class ArmEnv(Variant, gymnasium.Env):
     """One arm: the vector environment of the same id with N = 1, so single and bulk simulation
     agree bit for bit.
     """
@@ -286,19 +285,9 @@ class ArmEnv(gymnasium.Env):
         assert isinstance(vector, ArmVectorEnv)
         self.vector, self.env_id, self.render_mode = vector, name, render_mode
         self.names, self.units, self.task = vector.names, vector.units, vector.task
-        self.observation_space, self.action_space = (
-            vector.single_observation_space,
-            vector.single_action_space,
-        )
-
-    @property
-    def spec(self) -> GymnasiumSpec | None:
-        """Gymnasium's record of how this was made, under the id of the variant that it is."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, made: GymnasiumSpec | None) -> None:
-        self._spec = _named(made, self.vector.physics)
+        self.physics = vector.physics
+        self.observation_space = vector.single_observation_space
+        self.action_space = vector.single_action_space
 
     @property
     def target(self) -> np.ndarray:

@@ -126,9 +126,8 @@ def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
             zip(middle, bodies, strict=True), key=lambda pair: -data.geom_xpos[pair[1], 1]
         ):
             half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[[0, 2], 2]
-            second = "left" in (name := model.geom(i).name) or name.startswith(
-                "b"
-            )  # left leg, or hind leg
+            # Left leg, or hind leg.
+            second = "left" in (name := model.geom(i).name) or name.startswith("b")
             picture.rod(
                 np.stack([place - half, place + half]),
                 float(model.geom_size[i, 0]),

@@ -24,16 +24,13 @@ DT = 0.02  # s per step
 # The block: the object to push, or the obstacle (a disc seen from above).
 BLOCK_RADIUS = Physics.object_radius
 WALL = 0.24  # the walls' faces on push; the object's centre stays within 0.21 m along x and y
-BLOCK_MASS = (
-    Physics.mass
-)  # kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
+# kg, comparable to the arm's inertia (1 kg m^2), which keeps penetration small
+BLOCK_MASS = Physics.mass
 BLOCK_DECAY = 0.05  # s; a free object slows down by a factor e in this time
 RESTITUTION = 0.4  # share of the normal speed kept at a wall (the arm's contact is dead)
 FRICTION = 0.0  # the arm is so strong that friction would wedge it against the obstacle
-BLOCK_RING = (
-    0.08,
-    0.17,
-)  # m; distance of the block's centre from the shoulder at reset: within reach all around
+# m; distance of the block's centre from the shoulder at reset: within reach all around
+BLOCK_RING = (0.08, 0.17)
 BLOCK_CLEARANCE = 0.005  # m between block and arm at reset
 MAX_OVERLAP = 0.005  # m of block and arm in a given start; impacts reach 1.5 mm
 
@@ -62,18 +59,8 @@ STATE_NAMES = (
     "block_vy",
 )
 STATE_UNITS = ("rad", "rad", "rad/s", "rad/s", "m", "m", "m", "m", "m/s", "m/s")
-HALF_RANGE = (
-    1.0,
-    1.0,
-    17.0,
-    14.0,
-    0.21,
-    0.21,
-    0.21,
-    0.21,
-    4.8,
-    4.6,
-)  # in random data; angles: of cosine, sine
+# In random data; angles: of cosine, sine.
+HALF_RANGE = (1.0, 1.0, 17.0, 14.0, 0.21, 0.21, 0.21, 0.21, 4.8, 4.6)
 
 
 def arm_points(

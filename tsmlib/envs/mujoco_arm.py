@@ -178,9 +178,8 @@ def _add_block(spec: mujoco.MjSpec, physics: Physics, *, moving: bool) -> None:
 def _add_walls(spec: mujoco.MjSpec) -> None:
     """Four walls from which the object bounces; the arm passes over them."""
     log_e = np.log(RESTITUTION)
-    damping_ratio = -log_e / np.hypot(
-        np.pi, log_e
-    )  # of the damped spring that returns this share of the speed
+    # Of the damped spring that returns this share of the speed.
+    damping_ratio = -log_e / np.hypot(np.pi, log_e)
     for name, axis, sign in (("east", 0, 1), ("north", 1, 1), ("west", 0, -1), ("south", 1, -1)):
         spec.worldbody.add_geom(
             name=f"wall_{name}",

@@ -75,10 +75,8 @@ class Physics:
         return "".join(f"-{_WORDS[name]}{_spelled(value)}" for name, value in self.changed.items())
 
 
-SHORTEST, LONGEST = (
-    0.06,
-    0.24,
-)  # m: a link; both together, so that the fingertip stays within the walls
+# m: a link; both together, so that the fingertip stays within the walls
+SHORTEST, LONGEST = 0.06, 0.24
 RANGES = {
     "mass": (0.25, 4.0, " kg"),
     "damping": (0.5, 4.0, " N m s/rad"),
@@ -93,9 +91,8 @@ _WORDS = {
     "object_radius": "radius",
     "torque_gain": "gain",
 }
-PATTERN = "".join(
-    rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values()
-)  # of ``Physics.word``, a group for each
+# Of ``Physics.word``, a group for each.
+PATTERN = "".join(rf"(?:-{word}([0-9][0-9.x]*))?" for word in _WORDS.values())
 
 
 def parse(groups: Iterable[str | None]) -> Changes:

@@ -51,11 +51,8 @@ MAX_ANGLE = 1e6  # rad; beyond it, floats no longer resolve the fingertip well
 MAX_JOINT_SPEED = 1e3  # rad/s; full torque throughout reaches about 200
 MAX_BLOCK_SPEED = 100.0  # m/s
 
-ARM, BLOCK, WALLS = (
-    0b001,
-    0b010,
-    0b100,
-)  # the arm meets the block only, and passes over the walls and itself
+# The arm meets the block only, and passes over the walls and itself.
+ARM, BLOCK, WALLS = 0b001, 0b010, 0b100
 
 
 def physics_hash(env_id: str) -> str:
@@ -108,29 +105,28 @@ class PymunkArm(ArmVectorEnv):
         states = np.empty((*actions.shape[:2], len(self.names)))
         history = np.concatenate([self._history, actions], axis=1)
         over = self._history.shape[1] < self.max_episode_steps <= history.shape[1]
-        live, self._live = (
-            self._live,
-            [None] * self.num_envs,
-        )  # after a fault every episode is replayed
-        for i, torques in enumerate((geometry.GEAR * self.physics.torque_gain * actions).tolist()):
+        live = self._live
+        self._live = [None] * self.num_envs  # after a fault every episode is replayed
+        for i, torques in enumerate(self._torques(actions)):
             episode = live[i] or self._replayed(i)
             for t, (shoulder, elbow) in enumerate(torques):
                 state = episode.step(shoulder, elbow)
                 if reason := _fault(state):
                     raise SimulationUnstable(self.env_id, i, t, reason)
                 states[i, t] = state
-            live[i] = (
-                None if over else episode
-            )  # at the time limit the space, about 150 kB, is given back
+            # At the time limit the space, about 150 kB, is given back.
+            live[i] = None if over else episode
         self._live, self._history = live, history
         return states
+
+    def _torques(self, actions: np.ndarray) -> list:
+        """Actions (..., 2) in N m."""
+        return (geometry.GEAR * self.physics.torque_gain * actions).tolist()
 
     def _replayed(self, i: int) -> _Episode:
         """Episode i, built at its start and brought to the present."""
         episode = _Episode(self.task, self.physics, self._starts[i].tolist())
-        for shoulder, elbow in (
-            geometry.GEAR * self.physics.torque_gain * self._history[i]
-        ).tolist():
+        for shoulder, elbow in self._torques(self._history[i]):
             episode.step(shoulder, elbow)
         return episode
 
@@ -174,10 +170,8 @@ class _Episode:
 
     def _add_arm(self, q0: float, q1: float, dq0: float, dq1: float) -> None:
         (length, second), damping = self.physics.link_lengths, self.physics.damping
-        self.link1, self.link2 = (
-            pymunk.Body(ANCHOR_MASS, ARMATURE),
-            pymunk.Body(ELBOW_MASS, ARMATURE),
-        )
+        self.link1 = pymunk.Body(ANCHOR_MASS, ARMATURE)
+        self.link2 = pymunk.Body(ELBOW_MASS, ARMATURE)
         self.link1.angle, self.link1.angular_velocity = q0, dq0
         self.link2.angle, self.link2.angular_velocity = q0 + q1, dq0 + dq1
         self.link2.position = length * math.cos(q0), length * math.sin(q0)

@@ -89,9 +89,10 @@ def draw_scene(
                 )
             )
     elbow, _, tip = arm_points(state[:2], lengths)
+    # The pedestal.
     ax.add_patch(
         Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9)
-    )  # the pedestal
+    )
     _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)
     ax.add_patch(

@@ -88,10 +88,8 @@ class EnvSpec:
         """Name in folders and titles: ``"ReacherPush"``, ``"ReacherPush-mass2"``,
         ``"Reacher-delay5"``.
         """
-        noise, delay = (
-            f"-noise{self.noise:g}" if self.noise else "",
-            f"-delay{self.delay}" if self.delay else "",
-        )
+        noise = f"-noise{self.noise:g}" if self.noise else ""
+        delay = f"-delay{self.delay}" if self.delay else ""
         return f"{_ARMS[self.simulator][self.task]}{self.physics.word}{noise}{delay}"
 
     @property

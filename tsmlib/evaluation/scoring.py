@@ -31,9 +31,8 @@ from tsmlib.sampling import generator_of
 
 SHIFTS = 4  # pairs (s, s + 1), ..., (s, s + 4) of samples estimate the spread E|X - X'|
 LEVELS = torch.arange(1, 20) / 20  # 0.05 .. 0.95, the nominal levels of a calibration curve
-NOISE = torch.cat(
-    [torch.zeros(1), torch.logspace(-3, 0.5, 22)]
-)  # residual standard deviations to choose from
+# Residual standard deviations to choose from.
+NOISE = torch.cat([torch.zeros(1), torch.logspace(-3, 0.5, 22)])
 FLOORS = torch.logspace(-8, 4, 121)
 
 
@@ -92,9 +91,8 @@ def fit_own(samples: Tensor, truth: Tensor, *, iterations: int = 30) -> Tensor:
     for step, variance in enumerate(start):
         squares = (samples[:, :, step] - truth[:, step]).square()  # (S, N, D)
         for _ in range(iterations):
-            share = (squares @ (-0.5 / variance)).softmax(
-                0
-            )  # (S, N): whose sample the truth may have come from
+            # (S, N): whose sample the truth may have come from.
+            share = (squares @ (-0.5 / variance)).softmax(0)
             variance = (
                 torch.einsum("sn,snd->d", share, squares).div(len(truth)).clamp_min(FLOORS[0])
             )
@@ -153,9 +151,8 @@ def gaussian(error: Tensor, variance: Tensor) -> Tensor:
 
 def spread(samples: Tensor) -> Tensor:
     """Variance (N, T, D) of the samples; that of a single one is zero."""
-    return (samples - samples.mean(0)).square_().sum(0) / max(
-        1, len(samples) - 1
-    )  # ten times as fast as var
+    # Ten times as fast as var.
+    return (samples - samples.mean(0)).square_().sum(0) / max(1, len(samples) - 1)
 
 
 def ll_own(samples: Tensor, truth: Tensor, variance: Tensor) -> Tensor:

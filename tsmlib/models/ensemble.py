@@ -62,12 +62,14 @@ class Ensemble(StateModel, EnsembleModel):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for i, o in pairwise(widths):
             drawn = [nn.Linear(i, o) for _ in range(members)]
+            # (M, i, o)
             self.weights.append(
                 nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn]))
-            )  # (M, i, o)
+            )
+            # (M, 1, o)
             self.biases.append(
                 nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn]))
-            )  # (M, 1, o)
+            )
         self.output_layers = (f"weights.{layers}", f"biases.{layers}")
         if gaussian:  # limits of the stated log variance, learned as in PETS
             self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
@@ -111,11 +113,9 @@ class Ensemble(StateModel, EnsembleModel):
         """Rows sorted into a block per member, of equal size: a step is one batched product."""
         x, rows, taken, which = past.states[:, -1], len(past.states), 0, slice(None)
         if generator is None:
-            place, noise, block = (
-                torch.arange(rows, device=x.device).repeat(self.members),
-                None,
-                rows,
-            )
+            place = torch.arange(rows, device=x.device).repeat(self.members)
+            noise = None
+            block = rows
         else:
             member = draw_members(self.members, rows, generator, x)
             noise = standard_normal((rows, steps if self.gaussian else 0, x.shape[1]), generator, x)
@@ -124,9 +124,8 @@ class Ensemble(StateModel, EnsembleModel):
             counts = member.bincount()
             order, block = member.argsort(stable=True), int(counts.max())
             rank = torch.arange(rows, device=x.device) - (counts.cumsum(0) - counts)[member[order]]
-            slot = torch.empty_like(member).index_copy(
-                0, order, member[order] * block + rank
-            )  # of each row
+            # Of each row.
+            slot = torch.empty_like(member).index_copy(0, order, member[order] * block + rank)
             place = torch.zeros(len(counts) * block, dtype=torch.long, device=x.device)
             place = place.index_copy(0, slot[order], order)
 

@@ -180,9 +180,8 @@ class CausalDecoder(nn.Module):
         ):
             if layer is self.layers[-1] and not n:
                 break
-            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[
-                :, :now
-            ]  # zeros before the first position
+            # Zeros before the first position.
+            earlier = F.pad(s, (0, 0, now + dilation - s.shape[1], 0))[:, :now]
             s, skip = layer(earlier, s[:, s.shape[1] - now :], code)
             layer_inputs.append(s)
             skips.append(skip[:, now - n :])

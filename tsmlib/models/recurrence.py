@@ -77,9 +77,8 @@ class Recurrent:
     def read(self, past: Segment) -> Memory:
         """The memory after a past (B, L, .), all but its last state, with z = 0."""
         s, u = self.features(past.states[:, :-1]), past.actions[:, 1:]
-        given = torch.cat([s, u, torch.ones_like(u[..., :1])], dim=-1).transpose(
-            0, 1
-        )  # (L - 1, B, .)
+        # (L - 1, B, .)
+        given = torch.cat([s, u, torch.ones_like(u[..., :1])], dim=-1).transpose(0, 1)
         n = self.cell.shape[1] // 4
         cell = self.cell[len(self.cell) - n - given.shape[2] :]
         h = c = past.states.new_zeros(len(past.states), n)

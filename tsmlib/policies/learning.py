@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -41,6 +40,7 @@ from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, PathLike
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import TrainingState, resumable
+from tsmlib.training.fine_tune import frozen
 
 RewardFor = Callable[[Tensor], Reward]  # targets (R, dg) -> reward
 # n, generator -> starting states (n, dx), targets (n, dg)
@@ -110,7 +110,7 @@ def learn_policy(
     state = TrainingState(policy, adam, curve, options.iterations, identity, checkpoint)
     learner.state = state
     purpose = f"learning a policy, seed {seed}"
-    with resumable(state, purpose=purpose, progress=progress) as bar, _frozen(model):
+    with resumable(state, purpose=purpose, progress=progress) as bar, frozen(model):
         if not state.step:
             learner.record(measure, callback)
         for iteration in range(state.step, options.iterations):
@@ -305,18 +305,3 @@ def clip_gradients(gradients: Sequence[Tensor], norm: float) -> Tensor:
         for g in gradients:
             g *= (norm / norms).clamp(max=1).reshape(-1, *[1] * (g.ndim - 1))
     return norms
-
-
-@contextmanager
-def _frozen(model: Model) -> Iterator[None]:
-    """No gradients for the model's own weights."""
-    weights: list[nn.Parameter] = []
-    if isinstance(model, nn.Module):
-        weights = [p for p in model.parameters() if p.requires_grad]
-    for p in weights:
-        p.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for p in weights:
-            p.requires_grad_(True)

@@ -235,21 +235,17 @@ class SegmentPolicy(Policy):
         self.prior = deepcopy(prior) if isinstance(prior, ActionPrior) else ActionPrior(**prior)  # type: ignore[arg-type]
         self.prior.requires_grad_(False)
         self.action_dim, self.output_dim = len(self.prior.std), self.prior.latent_dim
-        self.past_len, self.dilations = (
-            max(1 + sum(dilations), self.prior.past_len),
-            tuple(dilations),
-        )
+        self.past_len = max(1 + sum(dilations), self.prior.past_len)
+        self.dilations = tuple(dilations)
 
         generators = _generators(copies, seed)
         self.inlet = BatchedLinear(self.features.dim + self.action_dim, channels, generators)
-        taps = [
-            BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations
-        ]  # drawn before all the outs
+        # Drawn before all the outs.
+        taps = [BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations]
         outs = [BatchedLinear(channels, 2 * channels, generators) for _ in dilations]
         self.layers = nn.ModuleList(map(GatedLayer, taps, outs))
-        self.codes = BatchedLinear(
-            target_dim, 2 * channels * len(dilations), generators
-        )  # V_f, V_g of every layer
+        # V_f, V_g of every layer.
+        self.codes = BatchedLinear(target_dim, 2 * channels * len(dilations), generators)
         self.head = BatchedLinear(channels, self.output_dim, generators)
 
     def begin(self, past: Segment, target: Tensor) -> Act:

@@ -125,9 +125,9 @@ def _only(model: nn.Module, part: Part) -> Iterator[None]:
     head = getattr(model, "output_layers", None)  # parts of its parameters' paths
     with ExitStack() as stack:
         if part == "head" and head is not None:
-            stack.enter_context(_frozen(model, but=head))
+            stack.enter_context(frozen(model, but=head))
         elif part == "codes" and isinstance(model, CodeLayers):
-            stack.enter_context(_frozen(model))
+            stack.enter_context(frozen(model))
             stack.enter_context(learned_codes(model))
         elif part != "all":
             has = (
@@ -141,13 +141,14 @@ def _only(model: nn.Module, part: Part) -> Iterator[None]:
 
 
 @contextmanager
-def _frozen(model: nn.Module, but: Sequence[str] = ()) -> Iterator[None]:
+def frozen(model: object, but: Sequence[str] = ()) -> Iterator[None]:
     """The model without gradients, but of parameters below the paths ``but``."""
-    before = {name: weight.requires_grad for name, weight in model.named_parameters()}
+    weights = dict(model.named_parameters()) if isinstance(model, nn.Module) else {}
+    before = {name: weight.requires_grad for name, weight in weights.items()}
     try:
-        for name, weight in model.named_parameters():
+        for name, weight in weights.items():
             weight.requires_grad_(any(f"{name}.".startswith(f"{path}.") for path in but))
         yield
     finally:
-        for name, weight in model.named_parameters():
+        for name, weight in weights.items():
             weight.requires_grad_(before[name])
