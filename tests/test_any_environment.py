@@ -291,6 +291,24 @@ def test_what_an_environment_says_of_itself_is_kept(made: Made) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    "said", [{"names": ("a", "b", "c")}, {"units": ["m"]}, {"angles": (7,)}, {"angles": (True,)}]
+)
+def test_an_attribute_that_means_something_else_is_not_taken_and_said(
+    made: Made, said: dict[str, Any]
+) -> None:
+    (name,) = said
+    with pytest.warns(UserWarning, match=f"attribute {name} of .* not taken"):
+        data = tsmlib.collect_random(made(type("Other", (Cart,), said)), episodes=2, horizon=3)
+    assert (data.names, data.units, data.angles) == (("x0", "x1"), ("", ""), ())
+
+
+def test_an_attribute_that_raises_is_named(made: Made) -> None:
+    kind = type("Late", (Cart,), {"dt": property(lambda self: {}["reset first"])})
+    with pytest.raises(UnsupportedEnvironment, match="dt of Late raises KeyError"):
+        tsmlib.collect_random(made(kind), episodes=2, horizon=3)
+
+
 # Actions ------------------------------------------------------------------------------------------
 
 

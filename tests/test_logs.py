@@ -183,6 +183,13 @@ ROW = log().iloc[:1]
         (log(), {"dt": 20}, "dt is 20 s, but the median step of 't' is 0.05"),
         (log(), {"dt": 0.06}, "dt is 0.06 s, but the median"),
         (log().assign(t=np.arange(19) * 20), {"episode": None}, "'t' is 20 s; expected seconds"),
+        (log().assign(t_ms=log().t), {"time": "t_ms"}, "'t_ms' is .*divide a time in milliseconds"),
+        (
+            log((9, 9)).assign(t=np.outer([1, 2], np.arange(9)).ravel() * 0.05),
+            {},
+            "expected one dt",
+        ),
+        (log(), {"states": ["x", "u"]}, "are states and actions"),
         (log().assign(run=[[1]] * 19), {}, "column 'run' names no episodes: unhashable"),
         (log(), {"states": None}, "states is None"),
         (log(), {"dt": -1}, "dt is -1"),

@@ -333,6 +333,9 @@ TURN = np.array([[[0.0, 3.0], [0.1, -3.0], [0.2, -2.9], [0.3, -2.8], [0.4, -2.7]
         ({"angles": "x0"}, "angles are"),
         ({"angles": ("theta",)}, "angles are"),
         ({"angles": ("x0",), "units": ("deg", "")}, "expected radians"),
+        ({"angles": ("x0",), "units": ("Deg.", "")}, "expected radians"),
+        ({"angles": ("q [deg]",), "names": ("q [deg]", "x")}, "without degrees"),
+        ({"states": 60 * TURN, "angles": (1,), "unwrap": True}, "jumps by .*convert degrees"),
         (
             {"states": TURN, "angles": ("x1",)},
             "'x1' jumps .* 2 step.*episode 0 after step 0.*unwrap",
@@ -420,7 +423,7 @@ def test_rounding_is_no_motion() -> None:
 
 
 def test_two_robots_are_told_apart_by_every_field(data: Trajectories) -> None:
-    robot = data.robot
+    robot = replace(data.robot, units=("rad", "", ""))
     robot.require_same(replace(robot, dt=robot.dt * 1.0001), "both")
     changes = [("env", "door"), ("dt", 0.5), ("names", ("a", "b", "d")), ("angles", (0,))]
     for field, value in [*changes, ("units", ("", "", "")), ("action_dim", 7)]:
@@ -434,7 +437,12 @@ def test_two_robots_are_told_apart_by_every_field(data: Trajectories) -> None:
 
 @pytest.mark.parametrize(
     ("index", "message"),
-    [([9], "there are 4 episodes"), (slice(0, 0), "no episode is left"), ([True], "boolean")],
+    [
+        ([9], "there are 4 episodes"),
+        (slice(0, 0), "no episode is left"),
+        ([True], "boolean"),
+        (None, "a slice, or numbers"),
+    ],
 )
 def test_a_choice_that_is_not_there_is_refused(
     data: Trajectories, index: object, message: str

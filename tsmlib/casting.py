@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -95,8 +96,20 @@ def one_each(field: str, values: Sequence[object], n: int, kind: type) -> list:
 def unwrapped(states: np.ndarray, angles: tuple[int, ...]) -> np.ndarray:
     """States (T, dx) whose angles do not jump."""
     states = states.astype(np.float64)
-    states[:, list(angles)] = np.unwrap(states[:, list(angles)], axis=0)
+    for d in angles:
+        states[:, d] = unwrapped_angle(f"state {d}", states[:, d])
     return states
+
+
+def unwrapped_angle(name: str, values: np.ndarray) -> np.ndarray:
+    """An angle (T,) that does not jump; TrajectoryError where it jumps by more than a turn."""
+    jumps = np.abs(np.diff(values))
+    if (jumps > 3 * math.pi).any():
+        raise TrajectoryError(
+            f"the angle '{name}' jumps by {jumps.max():g}; expected radians, which jump by a turn "
+            "of 2 pi where they are wrapped: convert degrees by np.radians(...)"
+        )
+    return np.unwrap(values)
 
 
 def float32(name: str, episodes: list[np.ndarray], columns: tuple[str, ...]) -> np.ndarray:
@@ -140,6 +153,17 @@ def require_bounds(actions: np.ndarray, env: str) -> None:
             f"actions of {env} go up to {most:g}; expected them within [-1, 1]. Scale them by "
             "their bounds: 2 * (u - low) / (high - low) - 1, or bounds=(low, high) of from_table"
         )
+
+
+def doubt_degrees(states: np.ndarray, robot: Robot) -> None:
+    """Say aloud that an angle without a unit goes through more turns than a joint has."""
+    for d in robot.angles:
+        if not robot.units[d] and (most := np.abs(states[:, d]).max()) > 8 * math.pi:
+            warnings.warn(
+                f"the angle '{robot.names[d]}' goes up to {most:g}, which is {most / 6.2832:.0f} "
+                "turns in radians; convert degrees by np.radians(...), or give its unit, 'rad'",
+                stacklevel=4,
+            )
 
 
 def require_no_jumps(increments: np.ndarray, steps: np.ndarray, robot: Robot) -> None:

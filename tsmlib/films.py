@@ -108,7 +108,7 @@ def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:
             return np.stack(frames)
     except Exception as error:  # of whatever library it renders with
         raise RuntimeError(
-            f"{task.env} gives no pictures here: {error!s:.200}. It needs what its "
+            f"{task.env} gives no pictures here: {error!r:.200}. It needs what its "
             "render_mode='rgb_array' needs; MuJoCo without a screen needs OpenGL by the "
             "environment variable MUJOCO_GL=egl or osmesa"
         ) from error

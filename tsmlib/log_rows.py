@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -13,6 +14,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from tsmlib import casting
 from tsmlib.checks import require_choice, require_number
 from tsmlib.robot import TrajectoryError
 
@@ -20,7 +22,8 @@ Missing = Literal["split", "interpolate", "refuse"]
 Bounds = tuple[float, float] | Mapping[str, tuple[float, float]] | Literal["data"]
 FilePath = str | os.PathLike[str]
 FILLED = 5  # missing rows, one after the other, that "interpolate" fills in at most
-SLOW = 10  # s; a longer step is taken for a time in other units unless dt says so
+MILLI = re.compile(r"(?<![a-z])(m|u|µ|n)s(ec)?(?![a-z])|milli|micro|nano")  # in a header
+SLOW = 1  # s; a longer step is taken for a time in other units unless dt says so
 EMPTY = ("", "na", "n/a", "nan", "null", "none", "<na>")  # cells of a CSV that hold nothing
 
 
@@ -54,6 +57,10 @@ class Log:
     ) -> Log:
         columns = _read_csv(Path(table)) if isinstance(table, str | os.PathLike) else table
         values = [_numbers(name, _column(columns, name)) for name in (*states, *actions)]
+        if both := set(states) & set(actions):
+            raise TrajectoryError(
+                f"columns {sorted(both)} are states and actions; expected each to be one of them"
+            )
         clock = None if time is None else _seconds(time, _column(columns, time))
         ids = np.zeros(len(values[0]), np.int64)
         if episode is not None:
@@ -91,7 +98,7 @@ class Log:
         if dt is None:
             dt = median
             self.notes.append(f"dt is {dt:g} s, the median step of '{self.time}'")
-            if dt > SLOW:
+            if dt > SLOW or MILLI.search(str(self.time).lower()):
                 raise TrajectoryError(
                     f"the median step of '{self.time}' is {dt:g} s; expected seconds: divide a "
                     f"time in milliseconds by 1e3, in nanoseconds by 1e9, or give dt={dt:g}"
@@ -103,6 +110,15 @@ class Log:
                 "both alike and in seconds: convert the time, or leave dt out"
             )
         follows = within & (np.abs(steps - dt) <= 0.5 * dt)
+        begins = np.flatnonzero(np.diff(self.ids, prepend=-1))
+        for start, end in zip(begins, [*begins[1:], len(self.ids)], strict=True):
+            own = steps[start : end - 1][follows[start : end - 1]]
+            if len(own) >= 5 and abs(np.median(own) - dt) > 0.1 * dt:
+                raise TrajectoryError(
+                    f"dt is {dt:g} s, but the median step of '{self.time}' is {np.median(own):g} "
+                    f"in the episode that begins in row {self.places[start]}; expected one dt: "
+                    "resample the log, or read episodes of each dt by themselves"
+                )
         if follows.sum() < 0.7 * within.sum():
             raise TrajectoryError(
                 f"only {follows.sum()} of {within.sum()} steps of '{self.time}' are near dt = "
@@ -128,7 +144,8 @@ class Log:
                 have = run[~gone[run, column]]
                 values = self.rows[have, column]
                 if column in angles and unwrap:
-                    self.rows[have, column] = values = np.unwrap(values)
+                    values = casting.unwrapped_angle(self.states[column], values)
+                    self.rows[have, column] = values
                 lack = run[gone[run, column]]
                 if missing != "interpolate" or not len(lack) or not len(have):
                     continue
@@ -191,7 +208,7 @@ def _column(table: Table, name: str) -> np.ndarray:
     names = getattr(table, "column_names", getattr(table, "columns", None))
     names = table if isinstance(table, Mapping) else names
     known = [str(n) for n in names] if isinstance(names, Iterable) else []
-    if known and name not in known:
+    if names is not None and name not in known:
         near = get_close_matches(name, known, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise TrajectoryError(

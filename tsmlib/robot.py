@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass, fields
@@ -10,6 +11,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tsmlib.checks import require_count, require_number, require_type
+
+RADIANS = ("", "rad", "rads", "radian", "radians")
+DEGREES = re.compile(r"(?<![a-z])deg(ree)?s?(?![a-z])|°")
 
 
 class TrajectoryError(ValueError):
@@ -47,10 +51,10 @@ class Robot:
             )
         angles = columns_of(self.angles, names)
         for angle in angles:
-            if units[angle].lower() in ("deg", "degree", "degrees", "°"):
+            if units[angle].lower() not in RADIANS or DEGREES.search(names[angle].lower()):
                 raise TrajectoryError(
                     f"the angle '{names[angle]}' has the unit {units[angle]!r}; expected radians: "
-                    "convert it by np.radians(...) and name its unit 'rad'"
+                    "convert it by np.radians(...), and name it without degrees, its unit 'rad'"
                 )
         require_count("action_dim", self.action_dim)
         dt = require_number("dt", self.dt, 0, above=True)

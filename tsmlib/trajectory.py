@@ -119,6 +119,7 @@ class Trajectories(FromLogs, Windows):
         casting.require_bounds(self.flat_actions, env)
         if not jumps:
             casting.require_no_jumps(self.increments(), self.steps, robot)
+            casting.doubt_degrees(self.flat_states, robot)
 
     @classmethod
     def from_rows(
@@ -200,9 +201,11 @@ class Trajectories(FromLogs, Windows):
     def take(self, index: slice | Sequence[int] | np.ndarray) -> Trajectories:
         """Some of the episodes: a slice, their numbers, or one bool for each."""
         try:
-            chosen = np.arange(len(self))[index].ravel()
+            chosen = np.atleast_1d(np.arange(len(self))[index])
         except IndexError as error:
             raise TrajectoryError(f"there are {len(self)} episodes: {error}") from error
+        if chosen.ndim > 1:
+            raise TrajectoryError(f"episodes are {index!r:.80}; expected a slice, or numbers (n,)")
         return self._parts([(int(i), 0, self.lengths[i]) for i in chosen])
 
     def _parts(self, parts: Sequence[tuple[int, int, int]]) -> Trajectories:

@@ -42,8 +42,10 @@ class Windows:
 
     def episode(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """States (T_i + 1, dx) and actions (T_i, du) of episode ``i``."""
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"there is no episode {i}; expected one of the {len(self)} from 0 on")
+        if not isinstance(i, int | np.integer) or not -len(self) <= i < len(self):
+            raise IndexError(
+                f"there is no episode {i!r:.80}; expected one of the {len(self)} from 0 on"
+            )
         i, row = i % len(self), int(self.offsets[i])
         steps = self.lengths[i]
         return self.flat_states[row : row + steps + 1], self.flat_actions[row - i : row - i + steps]

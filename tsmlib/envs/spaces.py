@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Space, Tuple
 
 from tsmlib.envs.ids import UnsupportedEnvironment, layers
+from tsmlib.robot import TrajectoryError, columns_of
 
 SUPPORTED = (
     "supported are observations that are a Box of numbers, or a Dict or Tuple of these, and "
@@ -83,7 +84,9 @@ def _values(env_id: str, space: Any, value: Any, name: str) -> Iterator[np.ndarr
         for i, part in enumerate(space.spaces):
             yield from _values(env_id, part, value[i], f"{name}[{i}]")
     else:
-        array = np.asarray(value)
+        value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
+        masked = np.ma.is_masked(value)
+        array = np.ma.filled(value.astype(np.float64), np.nan) if masked else np.asarray(value)
         if array.shape != space.shape:
             raise _changed(env_id, name, f"of shape {array.shape}", str(space.shape))
         if array.dtype.kind not in "fiub":
@@ -164,7 +167,17 @@ class Description:
 
 def said(env: Any, name: str) -> Any:
     """An attribute of an environment, that of its outermost layer that has one; None without."""
-    return next((getattr(layer, name) for layer in layers(env) if hasattr(layer, name)), None)
+    for layer in layers(env):
+        try:
+            return getattr(layer, name)
+        except AttributeError:
+            continue
+        except Exception as error:  # of a property, which may fail in any way
+            raise UnsupportedEnvironment(
+                f"{name} of {type(layer).__name__} raises {error!r:.100}; expected a value, or no "
+                f"attribute of this name"
+            ) from error
+    return None
 
 
 def describe(env_id: str, env: Any, observations: Space, actions: Space) -> Description:
@@ -179,30 +192,45 @@ def describe(env_id: str, env: Any, observations: Space, actions: Space) -> Desc
     def words(name: str) -> tuple[str, ...] | None:
         value = said(env, name)
         texts = isinstance(value, tuple | list) and all(isinstance(word, str) for word in value)
-        return tuple(value) if texts and len(value) == len(names) else None
+        if texts and len(value) == len(names):
+            return tuple(value)
+        _not_taken(env_id, name, value, f"{len(names)} texts, one for each number of a state")
+        return None
 
-    angles = said(env, "angles")
-    whole = isinstance(angles, tuple | list) and all(type(d) is int for d in angles)
-    if not whole or not all(0 <= d < len(names) for d in angles) or len(set(angles)) < len(angles):
-        angles = ()
+    known, angles = words("names") or names, said(env, "angles")
+    try:
+        columns = columns_of(angles if isinstance(angles, tuple | list) else (), known)
+    except TrajectoryError:
+        columns = ()
+    if not columns:
+        _not_taken(env_id, "angles", angles, f"some of 0 to {len(names) - 1}, or names of states")
     return Description(
         env_id,
         _dt(env_id, said(env, "dt"), (getattr(env, "metadata", None) or {}).get("render_fps")),
-        words("names") or names,
+        known,
         words("units") or ("",) * len(names),
-        tuple(angles),
+        columns,
         observations,
         box,
         idle_action(box),
     )
 
 
+def _not_taken(env_id: str, name: str, value: Any, expected: str) -> None:
+    if isinstance(value, tuple | list | np.ndarray) and len(value):
+        warnings.warn(
+            f"attribute {name} of {env_id} is {value!r:.80} and not taken; expected a list of "
+            f"{expected}",
+            stacklevel=6,
+        )
+
+
 def _dt(env_id: str, dt: Any, fps: Any) -> float:
     """Seconds per step, as the environment says."""
-    for seconds in (dt, fps and 1.0 / fps):
-        number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
-        if number and 0 < seconds < np.inf:
-            return float(seconds)
+    for value, inverse in ((dt, False), (fps, True)):
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if number and 0 < value < np.inf:
+            return float(1 / value if inverse else value)
     warnings.warn(
         f"{env_id} does not say how long a step is; one step counts as one second. Give it an "
         "attribute dt",
