@@ -143,7 +143,8 @@ class FromLogs:
             after = casting.numbers("next_observations", after)
         if after is not None:
             inside = np.setdiff1d(np.arange(len(x) - 1), ends - 1)
-            if after.shape != x.shape or not np.array_equal(after[inside], x[inside + 1]):
+            same = np.array_equal(*(np.float32(a) for a in (after[inside], x[inside + 1])))
+            if after.shape != x.shape or not same:
                 raise TrajectoryError(
                     "next_observations are not the observations of the next rows; expected them to "
                     "be within an episode, and its end marked in terminals or timeouts"
@@ -151,6 +152,8 @@ class FromLogs:
         named = tuple(f"action {k}" for k in range(u.shape[1]))
         u, notes = scaled(u, named, bounds)
         least = 1 if after is not None else 2
+        if not len(ends):
+            notes.append("nothing marks the end of an episode, so that all rows are one")
         if short := sum(b - a < least for a, b in parts):
             notes.append(f"{short} of {len(parts)} episodes have a single row and are left out")
         if notes:
@@ -272,7 +275,7 @@ class FromLogs:
                     if file[name].external or file[name].is_virtual:
                         raise ValueError(f"{name} has its data in other files")
                     arrays[name] = file[name][()]
-        except (OSError, ValueError, KeyError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, AttributeError, MemoryError) as error:
             raise TrajectoryError(
                 f"{path} holds no usable flat data set: {error}. Expected arrays {needed} "
                 "at its top"

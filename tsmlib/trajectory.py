@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -120,6 +120,11 @@ class Trajectories(FromLogs, Windows):
         if not jumps:
             casting.require_no_jumps(self.increments(), self.steps, robot)
             casting.doubt_degrees(self.flat_states, robot)
+
+    @classmethod
+    def ragged(cls, states: Arrays, actions: Arrays, **robot: Any) -> Trajectories:
+        """The constructor, by the name under which public scripts give unequal episodes."""
+        return cls(states, actions, **robot)
 
     @classmethod
     def from_rows(

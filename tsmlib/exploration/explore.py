@@ -200,6 +200,7 @@ def _task_identity(task: Task) -> Json:
     return {
         "task": task.name,
         "horizon": task.horizon,
+        "tolerance": task.tolerance,
         "starts": artifacts.digest({"start": start, "target": task.target})[:16],
         "reward of chance": list(fingerprint(task.reward, start, task.horizon, task.action_dim)),
     }

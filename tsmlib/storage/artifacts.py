@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -229,6 +230,7 @@ def save_model(path: PathLike, model: Model, header: Mapping[str, Json] | None =
     Raises:
         StoreError: weights that are not finite, or no room.
     """
+    require_type("path", path, (str, os.PathLike), "the path of a file")
     if not hasattr(model, "config"):
         raise TypeError(f"model is {described(model)}; expected one with config() and state_dict()")
     about = {**(header or {}), "class": type(model).__name__, "config": model.config()}
@@ -256,6 +258,8 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
         StoreError: the file is missing, damaged, of another class, or does not fit ``cls`` or
             ``expect``; both sides of what differs are named.
     """
+    require_type("cls", cls, type, "a class of models, such as tsmlib.TSM")
+    require_type("path", path, (str, os.PathLike), "the path of a file")
     path = Path(path)
     tensors, entry = _load(path, "model")
     header = entry["header"]

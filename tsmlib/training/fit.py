@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -151,6 +151,8 @@ def checked(
 ) -> tuple[Loss, Trajectories, Trajectories, TrainingOptions]:
     """Loss, training and held-out data and options, without what is None; see ``fit``."""
     require_type("model", model, nn.Module, f"a model, {CALL}")
+    if callable(data):  # public scripts give the loss second, before data, validation and options
+        loss, data, validation, options = cast(Any, (data, validation, options, loss))
     if not any(weight.requires_grad for weight in model.parameters()):
         raise ValueError("model has no weight to train; expected one with requires_grad")
     require_type("data", data, Trajectories, f"Trajectories, {CALL}")
