@@ -62,8 +62,8 @@ def figure(rows: pd.DataFrame) -> Figure:
         for _, seed in own.groupby("seed"):
             ax.plot(seed["env_steps"] / 1000, seed["value"], color=BLUE, marker=".")
         ax.axhline(level, color=PALE, linestyle="--")
-        ax.set(title=task_of(env), xlabel="1,000 steps", ylim=(0, 1000))
-        ax.set_xlim(left=0)
+        most = rows["env_steps"].max() / 1000 + 1
+        ax.set(title=task_of(env), xlabel="1,000 steps", xlim=(0, most), ylim=(0, 1000))
     axes[0].set_ylabel("return")
     return drawn
 

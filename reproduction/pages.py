@@ -76,9 +76,8 @@ def control(table: pd.DataFrame) -> str:
             values = select(rows, metric="return")["value"]
             word = f"{_spelled(values, 0)} ({len(values)})" if len(values) else "not run"
             line[f"{steps // 1000} k"] = word
-        minutes = select(table, task=task, metric="core_minutes")
-        per_step = minutes["value"].astype(float) / minutes["env_steps"].astype(float)
-        line["core min. for 25 k"] = f"{25_000 * per_step.mean():.1f}" if len(minutes) else ""
+        minutes = select(table, task=task, env_steps=25_000, metric="core_minutes")["value"]
+        line["core min., 25 k"] = f"{minutes.mean():.1f}" if len(minutes) else ""
         names = ("TD-MPC2", "DreamerV3", "SAC")
         lines.append(line | dict(zip(names, agents, strict=True)))
     return _markdown(lines)

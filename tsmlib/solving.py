@@ -124,6 +124,8 @@ class Solved:
         reward: that plans are made by.
         horizon: steps of an episode.
         options: settings.
+        goal: dimensions of the state that the environment calls its ``goal``, which no physics
+            reads: the model is blind to them.
         records: the learning curve, one per round: ``round``, ``env_steps`` until its end,
             ``return`` and its ``spread``, mean and deviation over the episodes by the
             environment's own reward, where it keeps one, ``planned_return`` by the reward of the
@@ -136,6 +138,7 @@ class Solved:
     reward: Reward
     horizon: int
     options: SolveOptions
+    goal: tuple[int, ...] = ()
     records: list[dict[str, float]] = field(default_factory=list)
 
     def __repr__(self) -> str:
@@ -210,14 +213,14 @@ def solve(
     horizon = require_count("horizon", limit if horizon is None else horizon)
     aim = reward_of(env, guided=True) if reward is None else reward
     with closing(make(env)) as made:
-        repeat = said(made, "action_repeat") or 1
+        repeat, goal = said(made, "action_repeat") or 1, said(made, "goal") or ()
     if steps < 2 * (per_round := o.episodes * horizon * repeat):
         raise ValueError(f"steps is {steps}; expected at least two rounds of {per_round}")
     data = collect_random(env, o.episodes, horizon=horizon, seed=_draw(seed, 0), rms=o.rms)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = OneStep.for_data(data, hidden=o.hidden)
-    solved = Solved(env, model, data, aim, horizon, o)
+    solved = Solved(env, model, data, aim, horizon, o, goal)
     start = torch.from_numpy(data.flat_states[data.offsets])
     identity: dict[str, Json] = {
         "settings": asdict(o),
@@ -285,7 +288,9 @@ def _fitted(
         return stored
     began, o = time.process_time(), solved.options
     train, held_out = solved.data.split(0.9, seed=seed)
-    solved.model.features.fit(train)
+    features = solved.model.features.fit(train)
+    for d in solved.goal:  # few episodes hold few goals, from which a network learns nonsense
+        features.std[2 * len(features.angles) + features.others.index(d)] = torch.inf
     schedule = TrainingOptions(
         future_len=min(20, *solved.data.lengths),
         steps=o.updates if k else o.first,

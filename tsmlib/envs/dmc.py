@@ -276,6 +276,7 @@ class ControlEnv(gymnasium.Env):
         reward_function: the reward of a control step, of states (..., dx) and actions (..., du).
         guided_reward: the same with the task's guide, to plan by.
         action_repeat: control steps of the suite in one step.
+        goal: dimensions of the state that no physics reads, the reacher's target.
     """
 
     action_repeat = REPEAT
@@ -291,6 +292,7 @@ class ControlEnv(gymnasium.Env):
         self.dt = REPEAT * self.task.substeps * self.model.opt.timestep
         self.names, self.units, self.angles = self.task.names, self.task.units, self.task.angles
         self.target = np.zeros(len(self.names) - self.model.nq - self.model.nv)
+        self.goal = tuple(range(self.model.nq + self.model.nv, len(self.names)))
         self.observation_space = Box(-np.inf, np.inf, (len(self.names),), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.model.nu,), np.float32)
 
