@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import gymnasium
@@ -152,3 +153,12 @@ def test_other_robots_are_solved_by_the_same_call() -> None:
         "tsm/Reacher-v0", 160, horizon=40, reward=reach, options=SMALL, progress=False
     )
     assert arm.records[-1]["return"] == pytest.approx(arm.records[-1]["planned_return"])
+
+
+def test_a_model_that_reaches_predicts_the_same_for_any_target() -> None:
+    few = dataclasses.replace(SMALL, first=5, updates=5)
+    model = tsmlib.solve(REACHER, 160, horizon=20, options=few, progress=False).model
+    one = torch.randn(8, 6)
+    other = torch.cat([one[:, :4], torch.randn(8, 2)], 1)
+    moved = [model.step(x, torch.zeros(8, 2))[:, :4] for x in (one, other)]
+    torch.testing.assert_close(*moved, rtol=0, atol=1e-6)

@@ -38,6 +38,8 @@ from tsmlib.storage.files import Json, PathLike, encode_nonfinite, writer_lock
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Segment, Trajectories
 
+BLIND = 1e12  # deviation in which a model sees a goal, so that it sees zero
+
 
 @dataclass(frozen=True)
 class SolveOptions:
@@ -290,7 +292,7 @@ def _fitted(
     train, held_out = solved.data.split(0.9, seed=seed)
     features = solved.model.features.fit(train)
     for d in solved.goal:  # few episodes hold few goals, from which a network learns nonsense
-        features.std[2 * len(features.angles) + features.others.index(d)] = torch.inf
+        features.std[2 * len(features.angles) + features.others.index(d)] = BLIND
     schedule = TrainingOptions(
         future_len=min(20, *solved.data.lengths),
         steps=o.updates if k else o.first,
