@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.models.base import Model, Step, as_dynamics, stepper
+from tsmlib.models.layers import first_weight
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment, initial_past
 
@@ -64,15 +65,7 @@ class MbrlModel(torch.nn.Module, OneStepEnsemble):
     def __init__(self, model: TransitionModel) -> None:
         super().__init__()
         inner = getattr(model, "model", None)
-        needed = (
-            "model",
-            "input_normalizer",
-            "obs_process_fn",
-            "target_is_delta",
-            "no_delta_list",
-            "learned_rewards",
-        )
-        missing = [name for name in needed if not hasattr(model, name)]
+        missing = [name for name in TransitionModel.__annotations__ if not hasattr(model, name)]
         if inner is not None:
             missing += [
                 f"model.{name}" for name in ("num_members", "forward") if not hasattr(inner, name)
@@ -148,7 +141,7 @@ class ForModelEnv:
         self.model, self.action_dim = model, action_dim
         self._stochastic = as_dynamics(model).stochastic
         self._past_len = as_dynamics(model).past_len
-        weight = next(model.parameters(), None) if isinstance(model, torch.nn.Module) else None
+        weight = first_weight(model)
         self.device = torch.device("cpu") if weight is None else weight.device
         self._past: Segment | None = None
 

@@ -13,10 +13,11 @@ from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tsmlib.checks import as_tensor
 from tsmlib.models.features import Features
+from tsmlib.models.layers import first_weight
 from tsmlib.sampling import Noise, NoNoise, by_generator
 from tsmlib.storage.files import Json
 from tsmlib.trajectory import Robot, Segment, Window
@@ -298,7 +299,7 @@ def inputs(
             "states (B, L, dx) and actions (B, L, du). At the start of an episode: "
             "tsmlib.trajectory.initial_past(states, past_len, action_dim)"
         )
-    weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
+    weight = first_weight(model)
     like = actions if weight is None else weight
     dtype, device = getattr(like, "dtype", None), None if weight is None else weight.device
     if dtype not in (torch.float32, torch.float64):

@@ -5,14 +5,13 @@ LSTM       x_{t+1}, h_{t+1} = f(x_t, u_t, h_t)    (iii) multi-step loss, h warme
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
 from tsmlib.checks import require_counts
 from tsmlib.models.base import Step, predict_segment, repeated
-from tsmlib.models.layers import chunked
+from tsmlib.models.layers import chunked, silu_network
 from tsmlib.models.recurrence import Recurrent
 from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
@@ -46,10 +45,8 @@ class OneStep(StateModel):
     ) -> None:
         super().__init__(state_dim, action_dim, angles)
         require_counts(hidden=hidden, layers=layers)
-        widths = [self.features.dim + action_dim, *[hidden] * layers]
-        inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
-        self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
-        self.output_layers = (f"net.{len(inner)}",)
+        self.net = silu_network(self.features.dim + action_dim, *[hidden] * layers, state_dim)
+        self.output_layers = (f"net.{2 * layers}",)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """f: (..., dx), (..., du) -> (..., dx)."""

@@ -11,7 +11,6 @@ model with H = 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 
 from tsmlib.checks import require_counts
 from tsmlib.models.base import Step, repeated, rollout
+from tsmlib.models.layers import silu_network
 from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Trajectories, Window
@@ -60,11 +60,9 @@ class Egocentric(StateModel):
         x, y, self.angle = body
         self.pairs = [[x, y], *map(list, places), *map(list, vectors)]
         self.n_places, dim = len(places), 2 * (len(places) + len(vectors)) + action_dim + 4
-        widths = [dim, *[hidden] * layers]
-        inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
-        self.net = nn.Sequential(*inner, nn.Linear(hidden, state_dim))
+        self.net = silu_network(dim, *[hidden] * layers, state_dim)
         self.linear = nn.Linear(dim, state_dim)
-        self.output_layers = (f"net.{len(inner)}", "linear")
+        self.output_layers = (f"net.{2 * layers}", "linear")
         self.register_buffer("seen_mean", torch.zeros(dim))
         self.register_buffer("seen_std", torch.ones(dim))
         self.register_buffer("step_std", torch.ones(state_dim))  # in the body's frame

@@ -19,7 +19,7 @@ BLOCK = 1024  # rows that are decoded at once on a CPU
 
 def on_device_of(model: object, *tensors: Tensor) -> tuple[Tensor, ...]:
     """``tensors`` on the device of the model's weights; as they are where it has none."""
-    weight = next(model.parameters(), None) if isinstance(model, nn.Module) else None
+    weight = first_weight(model)
     return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
 
 
@@ -30,6 +30,17 @@ def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
     return torch.cat(
         [compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)]
     )
+
+
+def first_weight(model: object) -> nn.Parameter | None:
+    """By whose type and device a model takes its inputs; None where it has no weights."""
+    return next(model.parameters(), None) if isinstance(model, nn.Module) else None
+
+
+def silu_network(*widths: int) -> nn.Sequential:
+    """Linear layers from each width to the next, with SiLU between them."""
+    inner = [m for i, o in pairwise(widths[:-1]) for m in (nn.Linear(i, o), nn.SiLU())]
+    return nn.Sequential(*inner, nn.Linear(widths[-2], widths[-1]))
 
 
 def whole_segments(future: Tensor, segment_len: int) -> tuple[Tensor, ...]:
@@ -134,9 +145,7 @@ class CausalDecoder(nn.Module):
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)
         self.state_skip = state_skip
         if state_skip:
-            widths = [channels + input_dim, state_skip, state_skip]
-            inner = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.SiLU())]
-            self.head = nn.Sequential(*inner, nn.Linear(state_skip, output_dim))
+            self.head = silu_network(channels + input_dim, state_skip, state_skip, output_dim)
         else:
             head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
             self.head = nn.Sequential(
