@@ -72,7 +72,7 @@ def episodes(case: Case, n: int, seed: int) -> Trajectories:
         "tsm/Made-v0",
         0.02,
         names,
-        ("m",) * len(names),
+        ("",) * len(names),
         case.model(torch.float32).features.angles,
     )
 

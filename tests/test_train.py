@@ -54,7 +54,7 @@ def episodes(n: int, seed: int) -> Trajectories:
         "tsm/Made-v0",
         0.02,
         ("a", "b", "c"),
-        ("m",) * 3,
+        ("rad", "m", "m"),
         (0,),
     )
 
@@ -195,10 +195,10 @@ def test_the_window_of_a_short_episode_is_as_long_as_the_episode() -> None:
 
 
 OTHER_ROBOTS = {
-    "env": Robot("tsm/Other-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (0,), 2),
-    "dt": Robot("tsm/Made-v0", 0.2, ("a", "b", "c"), ("m",) * 3, (0,), 2),
-    "names": Robot("tsm/Made-v0", 0.02, ("a", "b", "d"), ("m",) * 3, (0,), 2),
-    "angles": Robot("tsm/Made-v0", 0.02, ("a", "b", "c"), ("m",) * 3, (1,), 2),
+    "env": Robot("tsm/Other-v0", 0.02, ("a", "b", "c"), ("rad", "m", "m"), (0,), 2),
+    "dt": Robot("tsm/Made-v0", 0.2, ("a", "b", "c"), ("rad", "m", "m"), (0,), 2),
+    "names": Robot("tsm/Made-v0", 0.02, ("a", "b", "d"), ("rad", "m", "m"), (0,), 2),
+    "angles": Robot("tsm/Made-v0", 0.02, ("a", "b", "c"), ("m", "rad", "m"), (1,), 2),
 }
 
 

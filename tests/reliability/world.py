@@ -97,7 +97,7 @@ def episodes(n: int, seed: int) -> Trajectories:
         "tsm/Made-v0",
         0.02,
         ("a", "b", "c"),
-        ("m",) * 3,
+        ("rad", "m", "m"),
         (0,),
     )
 
