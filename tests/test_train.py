@@ -198,7 +198,7 @@ OTHER_ROBOTS = {
     "env": Robot("tsm/Other-v0", 0.02, ("a", "b", "c"), ("rad", "m", "m"), (0,), 2),
     "dt": Robot("tsm/Made-v0", 0.2, ("a", "b", "c"), ("rad", "m", "m"), (0,), 2),
     "names": Robot("tsm/Made-v0", 0.02, ("a", "b", "d"), ("rad", "m", "m"), (0,), 2),
-    "angles": Robot("tsm/Made-v0", 0.02, ("a", "b", "c"), ("m", "rad", "m"), (1,), 2),
+    "angles": Robot("tsm/Made-v0", 0.02, ("a", "b", "c"), ("rad", "m", "m"), (), 2),
 }
 
 

@@ -417,7 +417,7 @@ def harmless(
 OTHERWISE: dict[str, Any] = {
     "dt": 0.01,
     "names": [f"x{i}" for i in range(6)],
-    "units": ["cm"] * 6,
+    "units": ["rad"] * 2 + ["cm"] * 4,
     "angles": [0],
     "noise": 0.25,
     "delay": 3,
