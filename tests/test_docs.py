@@ -40,7 +40,7 @@ def test_the_programs_of_the_readme_push_read_a_log_and_plan_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    push, logs, robot = BLOCK.findall(README.read_text())
+    _solve, push, logs, robot = BLOCK.findall(README.read_text())  # the first takes minutes
     names: dict[str, Any] = {}
     exec(push, names)
     assert float(names["trial"].final_distance[0]) < 0.05
