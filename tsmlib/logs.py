@@ -143,7 +143,7 @@ class FromLogs:
             after = casting.numbers("next_observations", after)
         if after is not None:
             inside = np.setdiff1d(np.arange(len(x) - 1), ends - 1)
-            same = np.array_equal(*(np.float32(a) for a in (after[inside], x[inside + 1])))
+            same = np.array_equal(np.float32(after[inside]), np.float32(x[inside + 1]))
             if after.shape != x.shape or not same:
                 raise TrajectoryError(
                     "next_observations are not the observations of the next rows; expected them to "
