@@ -141,7 +141,6 @@ class FromLogs:
         after = next_observations
         if after is not None:
             after = casting.numbers("next_observations", after)
-        if after is not None:
             inside = np.setdiff1d(np.arange(len(x) - 1), ends - 1)
             same = np.array_equal(np.float32(after[inside]), np.float32(x[inside + 1]))
             if after.shape != x.shape or not same:
