@@ -194,9 +194,12 @@ class OpenLoop:
 
 
 def open_loop(actions: Tensor) -> OpenLoop:
-    """The open-loop controller that plays actions from the start of an episode.
+    """Make the open-loop controller that plays actions from the start of an episode.
 
     Args:
         actions: (N, T, du) in [-1, 1].
+
+    Returns:
+        The controller, for ``execute`` and ``collect``.
     """
     return OpenLoop(as_tensor("actions", actions, ("N", "T", "du")))

@@ -13,26 +13,57 @@ from tsmlib.robot import TrajectoryError
 
 
 class Segment(NamedTuple):
-    """States (B, L, dx), in physical units, with the actions (B, L, du) that led to them."""
+    """States in physical units, with the actions that led to them.
+
+    Args:
+        states: (B, L, dx).
+        actions: (B, L, du) in [-1, 1].
+    """
 
     states: Tensor
     actions: Tensor
 
     def then(self, following: Segment) -> Segment:
-        """This segment with ``following`` appended: (B, L, .) and (B, K, .) give (B, L + K, .)."""
+        """Append another segment.
+
+        Args:
+            following: states and actions (B, K, .).
+
+        Returns:
+            States (B, L + K, dx) and actions (B, L + K, du).
+        """
         return Segment(*(torch.cat(pair, dim=1) for pair in zip(self, following, strict=True)))
 
     def last(self, length: int) -> Segment:
-        """The last ``length`` steps, as the past of what follows."""
+        """Take the last steps, as the past of what follows.
+
+        Args:
+            length: steps to take; all, where the segment has fewer.
+
+        Returns:
+            States (B, length, dx) and actions (B, length, du).
+        """
         return Segment(self.states[:, -length:], self.actions[:, -length:])
 
     def to(self, device: torch.device | str) -> Segment:
-        """The same segment on ``device``."""
+        """Move the segment to a device.
+
+        Args:
+            device: such as "cuda".
+
+        Returns:
+            The same states and actions there.
+        """
         return Segment(self.states.to(device), self.actions.to(device))
 
 
 class Window(NamedTuple):
-    """A past segment X-, U- (B, L, .) and the future X+, U+ (B, K, .) that followed it."""
+    """A past and the future that followed it.
+
+    Args:
+        past: X-, U- (B, L, .).
+        future: X+, U+ (B, K, .).
+    """
 
     past: Segment
     future: Segment

@@ -151,7 +151,14 @@ class Solved:
         )
 
     def controller(self, *, seed: int = 0) -> Controller:
-        """The controller of one run of episodes, as ``collect`` and ``execute`` take it."""
+        """Make the controller of one run of episodes, as ``collect`` and ``execute`` take it.
+
+        Args:
+            seed: of the candidates of its plans.
+
+        Returns:
+            A controller that plans anew every ``options.every`` seconds.
+        """
         o, dt = self.options, self.data.dt
         every = max(1, round(o.every / dt))
         ahead = max(every + 1, round(o.ahead / dt))
@@ -159,17 +166,40 @@ class Solved:
         return Controller(self.model, self.reward, space, every, o, seed)
 
     def task(self, episodes: int = 1, *, seed: int = 500) -> Task:
-        """Episodes that begin by the resets of ``seed`` and those after it."""
+        """Make the task of episodes that begin by the environment's resets.
+
+        Args:
+            episodes: B, their number.
+            seed: of the first reset; later episodes take the seeds after it.
+
+        Returns:
+            The task, of ``horizon`` steps.
+        """
         return Task.from_env(
             self.env, n=episodes, horizon=self.horizon, reward=self.reward, seed=seed
         )
 
     def play(self, episodes: int = 1, *, seed: int = 500) -> Trial:
-        """Run episodes in closed loop; ``own_return`` is by the environment's own reward."""
+        """Run episodes in closed loop.
+
+        Args:
+            episodes: B, their number.
+            seed: of the first reset and of the plans; later episodes take the seeds after it.
+
+        Returns:
+            The trial, whose ``own_return`` is by the environment's own reward.
+        """
         return execute(self.task(episodes, seed=seed), self.controller(seed=seed), past_len=1)
 
     def film(self, *, seed: int = 500) -> np.ndarray:
-        """Frames (T, H, W, 3) uint8 of one episode."""
+        """Film one episode in closed loop.
+
+        Args:
+            seed: of the reset and of the plans.
+
+        Returns:
+            Frames (T, H, W, 3) uint8.
+        """
         return film(self.task(seed=seed), self.play(seed=seed), 0)
 
 

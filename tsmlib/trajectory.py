@@ -123,7 +123,19 @@ class Trajectories(FromLogs, Windows):
 
     @classmethod
     def ragged(cls, states: Arrays, actions: Arrays, **robot: Any) -> Trajectories:
-        """The constructor, by the name under which public scripts give unequal episodes."""
+        """Make episodes of unequal length, by the name that public scripts use for the constructor.
+
+        Args:
+            states: a list of (T_i + 1, dx), physical units.
+            actions: a list of (T_i, du), within [-1, 1].
+            robot: further arguments of the class by name, such as env and dt.
+
+        Returns:
+            The episodes.
+
+        Raises:
+            TrajectoryError: as of the class.
+        """
         return cls(states, actions, **robot)
 
     @classmethod
@@ -137,15 +149,21 @@ class Trajectories(FromLogs, Windows):
         *,
         jumps: bool = False,
     ) -> Trajectories:
-        """Episodes that lie one after the other.
+        """Make episodes of rows that lie one after the other.
 
         Args:
-            states: (sum of T_i + 1, dx).
-            actions: (sum of T_i, du).
+            states: (sum of T_i + 1, dx), physical units.
+            actions: (sum of T_i, du), within [-1, 1].
             lengths: the steps T_i of each episode.
             robot: what the numbers mean.
             terminated: whether the environment ended each episode.
             jumps: whether angles may jump by more than pi.
+
+        Returns:
+            The episodes.
+
+        Raises:
+            TrajectoryError: the rows are not as many as the lengths say, or as of the class.
         """
         steps = np.asarray(casting.one_each("lengths", lengths, len(lengths), np.integer))
         ends = np.cumsum(steps)
@@ -204,7 +222,17 @@ class Trajectories(FromLogs, Windows):
     __hash__ = None  # type: ignore[assignment] # arrays can be changed
 
     def take(self, index: slice | Sequence[int] | np.ndarray) -> Trajectories:
-        """Some of the episodes: a slice, their numbers, or one bool for each."""
+        """Take some of the episodes.
+
+        Args:
+            index: a slice, their numbers (n,), or one bool for each.
+
+        Returns:
+            The episodes in that order.
+
+        Raises:
+            TrajectoryError: there is no such episode, or none is left.
+        """
         try:
             chosen = np.atleast_1d(np.arange(len(self))[index])
         except IndexError as error:
@@ -229,7 +257,7 @@ class Trajectories(FromLogs, Windows):
         )
 
     def split(self, share: float = 0.9, *, seed: int = 0) -> tuple[Trajectories, Trajectories]:
-        """Training and held-out data: episodes in random order, divided.
+        """Divide episodes in random order into training and held-out data.
 
         Args:
             share: of the episodes that are for training, above 0 and below 1; both sides get one.
@@ -237,6 +265,9 @@ class Trajectories(FromLogs, Windows):
 
         Returns:
             Training data and held-out data.
+
+        Raises:
+            TrajectoryError: there are fewer than two episodes, or the share is 1.
         """
         share = require_number("share", share, 0, 1, above=True)
         if len(self) < 2 or share == 1:
@@ -249,12 +280,29 @@ class Trajectories(FromLogs, Windows):
         return self.take(np.sort(order[:n])), self.take(np.sort(order[n:]))
 
     def cut(self, steps: int) -> Trajectories:
-        """The first ``steps`` steps of every episode that has as many; the others are left out."""
+        """Take the first steps of every episode that has as many; the others are left out.
+
+        Args:
+            steps: of each new episode.
+
+        Returns:
+            Episodes of equal length.
+
+        Raises:
+            TrajectoryError: no episode has as many; a warning counts those left out.
+        """
         counts = self.window_counts(require_count("steps", steps), "cut(steps)")
         return self._parts([(i, 0, steps) for i in np.flatnonzero(counts).tolist()])
 
     def pieces(self, steps: int) -> Trajectories:
-        """Every episode in consecutive pieces of ``steps`` steps; the last one may be shorter."""
+        """Cut every episode into consecutive pieces.
+
+        Args:
+            steps: of each piece; the last one of an episode may be shorter.
+
+        Returns:
+            The pieces as episodes.
+        """
         require_count("steps", steps)
         return self._parts(
             [
@@ -265,7 +313,17 @@ class Trajectories(FromLogs, Windows):
         )
 
     def joined(self, other: Trajectories) -> Trajectories:
-        """The episodes of both; TrajectoryError where they are not of one robot."""
+        """Join the episodes of two data sets of one robot.
+
+        Args:
+            other: the episodes that come last.
+
+        Returns:
+            The episodes of both.
+
+        Raises:
+            TrajectoryError: they are not of one robot.
+        """
         require_type("other", other, Trajectories, "Trajectories")
         self.robot.require_same(other.robot, "the episodes to be joined")
         return object.__new__(Trajectories)._fill(
@@ -296,6 +354,10 @@ class Trajectories(FromLogs, Windows):
         return states, np.where((at[:-1] < ends)[..., None], actions, np.float32(0))
 
     def increments(self) -> np.ndarray:
-        """x_{t+1} - x_t of all steps (sum of T_i, dx), in float64."""
+        """Subtract from each state the one before it, x_{t+1} - x_t.
+
+        Returns:
+            Increments (sum of T_i, dx), physical units, in float64.
+        """
         steps = np.diff(self.flat_states.astype(np.float64), axis=0)
         return np.delete(steps, self.offsets[1:] - 1, axis=0)

@@ -41,7 +41,17 @@ class Windows:
         return np.cumsum(self.steps + 1) - self.steps - 1
 
     def episode(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """States (T_i + 1, dx) and actions (T_i, du) of episode ``i``."""
+        """Take one episode.
+
+        Args:
+            i: its number; negative ones count from the end.
+
+        Returns:
+            States (T_i + 1, dx), physical units, and actions (T_i, du).
+
+        Raises:
+            IndexError: there is no such episode.
+        """
         if not isinstance(i, int | np.integer) or not -len(self) <= i < len(self):
             raise IndexError(
                 f"there is no episode {i!r:.80}; expected one of the {len(self)} from 0 on"
@@ -51,9 +61,16 @@ class Windows:
         return self.flat_states[row : row + steps + 1], self.flat_actions[row - i : row - i + steps]
 
     def segment(self, past_len: int = 0) -> Segment:
-        """All episodes, of one length, as one segment (N, L + T, .) that begins at rest.
+        """Join all episodes, of one length, to one segment that begins at rest.
 
-        Column past_len + t holds u_t and x_{t+1}.
+        Args:
+            past_len: L, steps of rest before the first.
+
+        Returns:
+            States (N, L + T, dx) and actions (N, L + T, du); column L + t holds u_t and x_{t+1}.
+
+        Raises:
+            TrajectoryError: episodes differ in length.
         """
         self.require_equal_lengths("data.segment(...)")
         every = torch.arange(len(self))
@@ -61,12 +78,16 @@ class Windows:
         return window.past.then(window.future)
 
     def tensors(self) -> Episodes:
-        """The episodes as tensors, which share the memory of the arrays."""
+        """Give the episodes as tensors, which share the memory of the arrays.
+
+        Returns:
+            States (sum of T_i + 1, dx), actions (sum of T_i, du) and lengths (N,).
+        """
         arrays = (self.flat_states, self.flat_actions, self.steps)
         return Episodes(*(torch.from_numpy(array) for array in arrays))
 
     def windows(self, episodes: Tensor, starts: Tensor, past_len: int, future_len: int) -> Window:
-        """One window per pair of an episode and a start.
+        """Take one window per pair of an episode and a start.
 
         Args:
             episodes: (B,) numbers of episodes.
@@ -76,6 +97,9 @@ class Windows:
 
         Returns:
             The past (B, L, .) and the future (B, K, .).
+
+        Raises:
+            TrajectoryError: there is no such episode, or a future that ends beyond it.
         """
         for name, length in (("past_len", past_len), ("future_len", future_len)):
             require_count(name, length, least=0)
@@ -105,13 +129,31 @@ class Windows:
         return self.windows(at, end, require_count("past_len", past_len), 0).past
 
     def window_counts(self, future_len: int, what: str) -> np.ndarray:
-        """Windows of ``future_len`` steps in each episode (N,); a warning counts those left out."""
+        """Count the windows in each episode; a warning counts the episodes that have none.
+
+        Args:
+            future_len: K, steps of the future.
+            what: the windows are for, for the message.
+
+        Returns:
+            Windows of each episode (N,).
+
+        Raises:
+            TrajectoryError: no episode has ``future_len`` steps.
+        """
         return window_counts(
             torch.from_numpy(self.steps), future_len, f"{what} of {self.env}"
         ).numpy()
 
     def require_equal_lengths(self, purpose: str) -> None:
-        """TrajectoryError where episodes differ in length, for a ``purpose`` that needs it."""
+        """Require that all episodes have one length.
+
+        Args:
+            purpose: what needs it, for the message.
+
+        Raises:
+            TrajectoryError: they differ; the message names what to use.
+        """
         if len(set(self.lengths)) > 1:
             raise TrajectoryError(
                 f"{purpose} needs episodes of equal length; those of {self.env} have "

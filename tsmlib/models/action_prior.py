@@ -92,13 +92,24 @@ class ActionPrior(Configured):
         return prior
 
     def take_robot(self, data: Trajectories) -> None:
-        """Take the robot of training data and, the first time, the scale of their actions."""
+        """Take the robot of training data and, the first time, the scale of their actions.
+
+        Args:
+            data: training episodes.
+        """
         if self.robot is None:
             self.fit_scale(data)
         self.robot = data.robot
 
     def fit_scale(self, data: Trajectories | Tensor) -> ActionPrior:
-        """Take the deviation of training actions, or of (N, T, du); 1 of one that never changes."""
+        """Take the standard deviation of training actions as their scale.
+
+        Args:
+            data: training episodes, or actions (N, T, du) in [-1, 1].
+
+        Returns:
+            The prior itself, where an action that never changes has the scale 1.
+        """
         if isinstance(data, Trajectories):
             actions = torch.from_numpy(data.flat_actions)
         else:
@@ -109,11 +120,26 @@ class ActionPrior(Configured):
         return self
 
     def encode(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Q(Z | U+): (B, H, du) -> mean and log variance (B, dz)."""
+        """Encode action segments, Q(Z | U+).
+
+        Args:
+            actions: (B, H, du) in [-1, 1].
+
+        Returns:
+            Mean and log variance of Z, (B, dz) each.
+        """
         return self.encoder(actions / self.std)
 
     def decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
-        """P(U+ | U-, z): past actions (B, L, du), codes (B, dz) -> actions (B, H, du)."""
+        """Decode one action segment per code, P(U+ | U-, z).
+
+        Args:
+            past_actions: (B, L, du) in [-1, 1]; zeros at the start of an episode.
+            z: codes (B, dz), without unit.
+
+        Returns:
+            Actions (B, H, du) in [-1, 1].
+        """
         return chunked(self._decode, past_actions, z)
 
     def _decode(self, past_actions: Tensor, z: Tensor) -> Tensor:
@@ -127,7 +153,15 @@ class ActionPrior(Configured):
         return torch.stack(actions, dim=1)  # (B, H, du)
 
     def first(self, past_actions: Tensor, z: Tensor) -> Tensor:
-        """The first action (B, du) of ``decode`` alone, by which a segment policy acts."""
+        """Decode the first action of a segment alone, by which a segment policy acts.
+
+        Args:
+            past_actions: (B, L, du) in [-1, 1]; zeros at the start of an episode.
+            z: codes (B, dz), without unit.
+
+        Returns:
+            Actions (B, du) in [-1, 1], those with which ``decode`` begins.
+        """
         step = self.decoder(past_actions / self.std, z, 1)[:, 0]
         return (past_actions[:, -1] + self.std * step).clamp(-1, 1)
 
@@ -154,10 +188,20 @@ class ActionPrior(Configured):
         return as_tensor(name, value, shape, dtype=self.std.dtype, device=self.std.device)
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error plus beta KL per segment, free-running over the window's future.
+        """Sum squared error and beta KL over segments, free-running over the window's future (A.2).
 
         The past of the first segment is the window's, that of each later one the decoded segment
         before it.
+
+        Args:
+            window: past (B, L, .) and future (B, n H, .), of which the actions in [-1, 1] are read.
+            generator: of the codes, drawn from Q.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+
+        Raises:
+            ValueError: the future is not a whole number of segments.
         """
         past, loss = window.past.actions, window.past.actions.new_zeros(())
         for future in whole_segments(window.future.actions, self.segment_len):

@@ -44,18 +44,35 @@ class DynamicsModel(Protocol):
     features: Features
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read ``past`` (B, L, .) and predict one action at a time, for up to H actions.
+        """Read the past and predict one action at a time, for up to H actions.
 
-        No generator: the mode; with one: a sample. What is drawn for a segment is drawn here.
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: None for the mode, else of a sample, all of whose segment is drawn here.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
         """
         ...
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Objective of the training: a scalar for one batch of windows."""
+        """Compute the objective of the training on one batch of windows.
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: of random numbers.
+
+        Returns:
+            A scalar.
+        """
         ...
 
     def config(self) -> dict[str, Json]:
-        """The constructor's arguments, as they travel with the weights."""
+        """Tell the constructor's arguments, as they travel with the weights.
+
+        Returns:
+            The arguments by name, as JSON values.
+        """
         ...
 
 

@@ -49,21 +49,53 @@ class OneStep(StateModel):
         self.output_layers = (f"net.{2 * layers}",)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        """f: (..., dx), (..., du) -> (..., dx)."""
+        """Predict one step, x_{t+1} = f(x_t, u_t).
+
+        Args:
+            x: states (..., dx) in physical units.
+            u: actions (..., du) in [-1, 1].
+
+        Returns:
+            The next states (..., dx) in physical units.
+        """
         return x + self.features.step_std * self.net(torch.cat([self.features(x), u], dim=-1))
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Go on from the last state, for any number of steps. There is nothing to draw."""
+        """Go on from the last state, for any number of steps.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: unused; nothing is drawn.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
+        """
         return repeated(self.step, past.states[:, -1])
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """(i) Squared error of one-step increments on every (x_t, u_t, x_{t+1}) of the future."""
+        """Square the errors of one-step increments on every (x_t, u_t, x_{t+1}) (section 5.2, i).
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+        """
         before = states_before(window)
         predicted = self.step(before, window.future.actions)
         return self.features.increments(predicted, window.future.states).square().sum((1, 2)).mean()
 
     def multi_step_loss(self, window: Window, generator: Noise) -> Tensor:
-        """(ii) Squared error of the states that its own predictions reach, over the future."""
+        """Square the errors of the states that its own predictions reach (section 5.2, ii).
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+        """
         predicted = predict_segment(self, window.past, window.future.actions)
         return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
 
@@ -104,13 +136,30 @@ class LSTM(StateModel):
             self.cell.bias[:hidden] = 1.0  # forget gates start open
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Warm the hidden state up on the past (B, L, .), then carry it; nothing is drawn."""
+        """Warm the hidden state up on the past, then carry it from step to step.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: unused; nothing is drawn.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
+        """
         return self._recurrent().begin(past)
 
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
+        """Predict the states that ``begin`` steps through, by blocks of rows.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         return chunked(self._decode, *past, actions)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor) -> Tensor:
@@ -124,6 +173,14 @@ class LSTM(StateModel):
         return Recurrent.of(self.features, self.cell, self.out)
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Squared error of the states over the whole future, on the model's own predictions."""
+        """Square the errors of the states that its own predictions reach (section 5.2, iii).
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+        """
         predicted = predict_segment(self, window.past, window.future.actions)
         return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()

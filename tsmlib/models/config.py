@@ -40,7 +40,11 @@ class Configured(nn.Module):
         cls.__init__ = recording  # type: ignore[method-assign, assignment]
 
     def config(self) -> dict[str, Json]:
-        """The constructor's arguments as JSON values."""
+        """Tell the constructor's arguments, as they travel with the weights.
+
+        Returns:
+            The arguments by name, as JSON values.
+        """
         return dict(self._config)
 
     def __repr__(self) -> str:

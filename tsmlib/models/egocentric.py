@@ -68,7 +68,11 @@ class Egocentric(StateModel):
         self.register_buffer("step_std", torch.ones(state_dim))  # in the body's frame
 
     def take_robot(self, data: Trajectories) -> None:
-        """Take the robot of training data and, where there are none yet, their statistics."""
+        """Take the robot of training data and, where there are none yet, their statistics.
+
+        Args:
+            data: training episodes.
+        """
         fitted = self.features.fitted
         super().take_robot(data)
         if fitted:
@@ -83,7 +87,15 @@ class Egocentric(StateModel):
         self.step_std.copy_(step.std(0))
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        """(..., dx), (..., du) -> (..., dx)."""
+        """Predict one step in the frame of the body.
+
+        Args:
+            x: states (..., dx) in physical units.
+            u: actions (..., du) in [-1, 1].
+
+        Returns:
+            The next states (..., dx) in physical units.
+        """
         s = (self._seen(x, u) - self.seen_mean) / self.seen_std
         d = (self.net(s) + self.linear(s)) * self.step_std
         cosine, sine = x[..., self.angle, None].cos(), x[..., self.angle, None].sin()
@@ -92,11 +104,27 @@ class Egocentric(StateModel):
         return x + moved[..., self._order()]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Go on from the last state, for any number of steps. There is nothing to draw."""
+        """Go on from the last state, for any number of steps.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: unused; nothing is drawn.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
+        """
         return repeated(self.step, past.states[:, -1])
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Mean distance, in the size of steps, of the states it reaches on its own predictions."""
+        """Average the distance of the states that its own predictions reach, in the size of steps.
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            The mean over batch and steps, a scalar without unit.
+        """
         predicted = rollout(self, window.past, window.future.actions)
         apart = self.features.increments(predicted, window.future.states)
         return (apart.square().sum(-1) + 1e-4).sqrt().mean()

@@ -78,12 +78,16 @@ class Ensemble(StateModel, EnsembleModel):
     def increments(
         self, x: Tensor, u: Tensor, which: slice = slice(None)
     ) -> tuple[Tensor, Tensor | None]:
-        """Mean and log variance (M, R, dx) of the increments, in units of ``step_std``.
+        """Predict the increments of a step by each member.
 
         Args:
-            x: states (M, R, dx).
-            u: actions (M, R, du).
+            x: states (M, R, dx) in physical units.
+            u: actions (M, R, du) in [-1, 1].
             which: the members that are asked, M of them.
+
+        Returns:
+            Mean and log variance (M, R, dx), in units of ``step_std``; None for the log variance of
+            members that are not Gaussian.
         """
         s = torch.cat([self.features(x), u], dim=-1)
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -95,17 +99,31 @@ class Ensemble(StateModel, EnsembleModel):
         return mean, self.log_variance_min + F.softplus(log_variance - self.log_variance_min)
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Go on from the last state. No generator: every step takes the mean of all members.
+        """Go on from the last state, by the mean of all members or by one member per row.
 
-        With one, each row keeps a member of its own, and in the Gaussian form adds the noise which
-        that member states, drawn for a whole segment.
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: None for the mean; else of each row's member and, in the Gaussian form, of
+                the noise which that member states.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
         """
         return self._begin(past, self.segment_len, generator)
 
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through, with noise for as many steps."""
+        """Predict the states that ``begin`` steps through, with noise for as many steps.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1].
+            generator: as of ``begin``.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         step = self._begin(past, actions.shape[1], generator)
         return torch.stack([step(u) for u in actions.unbind(1)], dim=1)
 
@@ -148,9 +166,14 @@ class Ensemble(StateModel, EnsembleModel):
         return step
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Negative log-likelihood, or squared error, of one-step increments: mean over members.
+        """Compute the negative log-likelihood, or squared error, of one-step increments.
 
-        The tuples of the batch are dealt out to the members at random.
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: of the tuples of the batch, dealt out to the members at random.
+
+        Returns:
+            The mean over members, a scalar without unit.
         """
         future = window.future
         tuples = [

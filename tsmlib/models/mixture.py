@@ -101,7 +101,15 @@ class Mixture(nn.Module, EnsembleModel):
         return f"Mixture([{', '.join(type(model).__name__ for model in self.models)}])"
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read the past (B, L, .). No generator: the mode; with one: a sample."""
+        """Read the past by the models, and step through the mean of their modes or a sample.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: None for the mode; else of each row's model and of what that model draws.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
+        """
         shares = list(self._shares(past.states, generator))
         steps = [
             stepper(
@@ -121,7 +129,16 @@ class Mixture(nn.Module, EnsembleModel):
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """States (B, K, dx) under ``actions`` (B, K, du)."""
+        """Predict the states that ``begin`` steps through.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1].
+            generator: as of ``begin``.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         shares = list(self._shares(past.states, generator))
         states = [
             rollout(
@@ -135,13 +152,24 @@ class Mixture(nn.Module, EnsembleModel):
         return _joined(states, shares, mode=generator is None)
 
     def loss(self, *_: object) -> NoReturn:
-        """TypeError: what is trained is each model."""
+        """Refuse a training, since each model is trained by itself.
+
+        Args:
+            _: whatever a training gives.
+
+        Raises:
+            TypeError: always.
+        """
         raise TypeError(
             "a Mixture is not trained; train or fine-tune each of its models, then make it anew"
         )
 
     def config(self) -> NoReturn:
-        """TypeError: what is stored is each model."""
+        """Refuse a file, since each model is stored by itself.
+
+        Raises:
+            TypeError: always.
+        """
         raise TypeError(
             "a Mixture is not stored; save each of its models, and make it of what load_model gives"
         )

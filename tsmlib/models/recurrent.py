@@ -105,7 +105,15 @@ class RecurrentTSM(StateModel):
         return self.decoder.codes, [self.decoder.cell]
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
-        """Read the past (B, L, .): z = 0, or with a generator z ~ N(0, I) anew every H steps."""
+        """Read the past, then carry the hidden state from step to step.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            generator: None for the mode, z = 0; else of z ~ N(0, I), drawn anew every H steps.
+
+        Returns:
+            A function: actions (B, du) -> the states (B, dx) that they lead to, in physical units.
+        """
         x, taken = past.states[:, -1], 0
         codes = x.new_zeros(len(x), self.latent_dim)
         advance = self._recurrent().begin(past, lambda: codes)
@@ -122,17 +130,29 @@ class RecurrentTSM(StateModel):
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through, by blocks of rows."""
+        """Predict the states that ``begin`` steps through, by blocks of rows.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1].
+            generator: as of ``begin``.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         z = self._codes(past.states[:, -1], actions.shape[1], generator)
         return chunked(self._decode, *past, actions, z)
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
-        """States (B, K, dx) under actions and codes, each from the predicted one before it.
+        """Decode actions and codes into states, each from the predicted one before it.
 
         Args:
-            past: (B, L, .).
-            actions: (B, K, du).
-            z: (B, dz), of the first H steps, or (B, n, dz), of the first n H; z = 0 after them.
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1].
+            z: codes (B, dz) of the first H steps, or (B, n, dz) of the first n H; z = 0 after them.
+
+        Returns:
+            States (B, K, dx) in physical units.
         """
         return chunked(self._decode, *past, actions, z if z.ndim == 3 else z[:, None])
 
@@ -144,16 +164,31 @@ class RecurrentTSM(StateModel):
         return self.decoder.over(self.features)
 
     def point_loss(self, window: Window, generator: Noise) -> Tensor:
-        """|m - x|, m the mode (z = 0), of each H steps as a whole, and the mean of these."""
+        """Average |m - x| over the pieces of H steps, where m is the mode (z = 0).
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: unused; nothing is drawn.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+        """
         (past, future), x, decoder = window, window.past.states[:, -1], self._recurrent()
         states = self._run(decoder, x, decoder.read(past), future.actions, self._codes(x, 0, None))
         parts = self._parts(states, future.states)
         return torch.stack([distance(mode, x) for mode, x in parts]).mean()
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| of each H steps, and the mean of these.
+        """Average mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| over the pieces of H steps.
 
-        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All free-running through the future.
+        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All are free-running through the future.
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            generator: of the codes of the samples.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
         """
         (past, future), draws, decoder = window, SAMPLES + (self.mode_weight > 0), self._recurrent()
         n, steps = future.actions.shape[:2]

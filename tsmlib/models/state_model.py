@@ -48,7 +48,11 @@ class StateModel(Configured):
         return model
 
     def take_robot(self, data: Trajectories) -> None:
-        """Take the robot of training data and, where there are none yet, their statistics."""
+        """Take the robot of training data and, where there are none yet, their statistics.
+
+        Args:
+            data: training episodes.
+        """
         if not self.features.fitted:
             self.features.fit(data)
         self.robot = data.robot

@@ -162,18 +162,30 @@ class TSM(StateModel):
     def predict_segment(
         self, past: Segment, actions: Tensor, *, generator: Noise | None = None
     ) -> Tensor:
-        """The states (B, K, dx) that ``begin`` steps through with all of its actions planned."""
+        """Predict the states that ``begin`` steps through with all of its actions planned.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1], up to H of them.
+            generator: of the code; None for the prior's mean.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         return self.decode(past, actions, self.draw(past, actions, generator=generator))
 
     def prior(
         self, past: Segment, planned: Tensor | None = None, *, k: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """P(Z): mean and log variance of the code of the segment that follows, (B, dz) each.
+        """Give P(Z), the prior of the code of the segment that follows.
 
         Args:
-            past: states and actions (B, L, .), H steps or more.
+            past: states (B, L, dx) in physical units and actions (B, L, du), H steps or more.
             planned: (B, K, du), the first K <= H actions of the segment; None, none are known.
             k: (B, 1), how many of them a learned prior is shown; None, all.
+
+        Returns:
+            Mean and log variance of Z, (B, dz) each.
         """
         if self.code_prior is None:
             zeros = past.states.new_zeros(len(past.states), self.latent_dim)
@@ -185,12 +197,27 @@ class TSM(StateModel):
     def draw(
         self, past: Segment, planned: Tensor | None = None, *, generator: Noise | None = None
     ) -> Tensor:
-        """A code (B, dz) of the ``prior``; its mean without a generator."""
+        """Draw a code of the ``prior``.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            planned: (B, K, du), the first K <= H actions of the segment; None, none are known.
+            generator: of the draw; None for the mean.
+
+        Returns:
+            Codes (B, dz).
+        """
         mean, log_variance = self.prior(past, planned)
         return mean if generator is None else sample_posterior(mean, log_variance, generator)
 
     def encode(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Q(Z | X+): (B, H, dx) -> mean and log variance of Z, (B, dz) each.
+        """Encode future states, Q(Z | X+).
+
+        Args:
+            states: (B, H, dx) in physical units.
+
+        Returns:
+            Mean and log variance of Z, (B, dz) each.
 
         Raises:
             ValueError: the encoder sees past and actions as well; ``posterior`` gives it both.
@@ -203,14 +230,31 @@ class TSM(StateModel):
         return self.encoder(self.features(states))
 
     def posterior(self, past: Segment, future: Segment) -> tuple[Tensor, Tensor]:
-        """Q(Z | X+), or Q(Z | X+, X-, U-, U+): mean and log variance of Z, (B, dz) each."""
+        """Encode a future, Q(Z | X+), or Q(Z | X+, X-, U-, U+) where there is a ``full_encoder``.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            future: states (B, H, dx) in physical units, and actions (B, H, du).
+
+        Returns:
+            Mean and log variance of Z, (B, dz) each.
+        """
         if not self.full_encoder:
             return self.encode(future.states)
         whole = past.last(self.segment_len).then(future)
         return self.encoder(self.inputs(whole.states, whole.actions))
 
     def decode(self, past: Segment, actions: Tensor, z: Tensor) -> Tensor:
-        """P(X+ | X-, U-, U+, z), free-running: each state from the predicted one before it."""
+        """Decode P(X+ | X-, U-, U+, z) free-running, each state from the predicted one before it.
+
+        Args:
+            past: states (B, L, dx) in physical units, and the actions (B, L, du) that led to them.
+            actions: (B, K, du) in [-1, 1], up to H of them.
+            z: codes (B, dz), without unit.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         return chunked(self._decode, *past, actions, z)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
@@ -218,7 +262,15 @@ class TSM(StateModel):
         return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
 
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
-        """P(X+ | X-, U-, U+, z) with true states as inputs, all positions at once: (B, K, dx)."""
+        """Decode P(X+ | X-, U-, U+, z) with true states as inputs, all positions at once.
+
+        Args:
+            window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
+            z: codes (B, dz), without unit.
+
+        Returns:
+            States (B, K, dx) in physical units.
+        """
         (past, future), n = window, window.future.actions.shape[1]
         before = torch.cat([past.states, future.states[:, :-1]], dim=1)  # x_{t-L+1} .. x_{t+K-1}
         actions = torch.cat([past.actions[:, 1:], future.actions], dim=1)  # taken in each of them
@@ -226,11 +278,20 @@ class TSM(StateModel):
         return before[:, -n:] + self.features.step_std * increments
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Residual plus beta KL of each segment, free-running through the window (A.1).
+        """Sum residual and beta KL over segments, free-running through the window (A.1).
 
-        The future is a chain of K = n H steps. Each segment's code comes from its own true states,
-        its past from the model's own prediction of the segment before, so that training meets the
-        drift that rollouts meet.
+        Each segment's code comes from its own true states, its past from the model's own prediction
+        of the segment before, so that training meets the drift that rollouts meet.
+
+        Args:
+            window: past (B, L, .) and future (B, n H, .), in physical units; actions in [-1, 1].
+            generator: of the codes, drawn from Q.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+
+        Raises:
+            ValueError: the future is not a whole number of segments.
         """
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
@@ -242,7 +303,18 @@ class TSM(StateModel):
         return loss
 
     def teacher_forced_loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Residual of one-step increments plus beta KL, with true states as inputs."""
+        """Sum residual of one-step increments and beta KL over segments, true states as inputs.
+
+        Args:
+            window: past (B, L, .) and future (B, n H, .), in physical units; actions in [-1, 1].
+            generator: of the codes, drawn from Q.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+
+        Raises:
+            ValueError: the future is not a whole number of segments.
+        """
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
             z, kl = self._posterior_code(past, future, generator)
@@ -253,9 +325,19 @@ class TSM(StateModel):
         return loss
 
     def energy_loss(self, window: Window, generator: Noise) -> Tensor:
-        """Energy score of two free-running samples with codes from the prior; not in the paper.
+        """Sum the energy score of two samples over segments (``models.energy``); not in the paper.
 
-        The sum over segments, see ``models.energy``. The encoder is not used.
+        Both samples are free-running; the encoder is not used.
+
+        Args:
+            window: past (B, L, .) and future (B, n H, .), in physical units; actions in [-1, 1].
+            generator: of the codes, drawn from the prior.
+
+        Returns:
+            The mean over the batch, a scalar without unit.
+
+        Raises:
+            ValueError: the future is not a whole number of segments.
         """
         past = Segment(*(torch.cat([part, part]) for part in window.past))
         loss = past.states.new_zeros(())
@@ -299,7 +381,15 @@ class TSM(StateModel):
         return step
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """What the decoder reads at each position: (..., dx), (..., du) -> (..., input_dim)."""
+        """Join what the decoder reads at each position.
+
+        Args:
+            states: (..., dx) in physical units.
+            actions: (..., du) in [-1, 1].
+
+        Returns:
+            Standardised features and actions (..., input_dim).
+        """
         return torch.cat([self.features(states), actions], dim=-1)
 
     def _segments(self, future: Segment) -> list[Segment]:

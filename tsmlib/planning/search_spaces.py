@@ -80,11 +80,27 @@ class DirectActions:
         return f"DirectActions({steps} steps, {du} actions, rms {self.scale:.3g}, {noise})"
 
     def decode(self, parameters: Tensor) -> Tensor:
-        """(C, B, T, du) -> actions (C, B, T, du) in [-1, 1]."""
+        """Squash parameters to the bounds of actions by tanh (Eq. 2).
+
+        Args:
+            parameters: (C, B, T, du), any real numbers.
+
+        Returns:
+            Actions (C, B, T, du) in [-1, 1].
+        """
         return parameters.tanh()
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
-        """White noise, or smooth noise of the same variance: (n, n_targets, T, du)."""
+        """Draw white noise, or smooth noise of the same variance.
+
+        Args:
+            n: C, candidates.
+            n_targets: B, targets.
+            generator: of the noise.
+
+        Returns:
+            Noise (C, B, T, du), of variance 1.
+        """
         horizon, action_dim = self.shape
         if not self.smoothness:
             return torch.randn(n, n_targets, *self.shape, generator=generator)
@@ -100,7 +116,15 @@ class DirectActions:
         return torques[:, SETTLE:].unflatten(0, (n, n_targets)) / 0.1
 
     def after(self, parameters: Tensor, steps: int) -> tuple[DirectActions, Tensor]:
-        """The space of the rest after ``steps`` actions of a plan (B, T, du), and the rest."""
+        """Take away the actions of a plan that are done.
+
+        Args:
+            parameters: (B, T, du), the plan.
+            steps: of the plan that are done, fewer than its horizon.
+
+        Returns:
+            The space of the rest, and the rest of the parameters.
+        """
         horizon, action_dim = self.shape
         rest = DirectActions(
             horizon - steps, action_dim, rms=self.scale, smoothness=self.smoothness
@@ -178,19 +202,42 @@ class LatentActions:
         return f"LatentActions({self.horizon} steps, {n} codes of {dz} numbers)"
 
     def decode(self, parameters: Tensor) -> Tensor:
-        """Codes (C, B, K, dz) -> actions (C, B, T, du) in [-1, 1]."""
+        """Decode codes by the action prior (Eq. 3).
+
+        Args:
+            parameters: codes (C, B, K, dz).
+
+        Returns:
+            Actions (C, B, T, du) in [-1, 1].
+        """
         return self._whole(parameters)[:, :, : self.horizon]
 
     def noise(self, n: int, n_targets: int, generator: torch.Generator) -> Tensor:
-        """Codes (n, n_targets, K, dz) from N(0, I)."""
+        """Draw codes from N(0, I).
+
+        Args:
+            n: C, candidates.
+            n_targets: B, targets.
+            generator: of the noise.
+
+        Returns:
+            Codes (C, B, K, dz).
+        """
         return torch.randn(n, n_targets, *self.shape, generator=generator)
 
     @torch.no_grad()
     def after(self, parameters: Tensor, steps: int) -> tuple[LatentActions, Tensor]:
-        """The space of the rest after ``steps`` actions of a plan (B, K, dz), and the rest.
+        """Take away the actions of a plan that are done.
 
         Codes that begin with a segment stay as they are. Otherwise the rest of the plan is cut into
         new segments, whose codes come from the prior's encoder: nearly the same actions.
+
+        Args:
+            parameters: codes (B, K, dz), the plan.
+            steps: of the plan that are done, fewer than its horizon.
+
+        Returns:
+            The space of the rest, and its codes.
         """
         prior, left = self.prior, self.horizon - steps
         actions = self._whole(parameters[None])[0]  # (B, K H, du)

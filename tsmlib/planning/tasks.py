@@ -252,7 +252,11 @@ class Task:
         return self.reward_for in (rewards.reach, rewards.push)
 
     def idle_actions(self) -> Tensor:
-        """Doing nothing, (B, T, du): the floor below which a plan does harm."""
+        """Do nothing: the floor below which a plan does harm.
+
+        Returns:
+            Actions (B, T, du) in [-1, 1].
+        """
         assert self.idle is not None  # see __post_init__
         return self.idle.expand(len(self), self.horizon, -1).clone()
 
@@ -341,9 +345,16 @@ class Task:
         return replace(self, start=self.start[indices], target=self.target[indices], seeds=seeds)
 
     def require_robot(self, robot: Robot | None, what: str) -> None:
-        """TrajectoryError unless ``robot`` is this task's, where it is known; a warning names ids.
+        """Require that a robot is this task's, and warn where it is of another environment.
 
         A model of the standard arm may plan for a variant: the id alone is no error.
+
+        Args:
+            robot: of a model or data; None is not compared.
+            what: what the two are of, such as "the model and the task".
+
+        Raises:
+            TrajectoryError: they differ in more than the environment.
         """
         if robot is None or robot == self.robot:
             return
@@ -351,7 +362,15 @@ class Task:
         warn_of_other_env(robot, self.robot, what)
 
     def require_start(self, states: Tensor, what: str) -> None:
-        """ValueError unless ``states`` (B, dx) are this task's starts, up to rounding."""
+        """Require that states are this task's starts, up to rounding.
+
+        Args:
+            states: (B, dx) in physical units.
+            what: what begins in them, for the message.
+
+        Raises:
+            ValueError: they are others.
+        """
         name = f"task {self.name!r} of {self.env}"
         require_same_starts(states, torch.from_numpy(self.start), what, name)
 

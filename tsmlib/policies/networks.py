@@ -75,11 +75,33 @@ class Policy(Configured):
         self.features = Features(state_dim, angles)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
-        """Get ready to act after ``past`` (R, L, .); the result is given its last step first."""
+        """Get ready to act after the past; the result is given its last step first.
+
+        Args:
+            past: states (R, L, dx) in physical units, and the actions (R, L, du) that led to them.
+            target: (R, dg), in the task's unit, metres for places.
+
+        Returns:
+            A function: last states, the actions before them, noise or None -> actions (R, du).
+
+        Raises:
+            NotImplementedError: the class has no ``begin`` of its own.
+        """
         raise NotImplementedError
 
     def goals(self, past: Segment, target: Tensor) -> Tensor:
-        """Targets (R, dg) as the network sees them (M, B, dg); ValueError where they do not fit."""
+        """Scale targets and lay them out copy by copy, as the network sees them.
+
+        Args:
+            past: states (R, L, dx) in physical units, and the actions (R, L, du) that led to them.
+            target: (R, dg), in the task's unit, metres for places.
+
+        Returns:
+            Targets (M, B, dg), in units of ``target_std``.
+
+        Raises:
+            ValueError: past or target do not fit the policy.
+        """
         (rows, steps, dim), name = past.states.shape, type(self).__name__
         if dim != self.state_dim:
             raise ValueError(
@@ -97,7 +119,11 @@ class Policy(Configured):
         return self.by_copy(target / self.target_std)
 
     def take_statistics(self, model: Model) -> None:
-        """Those of the model's features, where the policy has none of its own."""
+        """Take the statistics of a model's features, where the policy has none of its own.
+
+        Args:
+            model: that the policy learns in; one with other angles gives a warning.
+        """
         own, known = self.features, getattr(model, "features", None)
         sizes = isinstance(known, Features) and own.step_std.shape == known.step_std.shape
         if own.fitted or not isinstance(known, Features) or not sizes:
@@ -113,7 +139,14 @@ class Policy(Configured):
             )
 
     def by_copy(self, rows: Tensor) -> Tensor:
-        """(R, k) -> (M, B, k)."""
+        """Lay rows out copy by copy.
+
+        Args:
+            rows: (R, k).
+
+        Returns:
+            The same numbers as (M, B, k).
+        """
         return rows.unflatten(0, (self.copies, -1))
 
 
@@ -181,6 +214,18 @@ class OneStepPolicy(Policy):
                 parameter.mul_(0.1)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
+        """Get ready to act on the present state and target.
+
+        Args:
+            past: states (R, L, dx) in physical units, and the actions (R, L, du) that led to them.
+            target: (R, dg), in the task's unit, metres for places.
+
+        Returns:
+            A function: last states, the actions before them, noise or None -> actions (R, du).
+
+        Raises:
+            ValueError: past or target do not fit the policy.
+        """
         goals = self.goals(past, target)
 
         def act(x: Tensor, u: Tensor, noise: Tensor | None) -> Tensor:
@@ -249,7 +294,18 @@ class SegmentPolicy(Policy):
         self.head = BatchedLinear(channels, self.output_dim, generators)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
-        """Read the past but for its last step; inputs of layers are carried from step to step."""
+        """Read the past but for its last step; inputs of layers are carried from step to step.
+
+        Args:
+            past: states (R, L, dx) in physical units, and the actions (R, L, du) that led to them.
+            target: (R, dg), in the task's unit, metres for places.
+
+        Returns:
+            A function: last states, the actions before them, noise or None -> actions (R, du).
+
+        Raises:
+            ValueError: past or target do not fit the policy.
+        """
         codes = self.codes(self.goals(past, target))
         past = past.last(self.past_len)
         zeros = codes.new_zeros(*codes.shape[:2], self.inlet.bias.shape[-1])

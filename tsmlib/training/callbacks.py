@@ -40,7 +40,11 @@ class Callback(Protocol):
     """Called at every record of a training; what it raises ends the training."""
 
     def __call__(self, progress: Progress) -> None:
-        """Take note of a record, before its checkpoint is written."""
+        """Take note of a record, before its checkpoint is written.
+
+        Args:
+            progress: the record.
+        """
         ...
 
 
