@@ -274,6 +274,7 @@ def test_flat_arrays_end_where_they_say() -> None:
         ({"terminals": np.full(10, 2)}, "expected 10 booleans"),
         ({"timeouts": np.full(10, np.nan)}, "timeouts have shape"),
         ({"terminals": np.ones(10)}, "every episode has a single row"),
+        ({"next_observations": OBS[:5]}, "not the observations of the next rows"),
         ({"next_observations": OBS}, "not the observations of the next rows"),
         ({"actions": 3 * ACT}, "bounds"),
         ({"bounds": (-0.5, 0.5)}, "within its bounds"),

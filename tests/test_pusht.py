@@ -323,6 +323,11 @@ def model(data):
     return Egocentric.for_data(data, hidden=16)
 
 
+def test_columns_that_the_robot_does_not_have_are_refused():
+    with pytest.raises(ValueError, match="pairs of columns, of the 3 state dimensions"):
+        Egocentric(3, 2, angles=(2,), body=(0, 1, 2))
+
+
 def test_what_is_seen_from_the_t_does_not_depend_on_where_it_lies(model, data):
     x, u = torch.from_numpy(data.states[:, 3]), torch.from_numpy(data.actions[:, 3])
     turned = symmetric_copies(data.states[:, 3], data.actions[:, 3])[1]  # by a quarter

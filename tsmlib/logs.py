@@ -142,8 +142,9 @@ class FromLogs:
         if after is not None:
             after = casting.numbers("next_observations", after)
             inside = np.setdiff1d(np.arange(len(x) - 1), ends - 1)
-            same = np.array_equal(np.float32(after[inside]), np.float32(x[inside + 1]))
-            if after.shape != x.shape or not same:
+            if after.shape != x.shape or not np.array_equal(
+                np.float32(after[inside]), np.float32(x[inside + 1])
+            ):
                 raise TrajectoryError(
                     "next_observations are not the observations of the next rows; expected them to "
                     "be within an episode, and its end marked in terminals or timeouts"

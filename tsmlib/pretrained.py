@@ -13,6 +13,7 @@ import torch
 
 import tsmlib.envs
 from tsmlib import zoo
+from tsmlib.checks import require_type
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.pusht_field import GOAL
 from tsmlib.envs.spec import EnvSpec
@@ -75,6 +76,7 @@ def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:
     Returns:
         The task.
     """
+    require_type("env", env, str, "an id, such as 'tsm/ReacherPush-v1'")
     if env.startswith("tsm/PushT-"):
         return load_pusht(split, env=env)
     spec = EnvSpec.parse(env)

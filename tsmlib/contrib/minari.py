@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tsmlib.checks import as_tensor, require_type
 from tsmlib.storage.files import Json, PathLike, StoreError, read_bytes
 from tsmlib.trajectory import Trajectories
 
@@ -98,9 +99,11 @@ def save_minari(
 
     from tsmlib.envs.stepping import within_bounds
 
+    require_type("trajectories", trajectories, Trajectories, "tsmlib.Trajectories")
     minari, t = _minari(dataset_id), trajectories
     buffer = minari.data_collector.EpisodeBuffer
-    given = np.zeros((len(t), t.horizon)) if rewards is None else rewards
+    size = (len(t), t.horizon)
+    given = np.zeros(size) if rewards is None else as_tensor("rewards", rewards, size).numpy()
     made_by, actions = _environment(t), Box(-1, 1, (t.robot.action_dim,))
     if made_by is not None:
         actions = made_by.action_space

@@ -57,6 +57,12 @@ class Egocentric(StateModel):
     ) -> None:
         super().__init__(state_dim, action_dim, angles)
         require_counts(hidden=hidden, layers=layers)
+        groups = [(body, 3), *((pair, 2) for pairs in (places, vectors) for pair in pairs)]
+        if any(len(group) != n or not {*group} <= {*range(state_dim)} for group, n in groups):
+            raise ValueError(
+                f"body is {body}, places {places} and vectors {vectors}; expected three columns, "
+                f"and pairs of columns, of the {state_dim} state dimensions"
+            )
         x, y, self.angle = body
         self.pairs = [[x, y], *map(list, places), *map(list, vectors)]
         self.n_places, dim = len(places), 2 * (len(places) + len(vectors)) + action_dim + 4
