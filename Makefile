@@ -19,7 +19,7 @@ help:
 	@echo "make reliability   kills and damaged files, at full length"
 	@echo "make bench     speed against references, and docs/speed.md"
 	@echo "make explorer  the page for the browser, into explorer/dist (needs node and npm)"
-	@echo "make docs      the documentation, into docs/_build/html"
+	@echo "make docs      the notebooks where they are not executed yet, and the documentation, into docs/_build/html"
 	@echo "make lint      style, types, and import contracts"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
@@ -41,9 +41,11 @@ explorer: $(READY)
 	$(PY) explorer/export.py explorer/dist
 	node explorer/build.mjs
 
-# Notebooks are shown as runs/laptop/seed0 executed them, or another: make docs RUN=runs/paper/seed0
+# Notebooks are shown as runs/laptop/seed0 executed them, which is done first where it is missing (15 minutes at its first
+# use), or as another run did: make docs RUN=runs/paper/seed0
 docs: $(READY)
 	$(PY) -c 'import myst_nb, furo, sphinx_copybutton, math_core' 2>/dev/null || $(PY) -m pip install -qq -r docs/requirements.lock
+	$(if $(RUN),,OMP_NUM_THREADS=1 $(PY) -m tsmlib run all --missing)
 	TSM_DOCS_RUN=$(RUN) OMP_NUM_THREADS=1 $(PY) -m sphinx -b html -n -W --keep-going docs docs/_build/html
 
 lint: $(READY)

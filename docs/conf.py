@@ -1,7 +1,7 @@
-"""The documentation site: ``make docs``. Nothing is fetched or executed while it is built.
+"""The documentation site: ``make docs``. Nothing is fetched or executed while Sphinx builds it.
 
-A notebook's page shows its outputs where runs/laptop/seed0 has executed it as it is stored now;
-``make docs RUN=runs/paper/seed0`` names another run.
+``make docs`` executes before what runs/laptop/seed0 lacks of the notebooks as they are stored now,
+and their pages show it; ``make docs RUN=runs/paper/seed0`` shows another run.
 """
 
 import sys
@@ -32,8 +32,7 @@ myst_heading_slug_func = "pages.anchor"
 nb_execution_mode = "off"
 nitpicky = True
 nitpick_ignore_regex = [(r"py:.*", r"(?!tsmlib\.\w+$).*")]  # what has no page of its own
-nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # a slider without its kernel shows nothing new
-suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets of executed notebooks
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # no page loads a script from elsewhere
 
 # API
 autosummary_generate = True

@@ -15,6 +15,8 @@ from math_core import LatexToMathML
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
+from reproduction.runner import is_executed
+
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 MATHML = LatexToMathML(fancy_error=False)  # LatexError ends the build
@@ -54,9 +56,8 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
     """A notebook with the outputs of ``executed`` where that is of the notebook as it is now."""
     notebook, said = nbformat.read(stored, 4), "Not executed for this page"
     if executed.exists():
-        own = nbformat.read(executed, 4)
-        if code(own) == code(notebook):
-            notebook, said = own, f"As executed in `{os.path.relpath(executed.parent, ROOT)}`"
+        if is_executed(stored, executed):
+            notebook, said = nbformat.read(executed, 4), f"As executed in `{os.path.relpath(executed.parent, ROOT)}`"
         else:
             said += f": `{os.path.relpath(executed, ROOT)}` is of another version of it"
     for cell in notebook.cells:
@@ -69,13 +70,6 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
         1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*")
     )
     return notebook
-
-
-def code(notebook: nbformat.NotebookNode) -> list[str]:
-    """Cells of code but for the parameters, which a run has its own of."""
-    cells = (cell for cell in notebook.cells if cell.cell_type == "code")
-    given = {"parameters", "injected-parameters"}
-    return [cell.source for cell in cells if not given & set(cell.metadata.get("tags", []))]
 
 
 def inline_formula(page: HTML5Translator, node: nodes.math) -> NoReturn:

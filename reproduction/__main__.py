@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "notebook", help=f"{', '.join(runner.notebooks())}, all, or the path of a copy"
     )
-    run.add_argument("--scale", default="laptop", help=f"{', '.join(SCALES)}")
+    run.add_argument("--scale", default="laptop", help="laptop, paper, or smoke, which is a test")
     run.add_argument("--seed", type=int, default=0)
     run.add_argument(
         "-p",
@@ -52,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help="another parameter of the notebook",
     )
+    run.add_argument("--missing", action="store_true", help="only those not executed as they are")
     run.set_defaults(do=_run)
     make = commands.add_parser("make", help="make targets, and what they are made from")
     make.add_argument("targets", nargs="+", help="such as models/Reacher/tsm, tables/03_predict")
@@ -88,9 +89,23 @@ def _run(arguments: argparse.Namespace) -> int:
     runner.require_tools()
     word = arguments.notebook
     paths = list(runner.notebooks().values()) if word == "all" else [runner.find(word)]
+    if run.scale == "smoke":
+        print("scale smoke is a test that a notebook runs; its numbers say nothing", file=sys.stderr)
     for path, values in [(path, runner.typed(path, texts)) for path in paths]:
-        print(runner.execute(path, run, values))
+        if arguments.missing and runner.is_executed(path, run.folder / path.name):
+            continue
+        copy = runner.execute(path, run, values)
+        print(f"Executed, with its pictures: {_linked(copy)}")
+        for film in sorted(copy.parent.glob(f"{path.stem[:2]}_*.mp4")):
+            print(f"Film: {_linked(film)}")
     return 0
+
+
+def _linked(path: Path) -> str:
+    """A path, which a terminal shows as a link where it can."""
+    if not sys.stdout.isatty():
+        return str(path)
+    return f"\033]8;;{path.as_uri()}\033\\{path}\033]8;;\033\\"
 
 
 def _make(arguments: argparse.Namespace) -> int:

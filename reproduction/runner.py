@@ -9,9 +9,13 @@ import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from reproduction.runs import Run
 from tsmlib.pretrained import ROOT
+
+if TYPE_CHECKING:
+    import nbformat
 
 NOTEBOOKS = ROOT / "notebooks"
 TOOLS = ("papermill", "ipykernel", "pandas", "ipywidgets", "imageio_ffmpeg")  # extra "study"
@@ -140,6 +144,29 @@ def execute(
     if failure:
         raise RunError(f"{notebook.stem} failed: {failure}\nSee {output}")
     return output
+
+
+def is_executed(notebook: Path, copy: Path) -> bool:
+    """Whether a copy is of the notebook as it is stored now, executed to its end.
+
+    Args:
+        notebook: its path.
+        copy: path of what a run wrote, which need not be there.
+    """
+    import nbformat
+
+    if not copy.is_file():
+        return False
+    executed = nbformat.read(copy, 4)
+    failed = executed.metadata.get("papermill", {}).get("exception")
+    return not failed and _code(executed) == _code(nbformat.read(notebook, 4))
+
+
+def _code(notebook: nbformat.NotebookNode) -> list[str]:
+    """Cells of code but for the parameters, which a run has its own of."""
+    cells = (cell for cell in notebook.cells if cell.cell_type == "code")
+    given = {"parameters", "injected-parameters"}
+    return [cell.source for cell in cells if not given & set(cell.metadata.get("tags", []))]
 
 
 def require_tools() -> None:

@@ -305,6 +305,14 @@ def test_a_notebook_is_executed_with_its_parameters_into_the_folder_of_its_run(
     assert capsys.readouterr().out.split()[-1] == str(folder / "own.ipynb")
 
 
+def test_a_notebook_is_executed_again_where_it_failed_or_has_changed(home: Path) -> None:
+    path = home / "own.ipynb"
+    counted = "open('count.txt', 'a').write('x')"
+    for cell in (counted + "; 1 / 0", counted, counted, counted + "  # changed"):
+        main(["run", str(notebook(path, cell)), "--missing"])
+    assert (home / "runs/laptop/seed0/count.txt").read_text() == "xxx"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -12,7 +12,7 @@ from tsmlib import plots, rewards
 from tsmlib.envs import drawing
 from tsmlib.envs.geometry import DT
 from tsmlib.envs.pusht_field import pusht_frames, pusht_physics
-from tsmlib.envs.render import render_array
+from tsmlib.envs.render import render_frames
 from tsmlib.envs.spec import is_arm
 from tsmlib.envs.stepping import make, within_bounds
 from tsmlib.planning.execution import Trial
@@ -67,9 +67,7 @@ def episode_film(data: Trajectories, episode: int) -> np.ndarray:
     if not is_arm(data.env):
         return drawing.frames(data.env, states)
     seconds = DT * np.arange(len(states))
-    return np.stack(
-        [render_array(x, data.env, note=f"{t:.2f} s") for x, t in zip(states, seconds, strict=True)]
-    )
+    return render_frames(states, data.env, notes=[f"{t:.2f} s" for t in seconds])
 
 
 def _drawn(task: Task, states: np.ndarray, target: int) -> np.ndarray:
@@ -80,17 +78,13 @@ def _drawn(task: Task, states: np.ndarray, target: int) -> np.ndarray:
         return pusht_frames(states, task.target[target].numpy(), pusht_physics(task.env))
     mover = task.position
     goal = None if mover is None else task.target[target].numpy()
-    frames = []
-    for step, state in enumerate(states):
-        note = f"{(step + 1) * DT:.2f} s"
-        if task.is_standard and goal is not None:
-            note += f",  {1000 * float(np.linalg.norm(state[mover] - goal)):.0f} mm away"
-        path = None if mover is None else states[: step + 1, mover]
-        tip, block = (None, path) if mover == rewards.BLOCK else (path, None)
-        frames.append(
-            render_array(state, task.env, goal, note=note, tip_path=tip, block_path=block)
-        )
-    return np.stack(frames)
+    notes = [f"{DT * (step + 1):.2f} s" for step in range(len(states))]
+    if task.is_standard and goal is not None:
+        away = 1000 * np.linalg.norm(states[:, mover] - goal, axis=-1)
+        notes = [f"{note},  {mm:.0f} mm away" for note, mm in zip(notes, away, strict=True)]
+    path = None if mover is None else states[:, mover]
+    tip, block = (None, path) if mover == rewards.BLOCK else (path, None)
+    return render_frames(states, task.env, goal, notes=notes, tip_path=tip, block_path=block)
 
 
 def _rendered(task: Task, trial: Trial, target: int) -> np.ndarray:

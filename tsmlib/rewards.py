@@ -7,6 +7,7 @@ before time. A person's own reward is another such function, which ``rewarded`` 
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -125,7 +126,7 @@ def _held(part: Tensor, counts: Tensor) -> Tensor:
 
     A reward that is infinite beyond the end would have a slope that is NaN, counted or not.
     """
-    shape = torch.broadcast_shapes(part.shape[:-1], counts.shape)
+    shape = np.broadcast_shapes(part.shape[:-1], counts.shape)
     part, counts = part.expand(*shape, -1), counts.expand(shape)
     last = counts.sum(-1)[..., None, None] - 1  # (..., 1, 1)
     return torch.where(counts[..., None], part, part.detach().take_along_dim(last, -2))
@@ -174,7 +175,7 @@ def rewarded(reward: Reward, states: Tensor, actions: Tensor) -> Tensor:
             f"the reward fails on {asked}: {error}. Count dimensions from the right: time is -2, "
             "targets are -3"
         ) from error
-    expected = torch.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
+    expected = np.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
     if not isinstance(rewards, Tensor) or rewards.shape != expected:
         raise ValueError(
             f"the reward of {asked} is {described(rewards)}; expected a tensor {tuple(expected)}, "

@@ -21,7 +21,7 @@ from tsmlib.envs.unstable import SimulationUnstable, import_mujoco, without_log
 
 import_mujoco()
 
-import gymnasium.envs.mujoco  # noqa: E402
+import gymnasium  # noqa: E402
 import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
@@ -40,7 +40,7 @@ from tsmlib.envs.geometry import (  # noqa: E402
 from tsmlib.envs.physics import Changes, Physics  # noqa: E402
 from tsmlib.envs.spec import EnvSpec  # noqa: E402
 
-ASSET = Path(gymnasium.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
+ASSET = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "reacher.xml"
 PLANE = 0.01  # m, height of the plane in which all centres move
 # Seconds, of the variants (the basic arm keeps 0.01 s): a fingertip at 30 m/s cannot step past the
 # block.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +38,8 @@ def draw_scene(
     to lay several poses over another. ValueError where the state's size does not fit the
     environment.
     """
-    from matplotlib.patches import Circle, Rectangle
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Circle
 
     arm = EnvSpec.parse(env_id)
     state, task, radius, lengths = (
@@ -51,57 +53,41 @@ def draw_scene(
         raise ValueError(f"the state is {state.shape}; {env_id} expected ({expected},)")
 
     if background:
-        solid = task == "push"  # elsewhere the frame is only there to look at
-        ax.add_patch(
-            Rectangle(
-                (-EXTENT, -EXTENT), 2 * EXTENT, 2 * EXTENT, fc=STEEL if solid else FRAME, ec="none"
-            )
-        )
-        ax.add_patch(Rectangle((-WALL, -WALL), 2 * WALL, 2 * WALL, fc=FLOOR, ec="none"))
-        reach = sum(lengths)
-        ax.add_patch(Circle((0, 0), reach, fc="none", ec=FRAME, lw=0.8, ls=(0, (4, 3)), zorder=1.1))
-        ax.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
-        ax.set_axis_off()
+        draw_floor(ax, env_id)
     for path, colour in ((tip_path, TIP), (block_path, BLOCK)):
         if path is not None:
             path = np.asarray(path)
-            ax.plot(
-                path[:, 0],
-                path[:, 1],
-                color=colour,
-                lw=1.6,
-                alpha=0.8,
-                solid_capstyle="round",
-                zorder=2,
-            )
+            line = Line2D(path[:, 0], path[:, 1], color=colour, lw=1.6, alpha=0.8, zorder=2)
+            line.set_solid_capstyle("round")
+            ax.add_artist(line)
     if target is not None:
         _target(ax, np.asarray(target), radius if task == "push" else 1.2 * ARM_RADIUS)
     if task != "reach":
         fixed = task == "obstacle"
         face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
-        ax.add_patch(
+        ax.add_artist(
             Circle((state[6], state[7]), radius, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3)
         )
         if fixed:  # a bolt: it does not move
-            ax.add_patch(
+            ax.add_artist(
                 Circle(
                     (state[6], state[7]), 0.25 * radius, fc=INK, ec="none", alpha=alpha, zorder=3
                 )
             )
     elbow, _, tip = arm_points(state[:2], lengths)
     # The pedestal.
-    ax.add_patch(
+    ax.add_artist(
         Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9)
     )
     _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)
-    ax.add_patch(
+    ax.add_artist(
         Circle(
             (tip[0], tip[1]), 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3
         )
     )
     for joint in (np.zeros(2), elbow):
-        ax.add_patch(
+        ax.add_artist(
             Circle(
                 (joint[0], joint[1]),
                 0.5 * ARM_RADIUS,
@@ -114,19 +100,48 @@ def draw_scene(
         )
 
 
+def draw_floor(ax: Axes, env_id: str) -> None:
+    """Floor, walls and reach of the arm of ``env_id``, with the limits of the picture."""
+    from matplotlib.patches import Circle, Rectangle
+
+    arm = EnvSpec.parse(env_id)
+    solid = arm.task == "push"  # elsewhere the frame is only there to look at
+    for half, colour in ((EXTENT, STEEL if solid else FRAME), (WALL, FLOOR)):
+        ax.add_artist(Rectangle((-half, -half), 2 * half, 2 * half, fc=colour, ec="none"))
+    reach = sum(arm.physics.link_lengths)
+    ax.add_artist(Circle((0, 0), reach, fc="none", ec=FRAME, lw=0.8, ls=(0, (4, 3)), zorder=1.1))
+    ax.set(xlim=(-EXTENT, EXTENT), ylim=(-EXTENT, EXTENT), aspect="equal")
+    ax.set_axis_off()
+
+
 def render_array(
     state: np.ndarray,
     env_id: str,
     target: np.ndarray | None = None,
     size: int = 480,
     *,
-    tip_path: np.ndarray | None = None,
-    block_path: np.ndarray | None = None,
     note: str = "",
 ) -> np.ndarray:
     """The scene as a uint8 image (size, size, 3). Needs neither a display nor OpenGL.
 
-    tip_path, block_path: as of ``draw_scene``. note: a line of text at the lower left.
+    note: a line of text at the lower left.
+    """
+    return render_frames(np.asarray(state)[None], env_id, target, size, notes=(note,))[0]
+
+
+def render_frames(
+    states: np.ndarray,
+    env_id: str,
+    target: np.ndarray | None = None,
+    size: int = 480,
+    *,
+    tip_path: np.ndarray | None = None,
+    block_path: np.ndarray | None = None,
+    notes: Sequence[str] = (),
+) -> np.ndarray:
+    """States (T, dx) as frames (T, size, size, 3) uint8; what does not move is drawn once.
+
+    tip_path, block_path (T, 2): where they went, drawn up to each frame. notes: text of each frame.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -136,13 +151,29 @@ def render_array(
     figure = Figure(figsize=(4.0, 4.0), dpi=size / 4.0)
     canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_scene(ax, state, env_id, target, tip_path=tip_path, block_path=block_path)
-    if note:
-        ax.text(
-            0.02 - WALL, 0.02 - WALL, note, color=INK, fontsize=11, family="DejaVu Sans", zorder=6
-        )
+    draw_floor(ax, env_id)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    floor, still = canvas.copy_from_bbox(figure.bbox), set(ax.get_children())
+    frames = np.empty((len(states), size, size, 3), np.uint8)
+    for step, state in enumerate(states):
+        tip, block = (None if x is None else x[: step + 1] for x in (tip_path, block_path))
+        draw_scene(ax, state, env_id, target, tip_path=tip, block_path=block, background=False)
+        if step < len(notes):
+            ax.text(
+                *(2 * (0.02 - WALL,)),
+                notes[step],
+                color=INK,
+                fontsize=11,
+                family="DejaVu Sans",
+                zorder=6,
+            )
+        canvas.restore_region(floor)
+        moved = [artist for artist in ax.get_children() if artist not in still]
+        for artist in sorted(moved, key=lambda artist: artist.get_zorder()):
+            ax.draw_artist(artist)
+            artist.remove()
+        frames[step] = np.asarray(canvas.buffer_rgba())[..., :3]
+    return frames
 
 
 def _capsule(
@@ -157,7 +188,7 @@ def _capsule(
         centre + ARM_RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         for centre, angle in ((end, along + half), (start, along + np.pi + half))
     ]
-    ax.add_patch(
+    ax.add_artist(
         Polygon(
             np.concatenate(rim),
             fc=colour,
@@ -172,15 +203,11 @@ def _capsule(
 
 def _target(ax: Axes, centre: np.ndarray, radius: float) -> None:
     """A ring the size of what should reach it, and a cross."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    ax.add_patch(Circle((centre[0], centre[1]), radius, fc="none", ec=TARGET, lw=1.6, zorder=5))
+    ax.add_artist(Circle((centre[0], centre[1]), radius, fc="none", ec=TARGET, lw=1.6, zorder=5))
     arm = 0.5 * min(radius, 2 * ARM_RADIUS)
     for dx, dy in ((arm, 0.0), (0.0, arm)):
-        ax.plot(
-            centre[0] + np.array([-dx, dx]),
-            centre[1] + np.array([-dy, dy]),
-            color=TARGET,
-            lw=1.6,
-            zorder=5,
-        )
+        along, across = centre[0] + np.array([-dx, dx]), centre[1] + np.array([-dy, dy])
+        ax.add_artist(Line2D(along, across, color=TARGET, lw=1.6, zorder=5))
