@@ -57,7 +57,10 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
     notebook, said = nbformat.read(stored, 4), "Not executed for this page"
     if executed.exists():
         if is_executed(stored, executed):
-            notebook, said = nbformat.read(executed, 4), f"As executed in `{os.path.relpath(executed.parent, ROOT)}`"
+            notebook, said = (
+                nbformat.read(executed, 4),
+                f"As executed in `{os.path.relpath(executed.parent, ROOT)}`",
+            )
         else:
             said += f": `{os.path.relpath(executed, ROOT)}` is of another version of it"
     for cell in notebook.cells:

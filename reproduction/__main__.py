@@ -90,7 +90,9 @@ def _run(arguments: argparse.Namespace) -> int:
     word = arguments.notebook
     paths = list(runner.notebooks().values()) if word == "all" else [runner.find(word)]
     if run.scale == "smoke":
-        print("scale smoke is a test that a notebook runs; its numbers say nothing", file=sys.stderr)
+        print(
+            "scale smoke is a test that a notebook runs; its numbers say nothing", file=sys.stderr
+        )
     for path, values in [(path, runner.typed(path, texts)) for path in paths]:
         if arguments.missing and runner.is_executed(path, run.folder / path.name):
             continue

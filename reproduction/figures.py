@@ -7,13 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
 
 from reproduction.claims.judge import PLACES, Comparison, compare
 from reproduction.claims.ledger import results
 from reproduction.pages import ARMS
 from reproduction.scores import HORIZONS
 from reproduction.tables import select
-from tsmlib import plots
+from tsmlib import plots, zoo
+from tsmlib.plots.style import styled
 from tsmlib.statistics import interval
 
 BASELINES = ("onestep", "multistep", "lstm")
@@ -85,10 +87,49 @@ def ahead(tables: Tables = results) -> Figure:
     return plots.forest(panels, x_label=label, reference=0.5, better="right", columns=2)
 
 
+@styled
+def rounds(tables: Tables = results) -> Figure:
+    """Share of targets solved against environment steps: rounds of own plans, and SAC.
+
+    Bands are 95 % intervals over seeds.
+    """
+    plans = select(tables("10_explore"), env=PLACES["ReacherPush"], configuration="own plans")
+    learned = select(tables("model_free"), env=PLACES["ReacherPush"], subset=None)
+    figure = Figure(figsize=(6.4, 3.3), layout="constrained")
+    ax = figure.add_subplot()
+    for word in ("rtsm", "lstm", "ensemble+mse", "sac"):
+        rows = learned if word == "sac" else plans
+        rows = select(rows, model=word, metric="success")
+        rows = rows[rows["env_steps"] > 0]
+        values = 100 * _by_seed(rows, "env_steps")
+        steps = np.sort(rows["env_steps"].unique()).astype(float)
+        middle, half = np.array([interval(column) for column in values.T]).T
+        name, hue = zoo.look(word).name, zoo.look(word).colour
+        ax.plot(steps, middle, color=hue, lw=2, marker="o" if len(steps) < 10 else "", ms=4)
+        ax.fill_between(steps, middle - half, middle + half, color=hue, alpha=0.12, lw=0)
+        inside = word == "sac"
+        ax.annotate(
+            name,
+            (steps[-1], middle[-1]),
+            (0 if inside else 8, 24 if inside else 0),
+            textcoords="offset points",
+            ha="right" if inside else "left",
+            va="center",
+            color=hue,
+            weight="bold",
+        )
+    ax.set_xscale("log")
+    ax.set(ylim=(0, 100), xlabel="steps of the environment", ylabel="targets within 5 cm (%)")
+    ax.set_xticks([20_000, 100_000, 1_000_000])
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "figure5": figure5,
     "figure6": figure6,
     "ahead": ahead,
+    "rounds": rounds,
 }
 
 

@@ -26,4 +26,6 @@ def completed(argv: list[str]) -> list[str]:
 
 if Path(sys.argv[0]).stem == "papermill" and sys.stdout.isatty():
     sys.argv[:] = completed(sys.argv)
-    print("A warning about encryption is harmless: the kernel runs on this machine.", file=sys.stderr)
+    print(
+        "A warning about encryption is harmless: the kernel runs on this machine.", file=sys.stderr
+    )

@@ -113,7 +113,16 @@ def save_video(frames: np.ndarray, path: str | Path, fps: int = 25) -> Path:
     rows, columns = frames.shape[1] % 2, frames.shape[2] % 2  # browsers play only even sizes
     even = np.pad(frames, ((0, 0), (0, rows), (0, columns), (0, 0)), mode="edge")
     # One thread, so that the bytes are the same again.
-    options = ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart"]
+    options = [
+        "-preset",
+        "veryfast",
+        "-threads",
+        "1",
+        "-fflags",
+        "+bitexact",
+        "-movflags",
+        "+faststart",
+    ]
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "film.mp4"
         try:
