@@ -130,7 +130,7 @@ class CausalDecoder(nn.Module):
         for dilation in dilations:
             require_counts(dilations=dilation)
         self.inlet = nn.Linear(input_dim, channels)
-        self.dilations = tuple(dilations)
+        self.dilations, self.plain = tuple(dilations), plain
         # Plain: neither residual nor skip connections but the last layer's output.
         self.layers = nn.ModuleList(
             GatedLayer(

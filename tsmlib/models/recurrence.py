@@ -154,7 +154,7 @@ class Recurrence(torch.autograd.Function):
                 rows[..., after - known : after] = given[t : t + kept]
             row_h[k].copy_(h)
             if x is not None:
-                _see(features, x, row_s[k])
+                see(features, x, row_s[k])
             q = torch.mm(ins[k], cell, out=qs[k])
             forget, write, read, new = (part[k] for part in parts)
             new.mul_(2)  # tanh(q) = 2 sigmoid(2 q) - 1, which processors compute faster
@@ -199,7 +199,7 @@ class Recurrence(torch.autograd.Function):
         if x is not None:
             dx = torch.cat([torch.zeros_like(x)[None], dstates])  # of x_0 .. x_T
             angles, others = (len(some) for some in (ctx.features.angles, ctx.features.others))
-            slopes = _slopes(ctx.features, torch.cat([x[None], states[:-1]]))
+            turns = slopes(ctx.features, torch.cat([x[None], states[:-1]]))
             dx_angles, dx_others = _each(dx, [angles, others])
             cos, sin, rest = row_s.split([angles, angles, others], 1)
             da = torch.empty_like(sigmoids[0])
@@ -231,7 +231,7 @@ class Recurrence(torch.autograd.Function):
             if dgiven is not None:
                 dgiven[t] = row_given
             if x is not None:
-                row_s *= slopes[t]
+                row_s *= turns[t]
                 dx[t] += dx[t + 1]
                 dx_angles[t].add_(cos).add_(sin)
                 dx_others[t].add_(rest)
@@ -254,18 +254,18 @@ def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
     ]
 
 
-def _see(features: Features, x: Tensor, s: Tensor) -> None:
-    """Write the features of x (B, dx), whose angles come first, into s (B, F)."""
+def see(features: Features, x: Tensor, s: Tensor) -> None:
+    """Write the features of x (..., dx), whose angles come first, into s (..., F)."""
     angles, others = len(features.angles), len(features.others)
-    angle, other = x.split([angles, others], 1)
-    cos, sin, rest = s.split([angles, angles, others], 1)
+    angle, other = x.split([angles, others], -1)
+    cos, sin, rest = s.split([angles, angles, others], -1)
     torch.cos(angle, out=cos)
     torch.sin(angle, out=sin)
     rest.copy_(other)
     s.sub_(features.mean).div_(features.std)
 
 
-def _slopes(features: Features, x: Tensor) -> Tensor:
+def slopes(features: Features, x: Tensor) -> Tensor:
     """Derivative (..., F) of each feature by its dimension of x (..., dx)."""
     angle, other = x.split([len(features.angles), len(features.others)], dim=-1)
     return torch.cat([-angle.sin(), angle.cos(), torch.ones_like(other)], dim=-1) / features.std

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from tsmlib.checks import require_choice, require_counts, require_flag, require_number
 from tsmlib.models.base import Step
 from tsmlib.models.energy import energy_score
+from tsmlib.models.free_running import free_running
 from tsmlib.models.layers import (
     CausalDecoder,
     CodePrior,
@@ -258,8 +259,7 @@ class TSM(StateModel):
         return chunked(self._decode, *past, actions, z)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
-        step = self._begin(Segment(states, before), z)
-        return torch.stack([step(u) for u in actions.unbind(1)], dim=1)  # (B, K, dx)
+        return free_running(self.decoder, self.features, Segment(states, before), actions, z)
 
     def decode_teacher_forced(self, window: Window, z: Tensor) -> Tensor:
         """Decode P(X+ | X-, U-, U+, z) with true states as inputs, all positions at once.
