@@ -235,14 +235,17 @@ class Recurrence(torch.autograd.Function):
                 dx[t] += dx[t + 1]
                 dx_angles[t].add_(cos).add_(sin)
                 dx_others[t].add_(rest)
+        dstart = None if x is None else dx[0]
+        if not any(ctx.needs_input_grad[7:]):  # of a model that is used, not trained
+            return None, None, dstart, dh, dc, dcodes, dgiven, None, None, None
         flat = rows.flatten(0, 1).T
         dcell = flat[:after] @ dq.flatten(0, 1)
         if x is None:
-            return None, None, None, dh, dc, dcodes, dgiven, dcell, None, None
+            return None, None, dstart, dh, dc, dcodes, dgiven, dcell, None, None
         dhidden = None if hidden is None else flat[seen:] @ ds.flatten(0, 1)
         last_inputs = flat[seen:] if hidden is None else active.flatten(0, 1).T
         dout = last_inputs @ dx[1:].flatten(0, 1)
-        return None, None, dx[0], dh, dc, dcodes, dgiven, dcell, dhidden, dout
+        return None, None, dstart, dh, dc, dcodes, dgiven, dcell, dhidden, dout
 
 
 def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:

@@ -18,7 +18,7 @@ from tsmlib.trajectory import Segment, initial_past
 def imagine(
     policy: Policy,
     model: Model,
-    start: Tensor,
+    start: Tensor | Segment,
     target: Tensor,
     *,
     horizon: int = 50,
@@ -30,27 +30,43 @@ def imagine(
     Args:
         policy: that acts.
         model: that predicts, on the policy's device.
-        start: (R, dx), on any device.
+        start: (R, dx), on any device; or the past, states (R, L, dx) and actions (R, L, du).
         target: (R, dg), on any device.
         horizon: T, steps (A.3).
         noise: standard deviation of the policy's output (A.3).
         generator: of the noise and the model's samples; none without, and the model's mode.
 
     Returns:
-        States (R, T, dx) and actions (R, T, du), where ``start`` is.
+        States (R, T, dx) and actions (R, T, du), where ``target`` is.
     """
     horizon = require_count("horizon", horizon)
-    home, (start, target) = start.device, on_device_of(policy, start, target)
-    past = initial_past(start, max(policy.past_len, as_dynamics(model).past_len), policy.action_dim)
+    home = target.device
+    if not isinstance(start, Segment):
+        start = initial_past(start, imagined_past(policy, model), policy.action_dim)
+    *both, target = on_device_of(policy, *start, target)
+    past = Segment(*both)
     drawn: Sequence[Tensor | None] = [None] * horizon
     if generator is not None:
-        shape = (len(start), horizon, policy.output_dim)
-        drawn = (noise * standard_normal(shape, generator, start)).unbind(1)
+        shape = (len(target), horizon, policy.output_dim)
+        drawn = (noise * standard_normal(shape, generator, target)).unbind(1)
     act, step = policy.begin(past, target), stepper(model, past, generator=generator)
-    x, u, states, actions = start, past.actions[:, -1], [], []
+    x, u, states, actions = past.states[:, -1], past.actions[:, -1], [], []
     for disturbance in drawn:
         u = act(x, u, disturbance)
         x = step(u)
         states.append(x)
         actions.append(u)
     return Segment(torch.stack(states, dim=1).to(home), torch.stack(actions, dim=1).to(home))
+
+
+def imagined_past(policy: Policy, model: Model) -> int:
+    """Steps of past that a policy and a model read.
+
+    Args:
+        policy: that acts.
+        model: that predicts.
+
+    Returns:
+        The longer of the two.
+    """
+    return max(policy.past_len, as_dynamics(model).past_len)

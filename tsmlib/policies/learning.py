@@ -2,6 +2,9 @@
 
     max over theta of eta = E[ sum_t gamma^t r(x_t, u_t) ],   u_t ~ pi_theta,   x_{t+1} ~ the model
 
+or, with ``LearningOptions.with_value``, of pieces of an episode and the value of what comes after
+(``value``), which learns what whole episodes do not teach.
+
     OneStepPolicy    u_t ~ N(pi(x_t, g), sd^2)       a fully connected network
     SegmentPolicy    Z ~ N(pi(X-, U-, g), sd^2)      acts by the first action that the prior decodes
 
@@ -16,9 +19,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -31,16 +35,19 @@ from tsmlib.checks import (
     require_type,
 )
 from tsmlib.models.base import Model, as_dynamics
+from tsmlib.policies.gradients import clip_gradients, discounted
 from tsmlib.policies.imagination import imagine
 from tsmlib.policies.networks import Policy
 from tsmlib.policies.options import LearningCurve, LearningOptions
+from tsmlib.policies.value import RATE, Bootstrap, Lesson
 from tsmlib.rewards import Reward, fingerprint, rewarded
-from tsmlib.sampling import SeparateNoise
+from tsmlib.sampling import Noise, SeparateNoise
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, PathLike
 from tsmlib.training.callbacks import Callback, Progress
 from tsmlib.training.checkpoint import TrainingState, resumable
 from tsmlib.training.fine_tune import frozen
+from tsmlib.trajectory import Segment
 
 RewardFor = Callable[[Tensor], Reward]  # targets (R, dg) -> reward
 # n, generator -> starting states (n, dx), targets (n, dg)
@@ -101,13 +108,16 @@ def learn_policy(
     learner = _Learner(policy, model, reward, draw, options, seed)
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.Adam(trained, lr=options.lr)
+    optimizers, learned = {"adam": optimizer}, cast(nn.Module, policy)
+    if options.bootstrap:
+        learned = learner.ahead = Bootstrap(policy, model, options, seed)
+        optimizers["value"] = torch.optim.Adam(learner.ahead.value.parameters(), lr=options.lr)
     identity: dict[str, Json] = asdict(options) | {"seed": seed}
     if checkpoint is not None:
         checkpoint = Path(checkpoint)
         identity |= learner.identity()
     curve = LearningCurve()
-    adam = {"adam": optimizer}
-    state = TrainingState(policy, adam, curve, options.iterations, identity, checkpoint)
+    state = TrainingState(learned, optimizers, curve, options.iterations, identity, checkpoint)
     learner.state = state
     purpose = f"learning a policy, seed {seed}"
     with resumable(state, purpose=purpose, progress=progress) as bar, frozen(model):
@@ -115,17 +125,19 @@ def learn_policy(
             learner.record(measure, callback)
         for iteration in range(state.step, options.iterations):
             began = time.process_time()
-            for group in optimizer.param_groups:
-                decay = options.lr, options.lr_decay, options.lr_final
-                group["lr"] = learning_rate(iteration, *decay)
-            rewards = learner.rewards(iteration, options.episodes)
-            value = discounted(rewards, options.gamma).mean(1)  # Eq. 4, (M,)
+            rate = learning_rate(iteration, options.lr, options.lr_decay, options.lr_final)
+            for name, one in optimizers.items():
+                for group in one.param_groups:
+                    group["lr"] = rate * RATE if name == "value" else rate
+            objective, lesson = learner.objective(iteration)
             optimizer.zero_grad(set_to_none=True)
-            (-value.sum()).backward()
+            (-objective.mean(1).sum()).backward()
             gradients = [p.grad for p in trained if p.grad is not None]
             if not torch.isfinite(clip_gradients(gradients, options.clip)).all():
                 raise state.stopped("the gradient of the return is not finite", iteration)
             optimizer.step()
+            if learner.ahead is not None and lesson is not None:
+                learner.ahead.learn(lesson, optimizers["value"])
             state.step = iteration + 1
             state.seconds += time.process_time() - began
             bar.update()
@@ -167,6 +179,7 @@ class _Learner:
     options: LearningOptions
     seed: int
     state: TrainingState[LearningCurve] = field(init=False)
+    ahead: Bootstrap | None = None
 
     def drawn(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Starts (n, dx) and targets (n, dg) of one copy, checked."""
@@ -179,19 +192,35 @@ class _Learner:
             as_tensor("draw's targets", target, (n, self.policy.target_dim), dtype=dtype),
         )
 
-    def rewards(self, iteration: int, n: int) -> Tensor:
-        """Rewards (M, n, T) of each step of n episodes of each copy."""
+    def episodes(self, iteration: int, n: int) -> tuple[Tensor, Tensor, SeparateNoise]:
+        """Starts (R, dx) and targets (R, dg) of n episodes of each copy, and their noise."""
         seeds = [(self.seed + m) * 1_000_003 + iteration for m in range(self.policy.copies)]
         generators = tuple(torch.Generator().manual_seed(seed) for seed in seeds)
         episodes = [self.drawn(n, generator) for generator in generators]
         start, target = (torch.cat(part) for part in zip(*episodes, strict=True))
-        o, noise = self.options, SeparateNoise(generators)
+        return start, target, SeparateNoise(generators)
+
+    def objective(self, iteration: int) -> tuple[Tensor, Lesson | None]:
+        """What the policy improves (M, B), and what the value is to learn, if there is one."""
+        o, (start, target, noise) = self.options, self.episodes(iteration, self.options.episodes)
+        if self.ahead is None:
+            _, rewards = self.imagined(start, target, noise, o.horizon, iteration)
+            return discounted(rewards, o.gamma), None  # Eq. 4
+        past, target = self.ahead.begin(start, target)
+        seen, rewards = self.imagined(past, target, noise, o.bootstrap, iteration)
+        return self.ahead.objective(seen, rewards)
+
+    def imagined(
+        self, start: Tensor | Segment, target: Tensor, noise: Noise, steps: int, iteration: int
+    ) -> tuple[Segment, Tensor]:
+        """Episodes, and the rewards (M, B, T) of each of their steps."""
+        o = self.options
         seen = imagine(
             self.policy,
             self.model,
             start,
             target,
-            horizon=o.horizon,
+            horizon=steps,
             noise=o.noise,
             generator=noise,
         )
@@ -207,7 +236,7 @@ class _Learner:
                 "the reward has no gradient: write it with differentiable torch operations on the "
                 "states or actions (no comparisons, rounding, .detach(), .item() or numpy)"
             )
-        return rewards.unflatten(0, (self.policy.copies, -1))
+        return seen, rewards.unflatten(0, (self.policy.copies, -1))
 
     def reward_for(self, target: Tensor) -> Reward:
         """The reward of some targets (R, dg)."""
@@ -243,7 +272,9 @@ class _Learner:
     def record(self, measure: Measure | None, callback: Callback | None) -> None:
         """A point of the curve; the present weights are those to go back to."""
         with torch.no_grad():  # the same episodes every time
-            predicted = self.rewards(self.options.iterations, 50).sum(-1).mean(1)
+            at = self.options.iterations
+            _, rewards = self.imagined(*self.episodes(at, 50), self.options.horizon, at)
+        predicted = rewards.sum(-1).mean(1)
         curve = self.state.curve
         curve.iteration.append(self.state.step)
         curve.seconds.append(self.state.seconds)
@@ -262,12 +293,6 @@ class _Learner:
         if callback is not None:
             means = {name: sum(values) / len(values) for name, values in newest.items()}
             callback(Progress(self.state.step, self.state.seconds, means))
-
-
-def discounted(rewards: Tensor, gamma: float) -> Tensor:
-    """sum_t gamma^t r_t over the last dimension, the first step in full (Eq. 4 up to gamma)."""
-    steps = torch.arange(rewards.shape[-1], dtype=rewards.dtype, device=rewards.device)
-    return (rewards * gamma**steps).sum(-1)
 
 
 def learning_rate(iteration: int, lr: float, decay: float, final: float) -> float:
@@ -296,12 +321,3 @@ def episodes_from(starts: Tensor, *, radius: float = 0.2) -> Draw:
         return starts[index], target
 
     return draw
-
-
-def clip_gradients(gradients: Sequence[Tensor], norm: float) -> Tensor:
-    """Shorten each copy's gradients (M, ...) to ``norm`` unless it is 0; the norms before (M,)."""
-    norms = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
-    if norm:
-        for g in gradients:
-            g *= (norm / norms).clamp(max=1).reshape(-1, *[1] * (g.ndim - 1))
-    return norms

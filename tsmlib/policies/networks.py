@@ -58,6 +58,7 @@ class Policy(Configured):
     past_len: int
     action_dim: int
     output_dim: int
+    places: tuple[int, ...] = ()
 
     def __init__(
         self,
@@ -184,8 +185,14 @@ class OneStepPolicy(Policy):
         hidden: units of a layer.
         layers: hidden ones, ReLU.
         target_std: what a target counts in, metres; of a coordinate in the disc of 0.2 m.
+        places: first dimensions of places (dg,) in the state that are to meet one after the other,
+            and the last of them the target, as fingertip and object: the network sees how far and
+            in which direction each is from the next; none without.
         copies: M, side by side.
         seed: of the weights of copy 0; copy m has seed + m.
+
+    Raises:
+        ValueError: a place that does not lie in the state.
     """
 
     past_len = 1
@@ -200,14 +207,22 @@ class OneStepPolicy(Policy):
         hidden: int = 64,
         layers: int = 2,
         target_std: float = 0.1,
+        places: Sequence[int] = (),
         copies: int = 1,
         seed: int = 0,
     ) -> None:
         super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
         require_counts(action_dim=action_dim, hidden=hidden, layers=layers)
         self.action_dim = self.output_dim = action_dim
+        if any(type(d) is not int or not 0 <= d <= state_dim - target_dim for d in places):
+            raise ValueError(
+                f"places is {places!r:.80}; expected dimensions from 0 to "
+                f"{state_dim - target_dim}, at each of which a place of {target_dim} numbers begins"
+            )
+        self.places = tuple(places)
         generators = _generators(copies, seed)
-        widths = [self.features.dim + target_dim, *[hidden] * layers, action_dim]
+        seen = self.features.dim + target_dim + len(self.places) * (2 * target_dim + 1)
+        widths = [seen, *[hidden] * layers, action_dim]
         self.net = nn.ModuleList(BatchedLinear(i, o, generators) for i, o in pairwise(widths))
         with torch.no_grad():
             for parameter in self.net[-1].parameters():
@@ -229,13 +244,32 @@ class OneStepPolicy(Policy):
         goals = self.goals(past, target)
 
         def act(x: Tensor, u: Tensor, noise: Tensor | None) -> Tensor:
-            s = torch.cat([self.by_copy(self.features(x)), goals], dim=-1)  # (M, B, in)
-            for i, layer in enumerate(self.net):
-                s = layer(F.relu(s) if i else s)
-            mean = s.tanh().flatten(0, 1)
+            mean = self.output(x, goals).tanh().flatten(0, 1)
             return mean if noise is None else (mean + noise).clamp(-1, 1)
 
         return act
+
+    def output(self, x: Tensor, goals: Tensor) -> Tensor:
+        """Ask the network, not squashed.
+
+        Args:
+            x: states (R, dx), physical units.
+            goals: (M, B, dg), as ``goals`` gives them.
+
+        Returns:
+            (M, B, du).
+        """
+        seen = [self.by_copy(self.features(x)), goals]  # (M, B, .)
+        x = self.by_copy(x / self.target_std)
+        places = [x[..., d : d + self.target_dim] for d in self.places]
+        for here, there in pairwise([*places, goals]):
+            way = there - here
+            length = (way.square().sum(-1, keepdim=True) + 1e-6).sqrt()
+            seen += [way, length, way / length]
+        s = torch.cat(seen, dim=-1)  # (M, B, in)
+        for i, layer in enumerate(self.net):
+            s = layer(F.relu(s) if i else s)
+        return s
 
 
 class SegmentPolicy(Policy):

@@ -24,6 +24,8 @@ class LearningOptions:
         lr_final: where the decay ends.
         clip: norm that each copy's gradient is shortened to; 0 never, the paper states none.
         record_every: iterations between records; a checkpoint is written as often.
+        bootstrap: H, steps of an update, after which a learned value stands for the rest of the
+            episode; 0 for the paper's way, whole episodes and no value.
     """
 
     horizon: int = 50
@@ -36,10 +38,39 @@ class LearningOptions:
     lr_final: float = 1e-4
     clip: float = 0.0
     record_every: int = 100
+    bootstrap: int = 0
+
+    @classmethod
+    def with_value(
+        cls, *, horizon: int, iterations: int = 6000, record_every: int = 500
+    ) -> LearningOptions:
+        """The schedule for what whole episodes do not teach, such as pushing; not the paper's.
+
+        Args:
+            horizon: T, steps of an imagined episode.
+            iterations: updates of H = 16 steps.
+            record_every: iterations between records.
+
+        Returns:
+            The options.
+        """
+        return cls(
+            horizon=horizon,
+            gamma=0.98,
+            noise=0.1,
+            episodes=128,
+            iterations=iterations,
+            lr=2e-3,
+            lr_decay=0.05 ** (100 / iterations),  # a twentieth at the end
+            clip=1.0,
+            record_every=record_every,
+            bootstrap=16,
+        )
 
     def __post_init__(self) -> None:
         for name in ("horizon", "episodes", "iterations", "record_every"):
             require_count(name, getattr(self, name))
+        require_count("bootstrap", self.bootstrap, least=0)
         for name in ("gamma", "lr_decay"):
             require_number(name, getattr(self, name), 0, 1, above=True)
         for name in ("noise", "lr_final", "clip"):
