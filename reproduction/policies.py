@@ -14,6 +14,7 @@ from reproduction.episodes import load_data, load_model, load_prior
 from reproduction.measures.actions import within
 from reproduction.runs import Run, env_id
 from reproduction.tables import Row, place
+from tsmlib import rewards
 from tsmlib.envs import fingerprint
 from tsmlib.models.base import DynamicsModel
 from tsmlib.planning.execution import Trial
@@ -33,7 +34,8 @@ def the_task(run: Run, name: str) -> Task:
 
 
 def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
-    """A policy such as ``tsm-latent``: one that acts through the prior, or ``direct``.
+    """A policy such as ``tsm-latent``: one that acts through the prior, or ``direct``; with
+    ``value`` a direct one that learns short pieces and the value of the rest.
 
     Its learning curve is in the file's header. Learning that was killed goes on.
     """
@@ -45,9 +47,15 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
     )
     copies, seed = run.pick(1, 1, 3), 1000 * run.seed
     dx, du = data.states.shape[2], data.actions.shape[2]
+    if space == "value":
+        copies = 1
     how = {"angles": data.angles, "copies": copies, "seed": seed}
-    if space == "latent":
-        policy: Policy = tsmlib.SegmentPolicy(dx, load_prior(run, name), **how)
+    if space == "value":
+        tip, block = rewards.TIP.start, rewards.BLOCK.start
+        places = (tip, block) if task.name == "push" else (tip,)
+        policy: Policy = tsmlib.OneStepPolicy(dx, du, hidden=256, places=places, **how)
+    elif space == "latent":
+        policy = tsmlib.SegmentPolicy(dx, load_prior(run, name), **how)
     else:
         policy = tsmlib.OneStepPolicy(dx, du, **how)
     policy.features.fit(data)
@@ -58,6 +66,11 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
         episodes=run.pick(4, 20, 20),
         record_every=max(1, n // 10),
     )
+    if space == "value":
+        n = run.pick(4, 500, 8000)
+        options = tsmlib.LearningOptions.with_value(
+            horizon=task.horizon, iterations=n, record_every=max(1, n // 16)
+        )
     checkpoint = path.with_suffix(".checkpoint")
     curve = tsmlib.learn_policy(
         policy,

@@ -86,7 +86,8 @@ def policies_of(run: Run) -> list[str]:
 
 
 def _learning(run: Run, arms: tuple[str, ...]) -> list[str]:
-    return [f"learning/{arm}/{name}" for arm, name in product(arms, policies_of(run))]
+    names = [f"learning/{arm}/{name}" for arm, name in product(arms, policies_of(run))]
+    return names + ["learning/ReacherPush/rtsm-value"] * ("ReacherPush" in arms)
 
 
 def _robustness(run: Run) -> list[str]:

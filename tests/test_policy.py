@@ -35,6 +35,7 @@ from tsmlib.policies.learning import (
     learning_rate,
 )
 from tsmlib.policies.networks import OneStepPolicy, SegmentPolicy, controller
+from tsmlib.policies.value import Bootstrap
 from tsmlib.rewards import Reward
 from tsmlib.sampling import Noise, standard_normal
 from tsmlib.storage import artifacts, files
@@ -291,6 +292,53 @@ def test_a_policy_learned_through_the_true_model_arrives(kind: str) -> None:
     assert curve.predicted[2][0] > curve.predicted[1][0] > curve.predicted[0][0]
 
 
+@KINDS
+def test_short_pieces_and_a_value_teach_what_whole_episodes_do(kind: str) -> None:
+    def distance(learner: Any) -> dict[str, Tensor]:
+        end = imagine(learner, Sled(), start, target, horizon=20).states[:, -1]
+        return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
+
+    actor, drawn = policy(kind), around()(50, torch.Generator().manual_seed(9))
+    start, target = (part.double() for part in drawn)
+    settings: dict[str, Any] = dict(horizon=20, bootstrap=3, gamma=0.9, noise=0.1, clip=1.0)
+    settings |= dict(episodes=20, iterations=150, record_every=75)
+    (before,), _, (after,) = learn(actor, Sled(0.01), measure=distance, **settings).measured[
+        "distance"
+    ]
+    assert after < 0.3 * before
+
+
+def test_a_value_says_what_the_rest_of_an_episode_is_worth() -> None:
+    options = LearningOptions(horizon=30, episodes=50, bootstrap=5, gamma=0.8, noise=0.2, clip=1.0)
+    actor, world, random = policy("onestep"), Sled(), torch.Generator().manual_seed(0)
+    ahead = Bootstrap(actor, world, options, seed=0)
+    adam = torch.optim.Adam(ahead.value.parameters(), lr=3e-3)
+    for _ in range(200):
+        past, target = ahead.begin(*around()(50, random))
+        seen = imagine(actor, world, past, target, horizon=5, noise=0.2, generator=random)
+        rewards = arrive(target)(*seen)[None]
+        ahead.learn(ahead.objective(seen, rewards)[1], adam)
+    start, target = (part.repeat_interleave(100, 0) for part in around()(30, random))
+    whole = imagine(actor, world, start, target, horizon=40, noise=0.2, generator=random)
+    worth = discounted(arrive(target)(*whole), 0.8).unflatten(0, (30, 100)).mean(1)
+    said = ahead.value.output(start, target[None])[0, ::100, 0]
+    assert torch.corrcoef(torch.stack([said, worth]))[0, 1] > 0.9
+    assert said.mean().item() == pytest.approx(worth.mean().item(), rel=0.2)
+
+
+def test_a_policy_sees_how_far_and_which_way_each_place_is_from_the_next() -> None:
+    actor = policy("onestep", 4, places=(0, 2))
+    goals = normal(1, 3, 2)
+    states = torch.tensor([[0.0, 0.0, 3.0, 4.0]]).double().expand(3, -1)
+    seen: list[Tensor] = []
+    actor.net[0].register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    actor.output(states, goals)
+    way = torch.tensor([3.0, 4.0, 5.0, 0.6, 0.8]).double()
+    torch.testing.assert_close(seen[0][0, 0, 6:11], way)
+    with pytest.raises(ValueError, match=r"places is \(3,\); expected dimensions from 0 to 2"):
+        policy("onestep", 4, places=(3,))
+
+
 @pytest.mark.parametrize("name", ["tsm", "lstm", "ensemble"])
 @KINDS
 def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, name: str) -> None:
@@ -381,8 +429,11 @@ def test_a_policy_sees_states_as_its_model_does_unless_it_was_fitted_before(kind
         learn_policy(policy(kind, DX, angles=(0,)), world, arrive, starts, once)
 
 
+@pytest.mark.parametrize("bootstrap", [0, 2])
 @KINDS
-def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_path: Path) -> None:
+def test_learning_that_was_stopped_continues_as_if_it_had_not(
+    kind: str, bootstrap: int, tmp_path: Path
+) -> None:
     def stop_late(actor: Any) -> dict[str, Tensor]:
         asked.append(weights(actor))
         if len(asked) == 4:  # at iterations 0, 2, 4 and 6
@@ -391,8 +442,12 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(kind: str, tmp_pat
 
     asked: list[dict[str, Tensor]] = []
     whole, stopped = policy(kind), policy(kind)
-    settings: dict[str, Any] = dict(iterations=8, checkpoint=tmp_path / "policy")
-    curve = learn(whole, measure=lambda _: {"asked": torch.ones(1)}, iterations=8)
+    settings: dict[str, Any] = dict(
+        iterations=8, bootstrap=bootstrap, checkpoint=tmp_path / "policy"
+    )
+    curve = learn(
+        whole, measure=lambda _: {"asked": torch.ones(1)}, iterations=8, bootstrap=bootstrap
+    )
     with pytest.raises(KeyboardInterrupt):
         learn(stopped, measure=stop_late, **settings)
     anew = policy(kind)

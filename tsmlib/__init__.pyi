@@ -39,6 +39,7 @@ from .policies.learning import learn_policy as learn_policy
 from .policies.networks import OneStepPolicy as OneStepPolicy
 from .policies.networks import SegmentPolicy as SegmentPolicy
 from .policies.options import LearningOptions as LearningOptions
+from .pretrained import load_policy as load_policy
 from .pretrained import load_pretrained as load_pretrained
 from .pretrained import load_pusht as load_pusht
 from .pretrained import load_task as load_task

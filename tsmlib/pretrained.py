@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from tsmlib.models.base import DynamicsModel
+    from tsmlib.policies.networks import OneStepPolicy
     from tsmlib.storage.files import Json
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -62,6 +63,32 @@ def load_pretrained(model: str, *, env: str) -> DynamicsModel:
     expect = cast("Mapping[str, Json]", tsmlib.envs.fingerprint(trained_on))
     cls = zoo.find(model).load()
     return cast("DynamicsModel", artifacts.load_model(path, cls, expect=expect))
+
+
+def load_policy(*, env: str) -> OneStepPolicy:
+    """A policy that was learned inside the recurrent model and comes with the package.
+
+    Args:
+        env: id of the environment that it acts in.
+
+    Returns:
+        The policy, on the CPU; ``tsmlib.policies.networks.controller`` makes it act.
+
+    Raises:
+        ValueError: none ships for this environment.
+    """
+    from tsmlib.policies.networks import OneStepPolicy  # heavy
+
+    require_type("env", env, str, "an id, such as 'tsm/ReacherPush-v1'")
+    trained_on = zoo.trained_on(env, "rtsm")
+    path = PRETRAINED / EnvSpec.parse(trained_on).name / "policy-rtsm-value.safetensors"
+    if not path.exists():
+        raise ValueError(
+            f"no policy of {env} ships; expected tsm/ReacherPush-v1. To learn one: "
+            "tsmlib.learn_policy(...)"
+        )
+    expect = cast("Mapping[str, Json]", tsmlib.envs.fingerprint(trained_on))
+    return artifacts.load_model(path, OneStepPolicy, expect=expect)
 
 
 def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:

@@ -213,15 +213,15 @@ class _Learner:
     def imagined(
         self, start: Tensor | Segment, target: Tensor, noise: Noise, steps: int, iteration: int
     ) -> tuple[Segment, Tensor]:
-        """Episodes, and the rewards (M, B, T) of each of their steps."""
-        o = self.options
+        """Episodes, and the rewards (M, B, T) of each of their steps; a record's without noise."""
+        spread = self.options.noise if torch.is_grad_enabled() else 0.0
         seen = imagine(
             self.policy,
             self.model,
             start,
             target,
             horizon=steps,
-            noise=o.noise,
+            noise=spread,
             generator=noise,
         )
         if not torch.isfinite(seen.states).all():
