@@ -1,10 +1,11 @@
 """Measurement of the explorer against what it is to reach; the table of docs/explorer.md.
 
-    python explorer/measure.py [--targets 100] [parity] [plans] [closed] [page] [table]
+    python explorer/measure.py [--targets 100] [parity] [plans] [closed] [drags] [page] [table]
 
 parity: largest differences of the page from Python, over 100 frozen starts, and CPU time of a try.
 plans: returns of open-loop plans for the frozen targets, in the page and in Python.
 closed: success of closed loops over random scenes.
+drags: of 20 random scenes, as the page plans after a first drag.
 page: times, sizes and accessibility in Chromium, by test/measure.mjs.
 
 Each is kept in measured.json, from which ``table`` writes. The page must be built.
@@ -91,7 +92,7 @@ def parity() -> dict[str, Any]:
     (found,) = ask(asked | {"actions": actions.flatten(1).tolist()})
     expected = rollout(model, past, actions).numpy()
     difference = np.abs(np.array(found).reshape(expected.shape) - expected)[..., [0, 1, 4, 5, 6, 7]]
-    cpu = in_page(task.take(10), seed=1, first=OPEN)["cpu"]
+    cpu = in_page(task.take(10), seed=1, first=OPEN, rounds=1)["cpu"]
     return {"n": len(task), "physics": float(physics), "model": float(difference.max()), "cpu": cpu}
 
 
@@ -108,7 +109,7 @@ def plans(targets: int) -> dict[str, Any]:
     return {
         "n": len(task),
         "python": python,
-        "page": [in_page(task, seed=1000 * k, first=OPEN) for k in (1, 2)],
+        "page": [in_page(task, seed=1000 * k, first=OPEN, rounds=1) for k in (1, 2)],
     }
 
 
@@ -131,6 +132,19 @@ def closed(targets: int) -> list[dict[str, Any]]:
     return runs
 
 
+def drags() -> dict[str, Any]:
+    """A first drag: the recurrent model plans again every ten steps; and one plan, both ways."""
+    task = draw_task(ENV, seed=DRAGS, n=20)
+    onestep = {"model": "onestep", "space": "direct"}
+    return {
+        "n": len(task),
+        "first": in_page(task, seed=1, replan=True),
+        "one plan": in_page(task, seed=1),
+        "one plan, one search": in_page(task, seed=1, rounds=1),
+        "one plan, one-step model, any torques": in_page(task, seed=1, **onestep),
+    }
+
+
 def closed_in_page(task: Task, again: dict[str, int], seed: int) -> dict[str, float]:
     return in_page(task, seed=seed, first=OPEN, again=again, replan=True)
 
@@ -147,7 +161,7 @@ def closed_in_python(task: Task, again: dict[str, int], seed: int) -> dict[str, 
 
 def in_page(task: Task, **asked: Any) -> dict[str, float]:
     """Means over the targets of a task, planned and executed in the page's own code."""
-    asked |= {"what": "plan", "task": "push", "model": "rtsm", "space": "latent"}
+    asked = {"what": "plan", "task": "push", "model": "rtsm", "space": "latent"} | asked
     (found,) = ask(
         asked | {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()}
     )
@@ -322,6 +336,7 @@ def main(asked: list[str], targets: int) -> None:
         "parity": parity,
         "plans": partial(plans, targets),
         "closed": partial(closed, targets),
+        "drags": drags,
         "page": page,
     }
     for part in [word for word in parts if word in asked or not asked]:
@@ -333,7 +348,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description="Measure the explorer and write the table of docs/explorer.md."
     )
-    parser.add_argument("parts", nargs="*", choices=["parity", "plans", "closed", "page", "table"])
+    parser.add_argument(
+        "parts", nargs="*", choices=["parity", "plans", "closed", "drags", "page", "table"]
+    )
     parser.add_argument("--targets", type=int, default=100)
     arguments = parser.parse_args()
     main(arguments.parts, arguments.targets)

@@ -163,7 +163,7 @@ def test_a_plan_of_the_page_is_worth_what_it_is_in_python() -> None:
         "targets": frozen.target.tolist(),
         "seed": 1,
     }
-    (found,) = ask(asked | {"first": search})
+    (found,) = ask(asked | {"first": search, "rounds": 1})
     model, prior = load_pretrained(word, env=frozen.env), load_pretrained("prior", env=frozen.env)
     space, predict = LatentActions(prior, frozen.horizon), model_predictor(model, frozen.past(10))  # type: ignore[arg-type]
     executed = torch.stack(
@@ -178,6 +178,16 @@ def test_a_plan_of_the_page_is_worth_what_it_is_in_python() -> None:
     mean, spread = float(executed.mean()), float(executed.mean(1).std())
     assert abs(np.mean([one["executed"] for one in found]) - mean) < 4 * spread
     assert all(one["success"] == (one["distance"] < frozen.tolerance) for one in found)
+
+
+def test_searching_on_never_leaves_a_worse_plan_than_the_first_search() -> None:
+    task = load_task(ENVS["push"]).take(3)
+    asked = {"what": "plan", "task": "push", "model": "onestep", "space": "latent", "seed": 1}
+    asked |= {"starts": task.start.astype(float).tolist(), "targets": task.target.tolist()}
+    asked |= {"first": {"candidates": 16, "iterations": 2}}
+    first, best = ask(asked | {"rounds": 1}, asked | {"rounds": 3})
+    gains = [b["predicted"] - a["predicted"] for a, b in zip(first, best, strict=True)]
+    assert min(gains) >= 0 < max(gains)
 
 
 def test_a_link_that_was_edited_by_hand_is_refused_in_one_sentence() -> None:

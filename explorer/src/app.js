@@ -1,6 +1,6 @@
 // The page: what a person does, the worker's answers, and the drawing of both.
 import { LESSONS, TOUR } from './lessons.js';
-import { drawReturns, drawTorques } from './plot.js';
+import { drawStrip, drawTorques } from './plot.js';
 import { kinematics } from './physics.js';
 import { defaultScene, flipped, fromLink, moved, outside, startState, toLink } from './scene.js';
 import { View, fromShare, palette, toShare } from './view.js';
@@ -11,7 +11,9 @@ const SPACES = { latent: 'codes c', direct: 'any torques' };
 const MODELS = { rtsm: 'recurrent TSM', tsm: 'TSM', lstm: 'LSTM', onestep: 'one-step model' };
 const STEP = 0.005, LONG_STEP = 0.02; // metres per key
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-const LAST = 20; // tries in the plot
+const LAST = 20; // tries in the strip
+const WAYS = [{ model: 'rtsm', space: 'latent' }, { model: 'onestep', space: 'direct' }]; // each try is made by two: ours, or what was chosen, and the other
+const OPENING = 2; // scene of the tour: the fooled model
 const SAME = 6; // tries in the table
 const WAIT = 200; // ms from a choice or a key to the plan, in case that more follow
 const LABEL = 0.05; // m from what can be dragged to its name
@@ -21,7 +23,7 @@ const signed = (v, digits = 2) => v.toFixed(digits).replace('-', '−');
 
 const state = {
   manifest: null, scene: defaultScene(), result: null, time: 0, playing: false, planning: false, failed: false,
-  view: matchMedia('(max-width: 700px)').matches ? 'over' : 'beside', tries: [], bent: null, tour: -1, id: 0, waiting: 0, touched: false,
+  view: matchMedia('(max-width: 700px)').matches ? 'over' : 'beside', tries: [], bent: null, tour: -1, id: 0, waiting: 0, touched: false, opening: false,
 };
 const worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
 const views = { predicted: new View($('predicted')), executed: new View($('executed')) };
@@ -215,6 +217,11 @@ function flip() {
 /** Take a scene where it is another one; what was planned for the one before is gone. */
 function change(scene) {
   if (scene === state.scene) return false;
+  if (state.opening) { // the line above the picture says so
+    state.opening = false;
+    if (scene.model === state.scene.model && scene.space === state.scene.space) scene = { ...scene, ...WAYS[0], replan: true };
+    worker.postMessage({ type: 'load', task: scene.task, model: scene.model });
+  }
   state.scene = scene;
   forget();
   show();
@@ -232,6 +239,7 @@ function forget() {
 
 function show() {
   const { scene, result, planning } = state, done = result?.done, model = look(scene.model);
+  $('do').textContent = headline();
   $('task').value = scene.task;
   $('model').value = scene.model;
   $('space').value = scene.space;
@@ -280,6 +288,12 @@ function show() {
   redraw();
 }
 
+/** The one line above the picture. */
+function headline() {
+  if (state.opening) return 'A one-step model planned this push, fooled by its own prediction. Drag the red target: a recurrent TSM plans.';
+  return 'Drag the target, the object or the fingertip. Each try is planned both ways: see the strip below.';
+}
+
 /** What is drawn, in words. */
 function legend() {
   const { scene } = state, what = { push: ' Brown: the object.', obstacle: ' Grey disc: the obstacle.', reach: '' }[scene.task];
@@ -295,6 +309,10 @@ function turned() {
 
 function verdict() {
   const { scene, result, planning } = state, done = result?.done;
+  if (planning && result?.parts.length === 1) {
+    const { round } = result.parts[0], searched = (state.progress?.round ?? round) + 1;
+    return `Best of ${searched} ${searched === 1 ? 'search' : 'searches'} so far; it searches on until nothing gets better.`;
+  }
   if (planning && result?.parts.length) {
     const { candidates, iterations, ms } = result.parts.at(-1);
     return `Executing and planning again: ${candidates} × ${iterations} candidates in ${Math.round(ms)} ms.`;
@@ -429,15 +447,16 @@ const answers = {
   },
   progress(event) {
     state.progress = event;
-    if (!state.result.parts.length) $('verdict').textContent = verdict();
+    if (state.result.parts.length < 2) $('verdict').textContent = verdict();
   },
   part(part) {
-    const { result } = state, executed = new Float64Array(result.executed.length + part.executed.length);
-    executed.set(result.executed);
-    executed.set(part.executed, result.executed.length);
-    Object.assign(result, { executed, parts: [...result.parts, part] });
+    const { result } = state, better = !part.from && result.parts.length, before = part.from ? result.executed : new Float64Array(0);
+    const executed = new Float64Array(before.length + part.executed.length);
+    executed.set(before);
+    executed.set(part.executed, before.length);
+    Object.assign(result, { executed, parts: [...(part.from ? result.parts : []), part] });
     if (part.from) $('verdict').textContent = verdict();
-    else if (still.matches) show();
+    else if (still.matches || (better && state.playing)) show();
     else play();
   },
   done(done) {
@@ -445,9 +464,16 @@ const answers = {
     result.done = { ...done, replan, steps: horizon() };
     state.planning = false;
     if (still.matches) state.time = horizon();
-    state.tries = [...state.tries, { ...result.done, model, space, start: startOf(scene) }].slice(-LAST);
+    state.tries = [...state.tries, { ...result.done, id: state.id, model, space, start: startOf(scene) }].slice(-LAST);
     plot();
     show();
+    const other = WAYS.find(way => way.model !== model || way.space !== space);
+    worker.postMessage({ type: 'plan', id: state.id, live: !still.matches, rival: true, scene: { ...scene, ...other, start: startState(scene, state.manifest.arm) } });
+  },
+  rival(rival) {
+    const one = state.tries.find(({ id }) => id === rival.id);
+    if (one) one.rival = { ...rival, steps: one.steps, replan: one.replan };
+    plot();
   },
   imagined({ from, states }) {
     asked = false;
@@ -458,8 +484,17 @@ const answers = {
   },
 };
 
+/** The strip of the last tries, and how often either way arrived. */
 function plot() {
-  drawReturns($('returns'), state.tries.map(one => ({ ...one, colour: colourOf(one.model) })));
+  const hued = one => one && { ...one, colour: colourOf(one.model) }, limit = about().tolerance;
+  drawStrip($('returns'), state.tries.map(one => ({ ...hued(one), rival: hued(one.rival) })), { limit, most: LAST });
+  const pairs = state.tries.filter(({ rival }) => rival).flatMap(one => [one, one.rival]), counts = new Map();
+  for (const { model, space, success } of pairs) {
+    const name = `${MODELS[model]}, ${SPACES[space]}`, [arrived, all] = counts.get(name) ?? [0, 0];
+    counts.set(name, [arrived + success, all + 1]);
+  }
+  const said = [...counts].map(([name, [arrived, all]]) => `${name} ${arrived} of ${all}`).join('; ');
+  $('share').textContent = said ? `Within ${Math.round(100 * limit)} cm: ${said}.` : 'Each try is made both ways, from the same start with the same search.';
 }
 
 let asked = false, wanted = false;
@@ -497,7 +532,8 @@ function visit(k) {
   state.tour = k;
   const place = TOUR[k];
   $('guide').hidden = !place;
-  $('tour').hidden = $('lead').hidden = $('do').hidden = Boolean(place);
+  state.opening = false;
+  $('tour').hidden = $('do').hidden = Boolean(place);
   $('steps').hidden = !place;
   if (!place) {
     $('tour').focus();
@@ -528,8 +564,9 @@ function copyLink() {
 
 function start() {
   makeHandles();
+  state.opening = !location.hash;
+  restore(location.hash || TOUR[OPENING].link);
   plot();
-  restore(location.hash);
   const choose = key => event => {
     if (key === 'task') change({ ...defaultScene(event.target.value), model: state.scene.model, space: state.scene.space, replan: state.scene.replan });
     else change({ ...state.scene, [key]: key === 'replan' ? event.target.checked : event.target.value });

@@ -28,7 +28,8 @@ export const LESSONS = [
     math: math('Maximise over the codes c 1 to c K the expected sum of rewards, with torques from the action prior',
       `<munder><mi>max</mi><mrow>${sub('c', '1')}<mo>…</mo>${sub('c', 'K')}</mrow></munder>${i('E')}<mo>[</mo><munder><mo>∑</mo><mi>t</mi></munder>`
       + `${reward(sub('x', 't'), sub('u', 't'))}<mo>]</mo>${o(',')}<mspace width="0.6em"/>${sub('u', 't')}${o('∼')}${i('P')}${o('(')}${sub('u', 't')}${o('|')}${sub('u', '1:t−1')}${o(',')}${i('c')}${o(')')}`),
-    text: 'The planner tries 64 plans in the model, keeps the best, and tries again around them, six times (cross-entropy method). '
+    text: 'The planner tries 64 plans in the model, keeps the best, and tries again around them, six times (cross-entropy method); then it '
+      + 'searches on, around its best plan and anew by turns, until nothing gets better in the mean over 32 futures. '
       + 'What it searches is your choice. The action prior is a second network: it turns codes c, eight numbers for each 0.2 s and not '
       + 'the Z above, into torques like those of the training data. Searching codes c, the planner finds only such torques; searching the '
       + 'torques themselves, it finds any.',

@@ -1,4 +1,4 @@
-// Returns of the last tries, and the torques of a plan, as SVG.
+// Where the last tries ended, and the torques of a plan, as SVG.
 const NS = 'http://www.w3.org/2000/svg', SIZE = 260, LEFT = 48, BELOW = 42, TOP = 8;
 
 function element(name, attributes, text = '') {
@@ -8,40 +8,36 @@ function element(name, attributes, text = '') {
   return found;
 }
 
-/** tries: { predicted, executed, colour, space, replan }, oldest first; the last one is emphasised. */
-export function drawReturns(svg, tries) {
-  const values = tries.flatMap(({ predicted, executed }) => [predicted, executed]);
-  const low = Math.floor(Math.min(-10, ...values) / 5) * 5, high = Math.ceil(Math.max(-5, ...values) / 5) * 5;
-  const wide = SIZE - LEFT - 8, tall = SIZE - BELOW - TOP;
-  const x = v => LEFT + (v - low) / (high - low) * wide, y = v => TOP + (high - v) / (high - low) * tall;
-  svg.replaceChildren();
+/**
+ * Where the last tries ended, one column each: the way that was chosen, filled, and the other, hollow.
+ * tries: { distance, colour, space, rival: { distance, colour, space } or none }, oldest first. limit: metres that count as arrived.
+ */
+export function drawStrip(svg, tries, { limit, most }) {
+  const high = 0.25, wide = SIZE - LEFT - 8, tall = SIZE - BELOW - TOP;
+  const x = i => LEFT + (i + 0.5) * wide / most, y = v => TOP + (1 - Math.min(v, high) / high) * tall;
+  svg.replaceChildren(element('rect', { x: LEFT, y: y(limit), width: wide, height: y(0) - y(limit), class: 'arrived' }));
   svg.setAttribute('viewBox', `0 0 ${SIZE} ${SIZE}`);
-  svg.append(element('path', { d: `M${x(low)} ${y(low)}H${x(high)}V${y(high)}Z`, class: 'fooled' }));
-  const step = high - low > 20 ? 10 : 5;
-  for (let v = low; v <= high; v += step) {
+  for (let cm = 0; cm <= 25; cm += 5) {
     svg.append(
-      element('path', { d: `M${x(v)} ${TOP}V${TOP + tall}M${LEFT} ${y(v)}H${LEFT + wide}`, class: 'grid' }),
-      element('text', { x: x(v), y: TOP + tall + 20, 'text-anchor': 'middle' }, `${v}`.replace('-', '−')),
-      element('text', { x: LEFT - 6, y: y(v) + 4, 'text-anchor': 'end' }, `${v}`.replace('-', '−')),
+      element('path', { d: `M${LEFT} ${y(cm / 100)}H${LEFT + wide}`, class: 'grid' }),
+      element('text', { x: LEFT - 6, y: y(cm / 100) + 4, 'text-anchor': 'end' }, cm === 25 ? '≥25' : `${cm}`),
     );
   }
   svg.append(
-    element('path', { d: `M${x(low)} ${y(low)}L${x(high)} ${y(high)}`, class: 'equal' }),
-    ...['predicted more', 'than executed'].map((text, i) =>
-      element('text', { x: LEFT + wide - 6, y: y(low) - 22 + 14 * i, 'text-anchor': 'end', class: 'note' }, text)),
-    element('text', { x: LEFT + wide / 2, y: SIZE - 4, 'text-anchor': 'middle' }, 'predicted return'),
-    element('text', { x: 0, y: 0, 'text-anchor': 'middle', transform: `translate(11 ${TOP + tall / 2}) rotate(-90)` }, 'executed return'),
+    element('text', { x: LEFT + wide / 2, y: SIZE - 14, 'text-anchor': 'middle' }, 'tries, the latest on the right'),
+    element('text', { x: 0, y: 0, 'text-anchor': 'middle', transform: `translate(11 ${TOP + tall / 2}) rotate(-90)` }, 'cm from the target at the end'),
   );
-  tries.forEach(({ predicted, executed, colour, space }, i) => {
-    const last = i + 1 === tries.length, r = last ? 6 : 4, mark = { class: last ? 'try last' : 'try', style: `--colour:${colour}` };
-    const [a, b] = [x(predicted), y(executed)];
-    svg.append(space === 'latent' ? element('circle', { cx: a, cy: b, r, ...mark })
-      : element('rect', { x: a - r, y: b - r, width: 2 * r, height: 2 * r, ...mark }));
+  const mark = ({ distance, colour, space }, i, kind, r) => {
+    const [a, b] = [x(i), y(distance)], style = `--colour:${colour}`;
+    return space === 'latent' ? element('circle', { cx: a, cy: b, r, class: kind, style })
+      : element('rect', { x: a - r, y: b - r, width: 2 * r, height: 2 * r, class: kind, style });
+  };
+  tries.forEach((one, i) => {
+    if (one.rival) svg.append(element('path', { d: `M${x(i)} ${y(one.distance)}V${y(one.rival.distance)}`, class: 'grid' }), mark(one.rival, i, 'rival', 4));
+    svg.append(mark(one, i, i + 1 === tries.length ? 'try last' : 'try', 4.5));
   });
-  const below = tries.filter(({ predicted, executed }) => predicted > executed).length;
-  svg.setAttribute('aria-label', tries.length
-    ? `Predicted against executed return of the last ${tries.length} tries; ${below} predicted more than was executed.`
-    : 'Predicted against executed return; no tries yet.');
+  const arrived = tries.filter(({ distance }) => distance < limit).length;
+  svg.setAttribute('aria-label', tries.length ? `Distance from the target at the end of the last ${tries.length} tries, both ways; ${arrived} arrived as chosen.` : 'Distance from the target at the end; no tries yet.');
 }
 
 /** actions: torques (T, 2) of shoulder and elbow, each from -1 to 1. */

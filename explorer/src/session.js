@@ -8,6 +8,9 @@ import { normal } from './random.js';
 export const SAMPLES = 32; // futures of the fan, and behind a predicted return, as in tsmlib.planning.predictors
 export const EVERY = 10; // steps executed before the next plan
 const FEWEST = 12; // candidates of a later plan, at least
+const ROUNDS = 8; // searches for the first plan, at most
+const PATIENCE = 2; // searches in a row that better nothing, after which it ends
+const BETTER = 0.05; // of return, by which a search has to better the best plan
 const ALONE = 8; // rows in which CEM judges its start and its last mean
 const L = 10, DU = 2;
 
@@ -108,16 +111,25 @@ export function affordable({ candidates, iterations }, msPerStep, steps, budget)
   return { candidates: many, iterations: Math.min(iterations, Math.max(1, Math.floor(fits / many))) };
 }
 
+/** A plan as the tables judge it: its return in the mean over futures, which are the same for every plan of one step. */
+function judged(network, past, plan, horizon, seed, target, place) {
+  const { mode, samples } = predict(network, past, plan, horizon, seed, place.dx), rows = samples ? SAMPLES : 1;
+  const found = returns(rows, samples ?? mode, samples ? repeated(plan, rows) : plan, target, place);
+  return { mode, samples, value: found.reduce((a, b) => a + b) / rows };
+}
+
 /**
- * Run a try. Asynchronous generator of events:
- *   { type: 'progress', iteration, of, value }
- *   { type: 'part', from, predicted (T - from, dx), fan (32, T - from, 2) or null, actions, executed (steps, dx), ms, candidates, iterations }
+ * Run a try. The search for the first plan goes on, from the best plan so far and anew by turns, until it betters nothing any
+ * more; each plan that betters the best is executed and shown in its place. Asynchronous generator of events:
+ *   { type: 'progress', iteration, of, round, value }
+ *   { type: 'part', from, round, predicted (T - from, dx), fan (32, T - from, 2) or null, actions, executed (steps, dx), ms, candidates, iterations },
+ *   which where from is 0 comes again, in place of the one before, with a better plan
  *   { type: 'done', predicted, executed, distance, success, mode }: the returns of the whole episode, as in the tables
  *
  * scene: { task, model, space, replan, start (dx), target (2), seed }. budget: milliseconds for each later plan, or
  * Infinity for the full search. keep: is told the past and the plan of each part, for ``imagine``.
  */
-export async function* attempt(library, scene, { first = { candidates: CAPACITY, iterations: 6 }, again = { candidates: CAPACITY, iterations: 4 }, budget = Infinity, keep = () => {} } = {}) {
+export async function* attempt(library, scene, { first = { candidates: CAPACITY, iterations: 6 }, again = { candidates: CAPACITY, iterations: 4 }, budget = Infinity, rounds = ROUNDS, keep = () => {} } = {}) {
   const { task, model, space, replan, start, target, seed } = scene, about = library.manifest.tasks[task];
   const [network, prior, world] = await Promise.all([library.model(task, model), library.prior(task), library.world(task)]);
   const dx = about.stateDim, T = about.horizon, place = measured(task, dx);
@@ -129,23 +141,32 @@ export async function* attempt(library, scene, { first = { candidates: CAPACITY,
     search = searchSpace(space, prior, past, horizon);
     const { candidates, iterations } = from ? affordable(again, rate, horizon, budget) : first;
     const question = { task, model, space, past, horizon, target };
-    const planning = cem(search, (rows, parameters) => judge(library, question, rows, parameters), { start: left, candidates, iterations, seed: seed + 1000 * from });
-    let step = await planning.next();
-    for (; !step.done; step = await planning.next()) yield { type: 'progress', from, ...step.value, of: iterations };
-    const plan = search.decode(4, repeated(step.value.parameters, 4)).slice(0, horizon * DU);
-    rate = (performance.now() - began) / ((candidates * iterations + ALONE) * horizon);
-    const { mode, samples } = predict(network, past, plan, horizon, seed + 1000 * from + 1, dx);
-    if (!from) {
-      const rows = samples ? SAMPLES : 1, of = returns(rows, samples ?? mode, samples ? repeated(plan, rows) : plan, target, place);
-      predicted = of.reduce((a, b) => a + b) / rows;
+    let best = null, idle = 0;
+    for (let round = 0; round < (from ? 1 : rounds) && idle < PATIENCE; round++) {
+      const draws = seed + 1000 * from + 17 * round;
+      const planning = cem(search, (rows, parameters) => judge(library, question, rows, parameters), { start: round % 2 ? best.parameters : left, candidates, iterations, seed: draws });
+      let step = await planning.next();
+      for (; !step.done; step = await planning.next()) yield { type: 'progress', from, round, ...step.value, of: iterations };
+      const { parameters } = step.value, plan = search.decode(4, repeated(parameters, 4)).slice(0, horizon * DU);
+      if (!round) rate = (performance.now() - began) / ((candidates * iterations + ALONE) * horizon);
+      const { value } = judged(network, past, plan, horizon, seed + 1000 * from + 2, target, place);
+      idle = best && !(value > best.value + BETTER) ? idle + 1 : 0;
+      if (best && !(value > best.value)) continue;
+      best = { value, plan, parameters };
+      const { mode, samples, value: fresh } = judged(network, past, plan, horizon, seed + 1000 * from + 1, target, place);
+      if (!from) {
+        predicted = fresh;
+        states.length = actions.length = 0;
+        world.reset(start);
+      }
+      keep({ network, past, plan, horizon, from });
+      const steps = replan ? EVERY : T, executed = world.advance(plan.subarray(0, steps * DU));
+      for (const x of executed) states.push(x);
+      actions.push(...plan.subarray(0, steps * DU));
+      const fan = samples && Float32Array.from({ length: SAMPLES * horizon * 2 }, (_, i) => samples[(i >> 1) * dx + place.position + (i & 1)]);
+      yield { type: 'part', from, predicted: mode, fan, actions: plan, executed, round, ms: performance.now() - began, candidates, iterations };
     }
-    keep({ network, past, plan, horizon, from });
-    const steps = replan ? EVERY : T, executed = world.advance(plan.subarray(0, steps * DU));
-    for (const x of executed) states.push(x);
-    actions.push(...plan.subarray(0, steps * DU));
-    left = replan ? search.left(step.value.parameters, EVERY) : undefined;
-    const fan = samples && Float32Array.from({ length: SAMPLES * horizon * 2 }, (_, i) => samples[(i >> 1) * dx + place.position + (i & 1)]);
-    yield { type: 'part', from, predicted: mode, fan, actions: plan, executed, ms: performance.now() - began, candidates, iterations };
+    left = replan ? search.left(best.parameters, EVERY) : undefined;
     if (!replan) break;
   }
   const end = (T - 1) * dx + place.position, distance = Math.hypot(states[end] - target[0], states[end + 1] - target[1]);

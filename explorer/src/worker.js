@@ -1,6 +1,6 @@
 // Plans in a worker, so that the page never waits.
-//   in:  { type: 'plan', id, scene } | { type: 'imagine', id, knobs, values } | { type: 'load', task, model } | { type: 'stop' }
-//   out: { type: 'ready', manifest } | { type: 'error', message } | an event of a try with its id | { type: 'imagined', id, from, states }
+//   in:  { type: 'plan', id, scene, live, rival } | { type: 'imagine', id, knobs, values } | { type: 'load', task, model } | { type: 'stop' }
+//   out: { type: 'ready', manifest } | { type: 'error', message } | an event of a try with its id | { type: 'rival', id, ... } its end the other way | { type: 'imagined', id, from, states }
 import { PageError, readManifest } from './files.js';
 import { loadMujoco } from './physics.js';
 import { Library, attempt, imagine } from './session.js';
@@ -47,11 +47,13 @@ const library = (async () => {
 library.then(({ manifest }) => postMessage({ type: 'ready', manifest }), fail);
 
 /** live: whether the plan is played while it is made, so that later parts have to be in time. */
-async function plan(id, scene, live) {
+async function plan(id, scene, live, rival) {
   const { library: files } = await library;
-  for await (const event of attempt(files, scene, { budget: live ? BUDGET : Infinity, keep: plan => { kept = { id, ...plan }; } })) {
+  const keep = rival ? undefined : plan => { kept = { id, ...plan }; };
+  for await (const event of attempt(files, scene, { budget: live ? BUDGET : Infinity, keep })) {
     if (id !== current) return;
-    postMessage({ ...event, id });
+    if (!rival) postMessage({ ...event, id });
+    else if (event.type === 'done') postMessage({ ...event, type: 'rival', id, model: scene.model, space: scene.space });
     await pause();
     if (id !== current) return;
   }
@@ -62,7 +64,7 @@ onmessage = async ({ data }) => {
     if (data.type === 'stop') current = 0;
     if (data.type === 'plan') {
       current = data.id;
-      await plan(data.id, data.scene, data.live);
+      await plan(data.id, data.scene, data.live, data.rival);
     }
     if (data.type === 'load') {
       const { library: files } = await library;

@@ -61,12 +61,12 @@ async function shared({ task, model, past, target, codes, workers }) {
   return [...found];
 }
 
-/** { model, space, replan, starts, targets, seed, first?, again? } -> [{ predicted, executed, distance, success, ms, cpu }], ms: of each plan; cpu: seconds */
-async function plan({ task, model, space, replan = false, starts, targets, seed, first, again }) {
+/** { model, space, replan, starts, targets, seed, first?, again?, rounds? } -> [{ predicted, executed, distance, success, ms, cpu }], ms: of each plan; cpu: seconds */
+async function plan({ task, model, space, replan = false, starts, targets, seed, first, again, rounds }) {
   const found = [];
   for (const [i, start] of starts.entries()) {
     const scene = { task, model, space, replan, start, target: targets[i], seed: seed + i }, ms = [], began = process.cpuUsage();
-    for await (const event of attempt(library, scene, { first, again })) {
+    for await (const event of attempt(library, scene, { first, again, rounds })) {
       if (event.type === 'part') ms.push(event.ms);
       if (event.type === 'done') found.push({ ...event, ms, cpu: process.cpuUsage(began).user / 1e6 });
     }

@@ -35,7 +35,8 @@ const steps = {
     await ready(page);
     measured.ready_ms = Math.round(await page.evaluate(() => performance.now()));
     await planned(page);
-    await onFirstScreen(page, ['#lead', '#space', '#knob-hint', '#verdict', '#numbers', '#meaning', '#agreement', '#time', '#legend']);
+    await onFirstScreen(page, ['#do', '#space', '#knob-hint', '#verdict', '#numbers', '#meaning', '#agreement', '#time', '#legend']);
+    assert.match(await text(page, '#agreement'), /The model was fooled/);
     const trace = await tracing(page);
     const box = await page.locator('#predicted').boundingBox(), handle = await page.locator('#figure-predicted .handle.target').boundingBox();
     const at = [handle.x + 22, handle.y + 22];
@@ -44,14 +45,20 @@ const steps = {
     await page.mouse.move(at[0] - 0.05 * box.width, at[1] + 0.02 * box.height, { steps: 5 });
     await page.mouse.up();
     await planned(page);
-    assert.match(await text(page, '#caption-executed'), /open loop/);
+    assert.match(await text(page, '#caption-predicted'), /recurrent TSM/);
+    assert.match(await text(page, '#caption-executed'), /every ten steps/);
     const [predicted, executed] = await Promise.all(['#predicted-return', '#executed-return'].map(id => text(page, id)));
     assert.ok([predicted, executed].every(value => Number(value.replace('−', '-')) < 0), `${predicted} ${executed}`);
     assert.equal(await tries(page), 2);
     await page.waitForFunction(() => document.querySelector('#time').value === '100', null, slow);
     measured.longest_main_thread_task_cpu_ms = (await trace()).longest;
+    await page.waitForFunction(() => document.querySelectorAll('#returns .rival').length > 0, null, slow); // made the other way too
+    assert.match(await text(page, '#share'), /Within 5 cm: .*recurrent TSM, codes c \d of \d/);
     await page.locator('#time').fill('40');
     assert.equal(await text(page, '#clock'), '0.80 s');
+    await page.uncheck('#replan');
+    await afresh(page);
+    await planned(page);
     await page.locator('#knob-0').fill('2');
     assert.equal(await text(page, '#knob-value-0'), '2.0');
     await page.click('[data-set-view=over]');
@@ -72,7 +79,7 @@ const steps = {
   },
 
   async 'model, search space and task are switched'() {
-    const page = await open();
+    const page = await open('#task=push');
     await ready(page);
     await planned(page);
     const choose = async (id, value) => { // and nothing else: it plans by itself
