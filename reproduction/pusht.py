@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import pandas as pd
 import torch
@@ -18,6 +19,7 @@ import torch
 import tsmlib
 from tsmlib.envs.pusht import weak_policy
 from tsmlib.models.egocentric import Egocentric
+from tsmlib.planning.base import SearchSpace
 from tsmlib.planning.pusht import random_play
 from tsmlib.pretrained import load_pusht
 from tsmlib.training.fit import fit
@@ -25,8 +27,13 @@ from tsmlib.training.options import TrainingOptions
 from tsmlib.trajectory import Trajectories
 
 EPISODES, HELD_OUT = 5800, 60  # of 100 steps
-STAGES = ((1, 1024, 7000, (0.0, 0.35)), (4, 384, 5000, (0.35, 0.65)), (10, 192, 3000, (0.65, 1.0)))
-CANDIDATES, ELITES, ITERATIONS = 128, 12, 4
+Stage = tuple[int, int, int, tuple[float, float]]  # steps ahead, batch, updates, part of a schedule
+STAGES: tuple[Stage, ...] = (
+    (1, 1024, 7000, (0.0, 0.35)),
+    (4, 384, 5000, (0.35, 0.65)),
+    (10, 192, 3000, (0.65, 1.0)),
+)
+SEARCH = {"candidates": 128, "elites": 12, "iterations": 4}
 EVERY, RMS = 5, 0.6  # steps; of full action, of which uniform actions have 0.58
 AHEAD = {"A": (40, 1.0), "B": (25, 0.0), "C": (25, 0.0)}  # steps of a plan, smoothness of the noise
 
@@ -36,34 +43,45 @@ def train(
 ) -> Egocentric:
     """The model of random play: one step ahead, then four, then ten on its own predictions."""
     model = Egocentric.for_data(data, seed=seed, hidden=128)
-    for future_len, batch, steps, span in STAGES:
-        updates = max(20, round(share * steps))
-        options = TrainingOptions(
-            future_len=future_len,
-            steps=updates,
-            batch_size=batch,
-            lr=2e-3,
-            muon=0.01,
-            span=span,
-            validate_every=max(10, updates // 4),
-        )
-        fit(model, data, held_out, options, seed=seed)
+    for stage in STAGES:
+        fit(model, data, held_out, options(stage, share), seed=seed)
     return model
 
 
+def options(stage: Stage, share: float = 1.0) -> TrainingOptions:
+    """What ``fit`` takes for a share of a stage."""
+    future_len, batch, steps, span = stage
+    updates = max(20, round(share * steps))
+    return TrainingOptions(
+        future_len=future_len,
+        steps=updates,
+        batch_size=batch,
+        lr=2e-3,
+        muon=0.01,
+        span=span,
+        validate_every=max(10, updates // 4),
+    )
+
+
 def trial(
-    model: tsmlib.DynamicsModel | None, protocol: str, pairs: int, *, seed: int
+    model: tsmlib.DynamicsModel | None,
+    protocol: str,
+    pairs: int,
+    *,
+    seed: int,
+    split: Literal["validation", "test"] = "test",
+    space: SearchSpace | None = None,
+    every: int = EVERY,
+    **search: int,
 ) -> tsmlib.Trial:
-    """Planning again every five steps on the first frozen pairs; None plans in the simulator."""
-    task = load_pusht("test", protocol)
+    """Planning again every few steps on the first frozen pairs; None plans in the simulator."""
+    task = load_pusht(split, protocol)
     task = task.take(min(pairs, len(task)))
     ahead, smoothness = AHEAD[protocol]
-    space = tsmlib.DirectActions(ahead, rms=RMS, smoothness=smoothness)
-    planner = partial(
-        tsmlib.cem, candidates=CANDIDATES, elites=ELITES, iterations=ITERATIONS, seed=seed
-    )
+    space = space or tsmlib.DirectActions(ahead, rms=RMS, smoothness=smoothness)
+    planner = partial(tsmlib.cem, **(SEARCH | search), seed=seed)
     return tsmlib.mpc(
-        task, model, space, planner, every=EVERY, lookahead=ahead, until_success=True, seed=seed
+        task, model, space, planner, every=every, lookahead=ahead, until_success=True, seed=seed
     )
 
 
@@ -87,6 +105,32 @@ def row(
     }
 
 
+class Table:
+    """Rows in a file, which is written after every one.
+
+    Args:
+        path: of the CSV; rows that it holds already are kept.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[dict[str, object]] = []
+        if path.exists():
+            self.rows = [dict(line) for _, line in pd.read_csv(path).iterrows()]
+
+    def has(self, method: str, protocol: str, seed: int) -> bool:
+        """Whether a row is there."""
+        key = (method, protocol, seed)
+        return any((row["method"], row["protocol"], row["seed"]) == key for row in self.rows)
+
+    def add(self, row: dict[str, object]) -> None:
+        """Append a row."""
+        self.rows.append(row)
+        print(row, flush=True)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(self.rows).to_csv(self.path, index=False)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -96,19 +140,13 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("runs/pusht"))
     parser.add_argument("--out", type=Path, default=Path("data/results/11_pusht.csv"))
     given = parser.parse_args()
-    rows: list[dict[str, object]] = []
-    if given.out.exists():
-        rows = [dict(line) for _, line in pd.read_csv(given.out).iterrows()]
+    table = Table(given.out)
 
     def add(method: str, protocol: str, seed: int, make: Callable[[], tsmlib.Trial]) -> None:
-        if any((r["method"], r["protocol"], r["seed"]) == (method, protocol, seed) for r in rows):
-            return
-        began = time.process_time()
-        result = make()
-        rows.append(row(result, time.process_time() - began, method, protocol, seed))
-        print(rows[-1], flush=True)
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(rows).to_csv(given.out, index=False)
+        if not table.has(method, protocol, seed):
+            began = time.process_time()
+            result = make()
+            table.add(row(result, time.process_time() - began, method, protocol, seed))
 
     for seed in given.seeds:
         path = given.models / f"egocentric-{seed}.safetensors"
