@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-import pandas as pd
 from torch import nn
 
 import tsmlib

@@ -323,9 +323,37 @@ def model(data):
     return Egocentric.for_data(data, hidden=16)
 
 
-def test_columns_that_the_robot_does_not_have_are_refused():
-    with pytest.raises(ValueError, match="pairs of columns, of the 3 state dimensions"):
-        Egocentric(3, 2, angles=(2,), body=(0, 1, 2))
+@pytest.mark.parametrize(
+    ("sizes", "arguments", "words"),
+    [
+        ((3, 2), {"angles": (2,), "body": (0, 1, 2)}, "vectors is"),
+        ((0, 2), {}, "state_dim is 0"),
+        ((7.0, 2), {}, "state_dim is 7.0"),
+        ((7, 3), {}, "action_dim is 3; expected 2"),
+        ((7, "2"), {}, "action_dim is '2'"),
+        ((7, 2), {"body": (2, 3)}, "body is .*; expected 3 different columns"),
+        ((7, 2), {"body": "234"}, "body is '234'"),
+        ((7, 2), {"body": None}, "body is None"),
+        ((7, 2), {"body": (2, 3, -3)}, "body is"),
+        ((7, 2), {"body": (2.0, 3, 4)}, "body is"),
+        ((7, 2), {"body": (2, 2, 4)}, "body is"),
+        ((7, 2), {"places": (0, 1)}, "places is 0"),
+        ((7, 2), {"places": 5}, "places is a int 5"),
+        ((7, 2), {"places": ((0, True),)}, "places is"),
+        ((7, 2), {"places": ()}, "column 0 0 times"),
+        ((7, 2), {"places": ((0, 1), (0, 1))}, "column 0 2 times"),
+        ((7, 2), {"vectors": ((5, 7),)}, "vectors is"),
+        ((7, 2), {"vectors": {5: 6}}, "vectors is a dict"),
+        ((7, 2), {"angles": (0,)}, "angles is .*; expected the body's alone"),
+        ((7, 2), {"angles": (4, 0)}, "expected the body's alone"),
+        ((7, 2), {"angles": 4}, "angles is 4"),
+        ((7, 2), {"hidden": -1}, "hidden is -1"),
+        ((7, 2), {"layers": 1.5}, "layers is 1.5"),
+    ],
+)
+def test_columns_that_make_no_sense_are_named(sizes, arguments, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        Egocentric(*sizes, **arguments)
 
 
 def test_what_is_seen_from_the_t_does_not_depend_on_where_it_lies(model, data):

@@ -90,6 +90,16 @@ def require_choice(name: str, value: T, choices: Iterable[T]) -> T:
     return value
 
 
+def require_columns(name: str, value: object, n: int, of: int) -> tuple[int, ...]:
+    """``value`` as ``n`` different columns of a state of ``of`` dimensions; else an error."""
+    expected = f"{n} different columns of the {of} state dimensions, 0 to {of - 1}"
+    if not isinstance(value, list | tuple) or any(type(column) is not int for column in value):
+        raise TypeError(f"{name} is {value!r:.80}; expected {expected}")
+    if len(value) != n or len({*value}) != n or not {*value} <= {*range(of)}:
+        raise ValueError(f"{name} is {value!r:.80}; expected {expected}")
+    return tuple(value)
+
+
 def as_tensor(
     name: str,
     value: object,

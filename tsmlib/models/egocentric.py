@@ -10,13 +10,14 @@ model with H = 1.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tsmlib.checks import require_counts
+from tsmlib.checks import require_columns, require_counts, require_type
 from tsmlib.models.base import Step, repeated, rollout
 from tsmlib.models.layers import silu_network
 from tsmlib.models.state_model import StateModel
@@ -36,6 +37,11 @@ class Egocentric(StateModel):
         vectors: pairs of columns that are vectors, velocities for example.
         hidden: width of the network.
         layers: hidden layers.
+
+    Raises:
+        TypeError: an argument of another kind; it is named.
+        ValueError: columns that there are not, or that are not named once; another angle than the
+            body's; an action that is no vector in the plane.
     """
 
     segment_len, past_len, stochastic = 1, 1, False
@@ -57,14 +63,23 @@ class Egocentric(StateModel):
     ) -> None:
         super().__init__(state_dim, action_dim, angles)
         require_counts(hidden=hidden, layers=layers)
-        groups = [(body, 3), *((pair, 2) for pairs in (places, vectors) for pair in pairs)]
-        if any(len(group) != n or not {*group} <= {*range(state_dim)} for group, n in groups):
+        if action_dim != 2:
+            raise ValueError(f"action_dim is {action_dim}; expected 2, a vector in the plane")
+        x, y, self.angle = require_columns("body", body, 3, state_dim)
+        self.pairs = [[x, y]]
+        for name, pairs in (("places", places), ("vectors", vectors)):
+            require_type(name, pairs, (list, tuple), "pairs of columns, such as ((0, 1),)")
+            columns = (require_columns(f"a pair of {name}", pair, 2, state_dim) for pair in pairs)
+            self.pairs += [list(pair) for pair in columns]
+        counts = Counter([self.angle, *(column for pair in self.pairs for column in pair)])
+        if wrong := [column for column in range(state_dim) if counts[column] != 1]:
             raise ValueError(
-                f"body is {body}, places {places} and vectors {vectors}; expected three columns, "
-                f"and pairs of columns, of the {state_dim} state dimensions"
+                f"body is {body}, places {places} and vectors {vectors}, which name column "
+                f"{wrong[0]} {counts[wrong[0]]} times; expected each of the {state_dim} state "
+                "dimensions once"
             )
-        x, y, self.angle = body
-        self.pairs = [[x, y], *map(list, places), *map(list, vectors)]
+        if self.features.angles != [self.angle]:
+            raise ValueError(f"angles is {angles}; expected the body's alone, ({self.angle},)")
         self.n_places, dim = len(places), 2 * (len(places) + len(vectors)) + action_dim + 4
         self.net = silu_network(dim, *[hidden] * layers, state_dim)
         self.linear = nn.Linear(dim, state_dim)
