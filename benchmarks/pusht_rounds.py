@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -40,6 +39,12 @@ from tsmlib.trajectory import Segment
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = (5_000, 20_000, 50_000, 100_000)  # steps of the environment
 MARKS = (5_000, 10_000, 15_000, 20_000, 30_000, 40_000, 50_000, 75_000, 100_000)  # of SAC
+STAGES: tuple[pusht.Stage, ...] = (  # of the training on the first play, and of a round's
+    (1, 1024, 700, (0.0, 0.35)),
+    (4, 384, 500, (0.35, 0.65)),
+    (10, 192, 300, (0.65, 1.0)),
+)
+FURTHER: pusht.Stage = (10, 192, 600, (0.0, 1.0))
 SEARCH = {"candidates": 64, "elites": 8, "iterations": 3}
 PAIRS, LONG, EPISODE = 200, 100, 50  # measured on; steps of an episode of random play, of own play
 LINES = {  # method -> colour, name at its line
@@ -83,9 +88,9 @@ def rounds(method: str, seed: int, add: Callable[[dict], None]) -> None:
         model: Egocentric | OneStep = OneStep.for_data(first, seed=seed)
     else:
         model = Egocentric.for_data(first, seed=seed, hidden=128)
-    for stage in pusht.STAGES:
+    for stage in STAGES:
         tsmlib.fit(
-            model, mirrored(first), held_out, pusht.options(stage, 0.1), seed=seed, progress=False
+            model, mirrored(first), held_out, pusht.options(stage), seed=seed, progress=False
         )
 
     def measure(model: tsmlib.DynamicsModel, prior: object = None) -> dict[str, float]:
@@ -98,7 +103,7 @@ def rounds(method: str, seed: int, add: Callable[[dict], None]) -> None:
     done: list[int] = []
     measure(model)
     counts = {k: (BUDGETS[k] - BUDGETS[k - 1]) for k in range(1, len(BUDGETS))}
-    further = replace(pusht.options(pusht.STAGES[2], 0.2), span=(0.0, 1.0))
+    further = pusht.options(FURTHER)
     options = ExplorationOptions(model=further, rounds=len(counts), every=5, **SEARCH)
     random = method == "random play"
     tsmlib.explore(

@@ -29,9 +29,9 @@ from tsmlib.trajectory import Trajectories
 EPISODES, HELD_OUT = 5800, 60  # of 100 steps
 Stage = tuple[int, int, int, tuple[float, float]]  # steps ahead, batch, updates, part of a schedule
 STAGES: tuple[Stage, ...] = (
-    (1, 1024, 7000, (0.0, 0.35)),
-    (4, 384, 5000, (0.35, 0.65)),
-    (10, 192, 3000, (0.65, 1.0)),
+    (1, 1024, 15_555, (0.0, 0.35)),
+    (4, 384, 10_000, (0.35, 0.65)),
+    (10, 192, 7_777, (0.65, 1.0)),
 )
 SEARCH = {"candidates": 128, "elites": 12, "iterations": 4}
 EVERY, RMS = 5, 0.6  # steps; of full action, of which uniform actions have 0.58
