@@ -182,6 +182,7 @@ def test_measures_of_success():
     assert success_b(episode, goal)
     assert not success_c(episode, goal)
     assert success_c(torch.stack([near, away, away, away]), goal)
+    assert not success_c(torch.stack([away, away]), goal)  # two steps are not held for three
     assert success_a(torch.stack([near, away]), goal)
     assert not success_a(near[None], goal)
 

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from tsmlib.checks import require_choice, require_count
 from tsmlib.collection import collect
@@ -81,7 +82,8 @@ def solved_c(states: Tensor, goal: Tensor) -> Tensor:
 
 def success_c(states: Tensor, goal: Tensor) -> Tensor:
     """Protocol C, CLEAR-LeWM Strict: solved in three states in a row. (..., T, 7) -> (...) bool."""
-    return solved_c(states, goal[..., None, :]).unfold(-1, HELD, 1).all(-1).any(-1)
+    solved = F.pad(solved_c(states, goal[..., None, :]), (HELD - 1, 0))  # held by no shorter one
+    return solved.unfold(-1, HELD, 1).all(-1).any(-1)
 
 
 def distance(states: Tensor, goal: Tensor, corners: Tensor | None = None) -> Tensor:
