@@ -111,6 +111,14 @@ def test_an_unknown_task_is_named_beside_those_that_there_are(env_id: str) -> No
         tsmlib.collect_random(env_id, 1)
 
 
+def test_an_id_with_two_slashes_is_the_same_environment() -> None:
+    data = tsmlib.collect_random(CUP.replace("dmc-", "dmc/"), 1, horizon=3)
+    assert data.env == CUP
+    assert (
+        data.flat_states.tolist() == tsmlib.collect_random(CUP, 1, horizon=3).flat_states.tolist()
+    )
+
+
 SMALL = tsmlib.SolveOptions(
     episodes=2, candidates=16, iterations=1, hidden=32, first=150, updates=30, ahead=0.6
 )
@@ -129,7 +137,8 @@ def test_a_run_that_was_stopped_goes_on_with_the_same_numbers(tmp_path: Path) ->
     assert [r["env_steps"] for r in whole.records] == [320, 480]
     for name, weight in whole.model.state_dict().items():
         torch.testing.assert_close(rest.model.state_dict()[name], weight, rtol=0, atol=0)
-    assert len(whole.film()) == 40
+    assert len(whole.film(tmp_path / "pendulum.gif")) == 40
+    assert (tmp_path / "pendulum.gif").stat().st_size > 1000
     assert whole.play().own_return is not None
 
 
@@ -138,6 +147,12 @@ def test_an_environment_without_a_reward_function_says_how_one_is_given() -> Non
         tsmlib.solve("Pendulum-v1")
     with pytest.raises(ValueError, match="two rounds of"):
         tsmlib.solve(PENDULUM, 1000)
+
+
+def test_a_reward_that_is_out_of_reach_is_named() -> None:
+    options = {"horizon": 20, "options": dataclasses.replace(SMALL, first=5), "progress": False}
+    with pytest.raises(ValueError, match=r"0 at each of 80 steps; a plan that looks 0\.6 s ahead"):
+        tsmlib.solve(CUP, 160, reward=lambda x, u: (x[..., 3] > 9).float(), **options)
 
 
 def test_other_robots_are_solved_by_the_same_call() -> None:

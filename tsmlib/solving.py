@@ -33,7 +33,8 @@ from tsmlib.planning.planners import cem
 from tsmlib.planning.predictors import model_predictor
 from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import Task
-from tsmlib.rewards import Reward, fingerprint, reward_of
+from tsmlib.plots import save_video
+from tsmlib.rewards import Reward, fingerprint, reward_of, rewarded
 from tsmlib.storage.files import Json, PathLike, encode_nonfinite, writer_lock
 from tsmlib.training.fit import TrainingOptions, fit
 from tsmlib.trajectory import Segment, Trajectories
@@ -191,16 +192,20 @@ class Solved:
         """
         return execute(self.task(episodes, seed=seed), self.controller(seed=seed), past_len=1)
 
-    def film(self, *, seed: int = 500) -> np.ndarray:
+    def film(self, path: PathLike | None = None, *, seed: int = 500) -> np.ndarray:
         """Film one episode in closed loop.
 
         Args:
+            path: of a file to write, .mp4, .webp, .gif or .png, in real time; None for none.
             seed: of the reset and of the plans.
 
         Returns:
             Frames (T, H, W, 3) uint8.
         """
-        return film(self.task(seed=seed), self.play(seed=seed), 0)
+        frames = film(self.task(seed=seed), self.play(seed=seed), 0)
+        if path is not None:
+            save_video(frames, path, fps=max(1, round(1 / self.data.dt)))
+        return frames
 
 
 def solve(
@@ -232,8 +237,8 @@ def solve(
         Model, data, learning curve and controller.
 
     Raises:
-        ValueError: the environment offers no reward, or has no limit of time; or fewer steps than
-            two rounds take.
+        ValueError: the environment offers no reward, or has no limit of time; fewer steps than two
+            rounds take; or a reward that is the same at every step of two rounds.
         StoreError: ``folder`` is of another run, or in use.
     """
     o = SolveOptions() if options is None else options
@@ -252,7 +257,7 @@ def solve(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = OneStep.for_data(data, hidden=o.hidden)
-    solved = Solved(env, model, data, aim, horizon, o, goal)
+    solved = Solved(data.env, model, data, aim, horizon, o, goal)
     start = torch.from_numpy(data.flat_states[data.offsets])
     identity: dict[str, Json] = {
         "settings": asdict(o),
@@ -275,6 +280,7 @@ def solve(
             if k:
                 new, own = _episodes(solved, k, seed, files)
                 solved.data = solved.data.joined(new)
+                _require_graded(solved)
                 taken += repeat * int(new.steps.sum())
                 record |= own | {"env_steps": float(taken)}
             record = _fitted(solved, k, seed, record, files)
@@ -290,6 +296,20 @@ def solve(
 def _draw(seed: int, k: int) -> int:
     """A seed of round k, from which its resets count up; those from 500 on are of no round."""
     return (seed * 1_000_003 + 1000 * k) % 2**31
+
+
+def _require_graded(solved: Solved) -> None:
+    """ValueError where all steps so far earn the same, so that plans are made of nothing."""
+    states, actions = solved.data.padded(solved.horizon)
+    after = torch.from_numpy(states[:, 1:])
+    earned = rewarded(solved.reward, after, torch.from_numpy(actions))
+    if float(earned.max() - earned.min()) == 0:
+        raise ValueError(
+            f"the reward of {solved.env} is {float(earned[0, 0]):g} at each of {earned.numel()} "
+            f"steps; a plan that looks {solved.options.ahead:g} s ahead sees nothing to choose by, "
+            "and no value bridges more. Give a reward that grades the way, reward=function, or "
+            "look farther ahead, SolveOptions(ahead=...)"
+        )
 
 
 def _episodes(

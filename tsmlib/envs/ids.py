@@ -27,7 +27,8 @@ def find_spec(env_id: str) -> GymnasiumSpec:
     """Gymnasium's record of an id, which may carry arguments.
 
     Args:
-        env_id: for example ``"Pendulum-v1"``, ``"Pendulum-v1(g=1.0)"`` or ``"module:Name-v0"``.
+        env_id: for example ``"Pendulum-v1"``, ``"Pendulum-v1(g=1.0)"`` or ``"module:Name-v0"``;
+            ``"tsm/dmc/..."`` stands for ``"tsm/dmc-..."``, since Gymnasium allows one slash.
 
     Raises:
         UnsupportedEnvironment: the id says that no id can say how its environment is made.
@@ -38,6 +39,7 @@ def find_spec(env_id: str) -> GymnasiumSpec:
     if colon:
         importlib.import_module(module)
         name = plain
+    name = re.sub(r"^tsm/dmc/", "tsm/dmc-", name)
     if name.startswith("tsm/PushT-") and not bracket:
         pusht_physics(name)  # registers a variant
     elif name.startswith("tsm/dmc-") and name not in CONTROL_IDS:

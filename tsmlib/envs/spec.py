@@ -124,7 +124,9 @@ CONTROL_IDS = tuple(f"tsm/dmc-{name}-v0" for name in CONTROL)  # see ``dmc``
 
 def is_arm(env_id: str) -> bool:
     """Whether an id is of an arm, or is meant to be, as opposed to what else is ours or foreign."""
-    return env_id.startswith("tsm/") and not env_id.startswith(("tsm/PushT-", "tsm/dmc-"))
+    return env_id.startswith("tsm/") and not env_id.startswith(
+        ("tsm/PushT-", "tsm/dmc-", "tsm/dmc/")
+    )
 
 
 _VECTOR_ARMS = {
