@@ -105,32 +105,41 @@ class FreeRunning(torch.autograd.Function):
             biases[:, :channels].unbind(0),
         )
 
-        inputs = x.new_empty(steps, n, width)
-        s, gates = (
-            x.new_empty(layers, steps * n, channels),
-            x.new_empty(layers, steps * n, 2 * channels),
-        )
-        h = x.new_empty(steps * n, layers * channels)
+        # Without gradients to come, one set of buffers serves all layers and positions.
+        kept, room = (steps, steps) if stack.keep else (known + 1, max(known, 1))
+        inputs, s = x.new_empty(steps, n, width), x.new_empty(layers, steps * n, channels)
+        gates = x.new_empty(layers if stack.keep else 1, room * n, 2 * channels)
+        h = x.new_empty(room * n, layers * channels)
         wide = channels + (width if stack.state_skip else 0)
-        total = x.new_empty(steps - known, n, wide)
-        hidden = [x.new_empty(2, steps - known, n, len(part)) for part in head[:-1]]
+        total = x.new_empty(kept - known, n, wide)
+        hidden = [x.new_empty(2, kept - known, n, len(part)) for part in head[:-1]]
         active = total if stack.state_skip else torch.empty_like(total)
         states = x.new_empty(steps - known, n, x.shape[2])
         minus = x.new_full((), -1.0)
 
-        def prepare(layer: int, begin: int, end: int) -> None:
-            """Codes and what comes from d positions before."""
-            s_, q = s[layer], gates[layer]
-            q[begin * n : end * n].unflatten(0, (-1, n)).copy_(given[layer])
+        def prepare(layer: int, begin: int, end: int) -> Tensor:
+            """Codes and what comes from d positions before: q, but for what comes from now."""
+            rows = slice(begin * n, end * n)
+            q = gates[layer, rows] if stack.keep else gates[0, : (end - begin) * n]
+            q.unflatten(0, (-1, n)).copy_(given[layer])
             d = dilations[layer]
-            if (begin := max(begin, d)) < end:
-                q[begin * n : end * n].addmm_(s_[(begin - d) * n : (end - d) * n], earlier[layer])
+            if (late := max(begin, d)) < end:
+                before = s[layer, (late - d) * n : (end - d) * n]
+                q[(late - begin) * n :].addmm_(before, earlier[layer])
+            return q
 
-        def gate(layer: int, s_: Tensor, q: Tensor, h_: Tensor, after: Tensor | None) -> None:
+        def gate(
+            layer: int,
+            s_: Tensor,
+            q: Tensor,
+            f: Tensor,
+            g: Tensor,
+            h_: Tensor,
+            after: Tensor | None,
+        ) -> None:
             q.addmm_(s_, now[layer]).sigmoid_()
-            filtered, opened = q.split(channels, dim=1)
-            torch.add(minus, filtered, alpha=2, out=filtered)
-            torch.mul(filtered, opened, out=h_)
+            torch.add(minus, f, alpha=2, out=f)
+            torch.mul(f, g, out=h_)
             if after is None:
                 return
             if stack.residual:
@@ -144,35 +153,48 @@ class FreeRunning(torch.autograd.Function):
         torch.addmm(inlet_bias, inputs.flatten(0, 1)[rows], inlet.T, out=s[0, rows])
         parts = h.split(channels, dim=1)
         for layer in range(last):
-            prepare(layer, first[layer + 1], known)
             rows = slice(first[layer + 1] * n, known * n)
-            gate(layer, s[layer, rows], gates[layer, rows], parts[layer][rows], s[layer + 1, rows])
+            q = prepare(layer, first[layer + 1], known)
+            h_ = parts[layer][rows] if stack.keep else parts[layer][: len(q)]
+            f, g = q.chunk(2, dim=1)
+            gate(layer, s[layer, rows], q, f, g, h_, s[layer + 1, rows])
 
-        by_step = [part.split(n) for part in s], [part.split(n) for part in gates]
-        h_by_step, h_parts = h[:, lowest * channels :].split(n), [part.split(n) for part in parts]
+        # What a step needs, as views that are made once.
+        late = known * n if stack.keep else 0
+        repeat = 1 if stack.keep else steps - known
+        s_steps = [part[known * n :].split(n) for part in s]
+        views = (gates, gates[..., :channels], gates[..., channels:])
+        q_steps, f_steps, g_steps = ([_steps(p[late:], n, repeat) for p in v] for v in views)
+        if not stack.keep:
+            q_steps, f_steps, g_steps = (v * layers for v in (q_steps, f_steps, g_steps))
+        h_steps = [_steps(part[late:], n, repeat) for part in parts]
+        mix_steps = _steps(h[late:, lowest * channels :], n, repeat)
+        in_steps, seen_steps = inputs[known:].unbind(0), inputs[known:, :, :seen].unbind(0)
         act = silu if stack.state_skip else relu
         latest, deviations, (order, _) = x[known], stack.features.step_std, _orders(stack.features)
         final = (head[-1] * deviations[:, None])[order].T
         final_bias = (head_bias[-1] * deviations)[order]
-        for t in range(known, steps):
-            k = t - known
-            see(stack.features, latest, inputs[t, :, :seen])
-            torch.addmm(inlet_bias, inputs[t], inlet.T, out=by_step[0][0][t])
+        for k in range(steps - known):
+            kept_k, t = k if stack.keep else 0, known + k
+            see(stack.features, latest, seen_steps[k])
+            torch.addmm(inlet_bias, in_steps[k], inlet.T, out=s_steps[0][k])
             for layer, d in enumerate(dilations):
-                if k % d == 0:
+                if not stack.keep:
+                    prepare(layer, t, t + 1)
+                elif k % d == 0:
                     prepare(layer, t, min(t + d, steps))
-                after = None if layer == last else by_step[0][layer + 1][t]
-                gate(layer, by_step[0][layer][t], by_step[1][layer][t], h_parts[layer][t], after)
-            torch.addmm(skip_bias, h_by_step[t], skips, out=total[k, :, :channels])
+                after = None if layer == last else s_steps[layer + 1][k]
+                q, f, g, h_ = (v[layer][k] for v in (q_steps, f_steps, g_steps, h_steps))
+                gate(layer, s_steps[layer][k], q, f, g, h_, after)
+            torch.addmm(skip_bias, mix_steps[k], skips, out=total[kept_k, :, :channels])
             if stack.state_skip:
-                total[k, :, channels:] = inputs[t]
+                total[kept_k, :, channels:] = inputs[t]
             else:
-                relu(total[k], out=active[k])
-            a = active[k]
-            for (before, after), weight, bias in zip(
-                hidden, head[:-1], head_bias[:-1], strict=True
-            ):
-                a = act(torch.addmm(bias, a, weight.T, out=before[k]), out=after[k])
+                relu(total[kept_k], out=active[kept_k])
+            a = active[kept_k]
+            for buffer, weight, bias in zip(hidden, head[:-1], head_bias[:-1], strict=True):
+                before, after = buffer[:, kept_k].unbind(0)
+                a = act(torch.addmm(bias, a, weight.T, out=before), out=after)
             latest = torch.add(latest, final_bias, out=states[k]).addmm_(a, final)
         if stack.keep:
             ctx.save_for_backward(x, states, inputs, s, gates, h, total, active, *hidden, *weights)
@@ -203,23 +225,31 @@ class FreeRunning(torch.autograd.Function):
             ds[layer, : max(known - d, 0) * n].zero_()
             ds[layer, max(steps - d, 0) * n :].zero_()
 
-        def slope(layer: int | slice, rows: slice) -> None:
+        def slope(f: Tensor, g: Tensor, value: Tensor, df: Tensor, dg: Tensor) -> None:
             """Write the derivative of h by q, [g (1 - f^2), f g (1 - g)] = [g - h f, h - h g]."""
-            f, g = gates[layer, rows].split(channels, dim=-1)
-            df, dg = dq[layer, rows].split(channels, dim=-1)
-            value = h[rows].unflatten(1, (layers, -1)).transpose(0, 1)[layer]
             torch.addcmul(g, value, f, value=-1, out=df)
             torch.addcmul(value, value, g, value=-1, out=dg)
 
         def through(
-            layer: int, dh_: Tensor, dq_: Tensor, ds_: Tensor, after: Tensor | None
+            layer: int, dh_: Tensor, dq_: Tensor, both: Tensor, ds_: Tensor, after: Tensor | None
         ) -> None:
-            dq_.unflatten(1, (2, -1)).mul_(dh_[:, None])
+            both.mul_(dh_)
             if after is not None and stack.residual:
                 ds_ += after
             ds_.addmm_(dq_, now[layer])
 
-        by_step = [part.split(n) for part in ds], [part.split(n) for part in dq]
+        ds_steps, dq_steps, both_steps = (
+            [part[known * n :].split(n) for part in whole]
+            for whole in (ds, dq, dq.unflatten(2, (2, channels)))
+        )
+        dh_both = [part[:, None] for part in dh_parts]
+        halves = (
+            part.unflatten(1, (steps, n))[:, known:].unbind(1)
+            for whole in (gates, dq)
+            for part in whole.chunk(2, dim=2)
+        )
+        f_steps, g_steps, df_steps, dg_steps = halves
+        h_steps = h.view(steps, n, layers, channels)[known:].transpose(1, 2).unbind(0)
         act_backward = silu_backward if stack.state_skip else relu_backward
         threshold = () if stack.state_skip else (0,)
         deviations, (order, unsorted) = stack.features.step_std, _orders(stack.features)
@@ -238,16 +268,17 @@ class FreeRunning(torch.autograd.Function):
             else:
                 relu_backward(da, total[k], 0, grad_input=dtotal[k])
             torch.mm(dtotal[k, :, :channels], skips, out=dh_skips)
-            slope(slice(None), slice(t * n, (t + 1) * n))
+            slope(f_steps[k], g_steps[k], h_steps[k], df_steps[k], dg_steps[k])
             for layer in reversed(range(layers)):
                 after = None
                 if layer < last:
-                    after = by_step[0][layer + 1][t]
+                    after = ds_steps[layer + 1][k]
                     if stack.residual:
                         dh_parts[layer].addmm_(after, back[layer])
                     else:
                         torch.mm(after, back[layer], out=dh_parts[layer])
-                through(layer, dh_parts[layer], by_step[1][layer][t], by_step[0][layer][t], after)
+                dq_, both, ds_ = (v[layer][k] for v in (dq_steps, both_steps, ds_steps))
+                through(layer, dh_both[layer], dq_, both, ds_, after)
                 d = stack.dilations[layer]
                 if k % d == 0 and (end := min(t + d, steps)) > d:
                     begin = max(t, d)
@@ -256,19 +287,24 @@ class FreeRunning(torch.autograd.Function):
                         earlier[layer],
                         out=ds[layer, (begin - d) * n : (end - d) * n],
                     )
-            row = torch.mm(by_step[0][0][t], inlet, out=dinputs[t])
+            row = torch.mm(ds_steps[0][k], inlet, out=dinputs[t])
             if stack.state_skip:
                 row += dtotal[k, :, channels:]
-            cos, sin, rest_ = (row[:, :seen] * slopes_[t]).split([angles, angles, others], 1)
+            cos, sin, rest_ = (row[:, :seen] * slopes_[t]).split_with_sizes(
+                [angles, angles, others], 1
+            )
             dx[t] += dx[t + 1]
             dx[t, :, :angles].add_(cos).add_(sin)
             dx[t, :, angles:].add_(rest_)
         for layer in reversed(range(last)):
             begin, end, d = first[layer + 1], known, stack.dilations[layer]
             rows = slice(begin * n, end * n)
-            slope(layer, rows)
+            dq_ = dq[layer, rows]
+            (f, g), (df, dg) = gates[layer, rows].chunk(2, 1), dq_.chunk(2, 1)
+            slope(f, g, parts[layer][rows], df, dg)
             after = ds[layer + 1, rows]
-            through(layer, after @ back[layer], dq[layer, rows], ds[layer, rows], after)
+            dh_ = (after @ back[layer])[:, None]
+            through(layer, dh_, dq_, dq_.unflatten(1, (2, -1)), ds[layer, rows], after)
             if (begin := max(begin, d)) < end:
                 ds[layer, (begin - d) * n : (end - d) * n].addmm_(
                     dq[layer, begin * n : end * n], earlier[layer]
@@ -323,3 +359,8 @@ def _orders(features: Features) -> tuple[list[int], list[int]]:
     """The dimensions of a state, angles first, and where each then stands."""
     order = features.angles + features.others
     return order, sorted(range(len(order)), key=order.__getitem__)
+
+
+def _steps(part: Tensor, n: int, repeat: int) -> tuple[Tensor, ...]:
+    """Views of n rows each; where only those of one step were kept, these again and again."""
+    return part.split(n) if repeat == 1 else (part[:n],) * repeat

@@ -23,12 +23,13 @@ def on_device_of(model: object, *tensors: Tensor) -> tuple[Tensor, ...]:
     return tensors if weight is None else tuple(tensor.to(weight.device) for tensor in tensors)
 
 
-def chunked(compute: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """``compute`` of so few rows at a time that its steps stay in a CPU's cache."""
-    if len(rows[0]) <= BLOCK or rows[0].device.type != "cpu":
+def chunked(compute: Callable[..., Tensor], *rows: Tensor, most: int | None = None) -> Tensor:
+    """``compute`` of so few rows at a time, ``most``, that its steps stay in a CPU's cache."""
+    most = min(BLOCK, most or BLOCK)
+    if len(rows[0]) <= most or rows[0].device.type != "cpu":
         return compute(*rows)
     return torch.cat(
-        [compute(*block) for block in zip(*(part.split(BLOCK) for part in rows), strict=True)]
+        [compute(*block) for block in zip(*(part.split(most) for part in rows), strict=True)]
     )
 
 

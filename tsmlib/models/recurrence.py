@@ -260,8 +260,8 @@ def _each(buffer: Tensor, sizes: list[int]) -> list[tuple[Tensor, ...]]:
 def see(features: Features, x: Tensor, s: Tensor) -> None:
     """Write the features of x (..., dx), whose angles come first, into s (..., F)."""
     angles, others = len(features.angles), len(features.others)
-    angle, other = x.split([angles, others], -1)
-    cos, sin, rest = s.split([angles, angles, others], -1)
+    angle, other = x.split_with_sizes([angles, others], -1)
+    cos, sin, rest = s.split_with_sizes([angles, angles, others], -1)
     torch.cos(angle, out=cos)
     torch.sin(angle, out=sin)
     rest.copy_(other)

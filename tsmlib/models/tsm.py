@@ -40,6 +40,8 @@ from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise, random_indices
 from tsmlib.trajectory import Segment, Window
 
+ROWS = 256  # that are decoded at once where no gradient is to come
+
 
 class TSM(StateModel):
     """Temporal segment model of one robot: the paper's (section 3, Eq. 1, appendix A.1).
@@ -256,7 +258,8 @@ class TSM(StateModel):
         Returns:
             States (B, K, dx) in physical units.
         """
-        return chunked(self._decode, *past, actions, z)
+        most = None if torch.is_grad_enabled() else ROWS
+        return chunked(self._decode, *past, actions, z, most=most)
 
     def _decode(self, states: Tensor, before: Tensor, actions: Tensor, z: Tensor) -> Tensor:
         return free_running(self.decoder, self.features, Segment(states, before), actions, z)
