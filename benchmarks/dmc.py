@@ -4,7 +4,8 @@
 
 Runs are kept in runs/dmc and go on where they stopped; more steps continue them. The rows of all
 runs there land in data/results/dmc.csv, one per task, seed and round, and figures/dmc.png is drawn;
-``--no-run`` does only this.
+``--no-run`` does only this. ``--film`` instead writes figures/dmc.webp, six seconds of each task by
+the first seed after ``--steps``.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from reproduction import tables
 from reproduction.pages import fill
 from tsmlib.envs import CONTROL_IDS
 from tsmlib.plots.style import BLUE, PALE, styled
+from tsmlib.storage.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = ROOT / "runs" / "dmc"
@@ -68,14 +70,31 @@ def figure(rows: pd.DataFrame) -> Figure:
     return drawn
 
 
+def film(steps: int, seed: int, tasks: list[str]) -> None:
+    """Six seconds of each task side by side, in real time."""
+    films = {}
+    for task in tasks:
+        folder = RUNS / task / f"seed{seed}"
+        solved = tsmlib.solve(f"tsm/dmc-{task}-v0", steps, seed=seed, folder=folder)
+        solved.horizon = round(6 / solved.data.dt)
+        films[task] = solved.film()[:: max(1, round(0.08 / solved.data.dt)), ::2, ::2]
+    whole = tsmlib.plots.side_by_side(films)
+    picture = tsmlib.plots.animation(whole, 12, form="WEBP", width=1200, hold=1.0)
+    write_bytes(ROOT / "figures" / "dmc.webp", picture)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=50_000)
     parser.add_argument("--tasks", nargs="+", default=[task_of(env) for env in CONTROL_IDS])
     parser.add_argument("--no-run", action="store_true")
+    parser.add_argument("--film", action="store_true")
     asked = parser.parse_args()
     torch.set_num_threads(1)
+    if asked.film:
+        film(asked.steps, asked.seeds[0], asked.tasks)
+        return
     for seed in [] if asked.no_run else asked.seeds:
         for task in asked.tasks:
             run(f"tsm/dmc-{task}-v0", asked.steps, seed)
