@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -15,7 +16,7 @@ from reproduction.pages import ARMS
 from reproduction.scores import HORIZONS
 from reproduction.tables import select
 from tsmlib import plots, zoo
-from tsmlib.plots.style import styled
+from tsmlib.plots.style import PALE, WIDTH, styled
 from tsmlib.statistics import interval
 
 BASELINES = ("onestep", "multistep", "lstm")
@@ -125,9 +126,51 @@ def rounds(tables: Tables = results) -> Figure:
     return figure
 
 
+@styled
+def figure7(tables: Tables = results) -> Figure:
+    """Executed return of policies of pushing against the steps of a model, or of the environment.
+
+    Lines are means over seeds, bands their range.
+    """
+    own = select(tables("policies"), metric="return_true", subset="validation")
+    rows = select(tables("05_control"), env=PLACES["ReacherPush"], metric="return_true")
+    rows = select(rows, planner="policy", execution="policy")
+    whole = 20 * 100  # steps of the model in an update of whole episodes
+    lines = {("rtsm", "pieces of 16 steps and a value"): own.assign(steps=own["samples"])}
+    for word, space in (("rtsm", "direct"), ("tsm", "latent")):
+        found = select(rows, model=word, search_space=space)
+        lines[word, f"whole episodes, {space}"] = found.assign(steps=whole * found["iteration"])
+    found = select(tables("model_free"), env=PLACES["ReacherPush"], metric="return_true")
+    found = select(found, model="sac", subset=None)
+    lines["sac", "steps of the environment"] = found.assign(steps=found["env_steps"])
+    figure, ax = plt.subplots(figsize=(WIDTH, 2.6))
+    for (word, how), found in lines.items():
+        found = found[found["steps"] > 0]
+        level = found.groupby(["steps", "seed"])["value"].mean().groupby("steps")
+        low, mean, high = level.min(), level.mean(), level.max()
+        look = zoo.look(word)
+        ax.plot(mean.index, mean, color=look.colour, ls="-" if word != "sac" else "--", lw=1.4)
+        ax.fill_between(mean.index, low, high, color=look.colour, alpha=0.15, lw=0)
+        at = (mean.index[-1], mean.iloc[-1])
+        text = f"{look.name}: {how}"
+        ax.annotate(
+            text,
+            at,
+            (5, 8 if word == "sac" else -2),
+            textcoords="offset points",
+            color=look.colour,
+            va="center",
+        )
+    ax.axhline(mean.iloc[-1], color=PALE, lw=0.8, ls="--", zorder=1)  # SAC's level
+    ax.set(xscale="log", xlabel="steps of the model", ylabel="executed return (m)", ylim=(-19, -7))
+    ax.set_xlim(2e4, 2e8)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "figure5": figure5,
     "figure6": figure6,
+    "figure7": figure7,
     "ahead": ahead,
     "rounds": rounds,
 }

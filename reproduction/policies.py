@@ -67,9 +67,9 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
         record_every=max(1, n // 10),
     )
     if space == "value":
-        n = run.pick(4, 500, 8000)
+        n = run.pick(4, 500, 3000)
         options = tsmlib.LearningOptions.with_value(
-            horizon=task.horizon, iterations=n, record_every=max(1, n // 16)
+            horizon=task.horizon, iterations=n, record_every=max(1, n // 12)
         )
     checkpoint = path.with_suffix(".checkpoint")
     curve = tsmlib.learn_policy(

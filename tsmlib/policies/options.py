@@ -42,7 +42,7 @@ class LearningOptions:
 
     @classmethod
     def with_value(
-        cls, *, horizon: int, iterations: int = 6000, record_every: int = 500
+        cls, *, horizon: int, iterations: int = 3000, record_every: int = 250
     ) -> LearningOptions:
         """The schedule for what whole episodes do not teach, such as pushing; not the paper's.
 
