@@ -76,14 +76,17 @@ def polars_like(frame: pd.DataFrame) -> Any:
     return polars.DataFrame({name: frame[name].tolist() for name in frame})
 
 
-@pytest.mark.parametrize("form", ["csv", "gz", "semicolons", "dict", "polars", "shuffled"])
+@pytest.mark.parametrize(
+    "form", ["csv", "gz", "semicolons", "commas", "dict", "polars", "shuffled"]
+)
 def test_the_same_table_in_any_form_gives_the_same_data(form: str, tmp_path: Path) -> None:
     frame = log()
     frame.loc[8, "x"] = np.nan
     table: Any = frame
-    if form in ("csv", "gz", "semicolons"):
+    if form in ("csv", "gz", "semicolons", "commas"):
         table = str(tmp_path / ("log.csv.gz" if form == "gz" else "log.csv"))
-        frame.to_csv(table, index=False, sep=";" if form == "semicolons" else ",")
+        separator, decimal = {"semicolons": ";.", "commas": ";,"}.get(form, ",.")
+        frame.to_csv(table, index=False, sep=separator, decimal=decimal)
     elif form == "dict":
         table = {name: frame[name].to_numpy() for name in frame}
     elif form == "polars":
@@ -227,7 +230,7 @@ def test_what_is_no_log_is_one_clear_error(table: Any, change: dict, message: st
         ("x,v,u,run,t\n1,2,0,0\n", "row 0 of .* has 4 fields; expected 5"),
         ("x,v,x,run,t\n1,2,0,0,0\n", "names a column twice"),
         ("", "cannot be read|no column|columns"),
-        ("x;v;u;run;t\n1,5;2;0;0;0\n1,5;2;0;0;1\n", "column 'x' holds '1,5' in row 0"),
+        ("x;v;u;run;t\n1,5;2.5;0;0;0\n1,5;2;0;0;1\n", "'x' holds '1,5' in row 0.* decimal"),
         ("\x00\xff\x80", "no column|cannot be read"),
     ],
 )

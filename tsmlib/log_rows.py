@@ -248,8 +248,10 @@ def _number(name: str, row: int, value: object) -> float:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         shown = str(value) if isinstance(value, str) else value
+        hint = ": pandas.read_csv(..., decimal=',') reads commas" if "," in str(value) else ""
         raise TrajectoryError(
-            f"column '{name}' holds {shown!r:.40} in row {row} of the table; expected a number"
+            f"column '{name}' holds {shown!r:.40} in row {row} of the table; "
+            f"expected a number{hint}"
         ) from None
 
 
@@ -362,4 +364,19 @@ def _read_csv(path: Path) -> dict[str, list[str]]:
             )
     if len(set(names)) < len(names):
         raise TrajectoryError(f"{path} names a column twice: {', '.join(names):.200}")
+    if separator != ",":
+        lines = _with_points(lines)
     return {name: [line[k] for line in lines] for k, name in enumerate(names)}
+
+
+def _with_points(lines: list[list[str]]) -> list[list[str]]:
+    """Cells with decimal points, where all of a file's fractions have decimal commas."""
+    commas, points = (
+        re.compile(rf"\s*[+-]?\d*{mark}\d+(e[+-]?\d+)?\s*", re.IGNORECASE) for mark in (",", r"\.")
+    )
+    if any(points.fullmatch(cell) for line in lines for cell in line):
+        return lines
+    return [
+        [cell.replace(",", ".") if commas.fullmatch(cell) else cell for cell in line]
+        for line in lines
+    ]

@@ -76,8 +76,8 @@ export const TOUR = [
   {
     title: 'Planning again',
     link: '#task=push&model=rtsm&space=latent&replan=1&seed=1&arm=-2.44,-0.85&target=0.04,0.08&block=-0.1,-0.11',
-    text: 'A long way round. One plan, executed without looking, misses by about 10 cm (untick “Plan again” and see). Looking every ten '
-      + 'steps (0.2 s) and planning the rest anew, it ends far nearer, on a slow machine less so. Each faint line is what an earlier plan '
+    text: 'A long way round. The planner looks every ten steps (0.2 s) at where the object really is, and plans the rest anew, so that an '
+      + 'error does not grow: untick “Plan again” to see one plan, executed without looking. Each faint line is what an earlier plan '
       + 'predicted, from the dot where it was made.',
   },
 ];
