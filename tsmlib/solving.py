@@ -27,6 +27,7 @@ from tsmlib.envs.spaces import said
 from tsmlib.envs.stepping import make
 from tsmlib.exploration.rounds import RoundFiles
 from tsmlib.films import film
+from tsmlib.models.base import Model
 from tsmlib.models.baselines import OneStep
 from tsmlib.planning.execution import Trial, execute
 from tsmlib.planning.planners import cem
@@ -91,7 +92,7 @@ class Controller:
         seed: of the candidates of the next plan.
     """
 
-    model: OneStep
+    model: Model
     reward: Reward
     space: DirectActions
     every: int
@@ -204,7 +205,7 @@ class Solved:
         """
         frames = film(self.task(seed=seed), self.play(seed=seed), 0)
         if path is not None:
-            save_video(frames, path, fps=max(1, round(1 / self.data.dt)))
+            save_video(frames, Path(path), fps=max(1, round(1 / self.data.dt)))
         return frames
 
 
