@@ -287,7 +287,7 @@ def test_the_tables_of_the_results_page_are_those_of_the_rows(tmp_path: Path) ->
 @pytest.mark.parametrize("name", figures.FIGURES)
 def test_a_figure_is_drawn_of_the_published_rows(name: str) -> None:
     figure = figures.FIGURES[name]()
-    assert len(figure.axes) > 1
+    assert all(ax.has_data() for ax in figure.axes)
     plt.close(figure)
 
 
