@@ -5,11 +5,10 @@ VENV := .venv
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 PIP := $(PY) -m pip --disable-pip-version-check install --progress-bar on
-TEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # two processes of one thread
 
 NOTEBOOKS := quickstart collect train predict latent control robustness action_prior claims your_own explore pusht
 
-.PHONY: help $(NOTEBOOKS) test reliability bench explorer docs lint clean
+.PHONY: help $(NOTEBOOKS) test reliability bench explorer docs lint release clean
 
 help:
 	@echo "make control   plan with the shipped models and execute the plans: notebooks/05_control.ipynb"
@@ -21,13 +20,14 @@ help:
 	@echo "make explorer  the page for the browser, into explorer/dist (needs node and npm)"
 	@echo "make docs      the notebooks where they are not executed yet, and the documentation, into docs/_build/html"
 	@echo "make lint      style, types, and import contracts"
+	@echo "make release   everything of a release, into dist/ (RELEASING.md)"
 	@echo "make clean     remove .venv and caches; runs/ stays"
 
 $(NOTEBOOKS): $(READY)
 	$(PY) -m tsmlib run $@
 
 test: $(READY)
-	$(TEST) tests
+	$(PY) -m tsmlib test
 
 reliability: $(READY)
 	$(PY) tests/reliability $(PARTS)
@@ -54,8 +54,11 @@ lint: $(READY)
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports
 
+release: explorer docs
+	$(PY) release.py $(ARGS)
+
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -not -path './runs/*' -prune -exec rm -rf {} +
 
 # torch goes first and by itself, so that a CPU build of it is kept where one is found.

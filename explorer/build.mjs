@@ -35,7 +35,7 @@ for (const path of ['index.html', 'style.css', 'src']) cpSync(at(path), at(`dist
 cpSync(at('node_modules/@mujoco/mujoco/mujoco.js'), at('dist/vendor/mujoco.js'));
 writeFileSync(at('dist/vendor/mujoco.wasm'), stripped(readFileSync(at('node_modules/@mujoco/mujoco/mujoco.wasm'))));
 const licence = JSON.parse(readFileSync(at('node_modules/@mujoco/mujoco/package.json')));
-writeFileSync(at('dist/vendor/README.txt'), `mujoco.js and mujoco.wasm: ${licence.name} ${licence.version}, ${licence.license}\n`);
+writeFileSync(at('dist/vendor/README.txt'), `mujoco.js and mujoco.wasm: ${licence.name} ${licence.version}, ${licence.license}: LICENSE and LICENSES_THIRD_PARTY.md\n`);
 await compile('kernel.wasm', ['simd']);
 await compile('kernel-fused.wasm', ['simd', 'relaxed-simd']);
 console.log('explorer/dist is built; python -m tsmlib explore serves it');

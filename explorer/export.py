@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib.metadata
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -259,6 +260,9 @@ def write(folder: Path, tasks: Mapping[str, str] = TASKS) -> None:
             "clearance": geometry.BLOCK_CLEARANCE,
         },
     }
+    for file in importlib.metadata.distribution("mujoco-core").files or ():
+        if "licenses" in file.parts:  # of MuJoCo and of what is built into it
+            files.write_bytes(folder / "vendor" / file.name, file.read_binary())
     files.write_bytes(folder / "manifest.json", json.dumps(manifest).encode())
 
 

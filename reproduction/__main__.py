@@ -1,18 +1,21 @@
 """Commands of the reproduction: ``python -m tsmlib`` hands these on.
 
-``run NOTEBOOK`` executes a notebook, ``run all`` all of them in order; ``explore`` serves the
-explorer.
+``run NOTEBOOK`` executes a notebook, ``run all`` all of them in order; ``control`` is short for
+``run control``, and so on. ``explore`` serves the explorer, ``test`` runs the tests of a checkout.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from reproduction import explorer, runner
 from reproduction.runs import SCALES, Run, home
+from tsmlib.shipped import ROOT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -24,8 +27,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 done, 1 it failed, 2 bad arguments, 130 interrupted.
     """
-    arguments = _parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in runner.notebooks().keys() - {
+        "claims",
+        "explore",
+    }:  # these two are more
+        words.insert(0, "run")
     try:
+        if words[:1] == ["test"]:
+            return _test(words[1:])
+        arguments = _parser().parse_args(words)
         return arguments.do(arguments)
     except (RuntimeError, ValueError, TypeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -75,6 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     explore.add_argument("--port", type=int, default=explorer.PORT, help="0 is any that is free")
     explore.add_argument("--open", action="store_true", help="open it in a browser")
     explore.set_defaults(do=_explore)
+    commands.add_parser("test", help="run the tests of a checkout; options are those of pytest")
     return parser
 
 
@@ -147,6 +159,16 @@ def _pages(arguments: argparse.Namespace) -> int:
 def _explore(arguments: argparse.Namespace) -> int:
     explorer.serve(port=arguments.port, browser=arguments.open)
     return 0
+
+
+def _test(words: Sequence[str]) -> int:
+    if not (ROOT / "tests").is_dir():
+        raise runner.RunError(
+            f"there are no tests in {ROOT}: they come with a checkout (git clone)"
+        )
+    command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile"]
+    command += ["--no-loadscope-reorder", *(words or ["tests"])]
+    return subprocess.call(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
 if __name__ == "__main__":

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from reproduction.runner import RunError
-from tsmlib.pretrained import ROOT
+from tsmlib import shipped
 
-PAGE = ROOT / "explorer" / "dist"
 PORT = 8765
 TYPES = {".wasm": "application/wasm", ".js": "text/javascript", ".f32": "application/octet-stream"}
 HEADERS = {
@@ -55,11 +54,18 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-def server(folder: Path = PAGE, *, port: int = PORT) -> http.server.ThreadingHTTPServer:
+def page() -> Path:
+    """The folder of the page; ValueError where tsmlib-models, which holds it, is not installed."""
+    name = "explorer/dist"
+    return shipped.more(name, []) if shipped.INSTALLED else shipped.ROOT / name
+
+
+def server(folder: Path | None = None, *, port: int = PORT) -> http.server.ThreadingHTTPServer:
     """A server of the page on 127.0.0.1, not yet running; port 0 is any that is free.
 
     RunError where the page is not built, or the port is taken or none.
     """
+    folder = folder or page()
     if not (folder / "index.html").exists() or not (folder / "manifest.json").exists():
         raise RunError(
             f"there is no page in {folder}; build it, which needs node and npm: make explorer"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from reproduction.runs import Run
-from tsmlib.pretrained import ROOT
+from tsmlib.shipped import ROOT
 
 if TYPE_CHECKING:
     import nbformat

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from tsmlib import shipped
 from tsmlib.checks import require_choice, require_count
 from tsmlib.envs.spec import ENV_IDS, EnvSpec
-from tsmlib.pretrained import INSTALLED, PRETRAINED, ROOT
+from tsmlib.shipped import INSTALLED, ROOT
 
 SCALES = ("smoke", "laptop", "paper")
 TENSORS = ("data", "models", "plans", "policies")  # kinds of targets that are no table of rows
@@ -59,7 +60,7 @@ class Run:
         """
         kind, _, rest = target.partition("/")
         if kind == "models" and self.scale == "laptop":
-            return PRETRAINED / f"{rest}.safetensors"
+            return shipped.find(f"data/pretrained/{rest}.safetensors")
         return self.folder / f"{target}.{'safetensors' if kind in TENSORS else 'csv'}"
 
     def require(self, target: str) -> Path:

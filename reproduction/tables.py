@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pandas as pd
 
+from tsmlib import shipped
 from tsmlib.envs.spec import EnvSpec
-from tsmlib.pretrained import ROOT
+from tsmlib.shipped import ROOT
 
 RESULTS = ROOT / "data" / "results"  # the published tables
 Row = dict[str, object]
@@ -98,7 +99,7 @@ def read(path: Path) -> pd.DataFrame:
 
 def published(name: str) -> pd.DataFrame:
     """A table of data/results, such as ``03_predict``."""
-    return read(RESULTS / f"{name}.csv")
+    return read(shipped.find("data/results") / f"{name}.csv")
 
 
 def select(table: pd.DataFrame, **where: object) -> pd.DataFrame:

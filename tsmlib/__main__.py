@@ -13,15 +13,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tsmlib
-from tsmlib.pretrained import ROOT
+from tsmlib.shipped import ROOT
 
 USAGE = """usage: python -m tsmlib COMMAND ...
 
   run NOTEBOOK       execute a notebook into runs/<scale>/seed<seed>/; run --help
+  control            the same as run control, and so on
   notebooks FOLDER   copy the notebooks into a folder
   explore            serve the explorer, a page in the browser, on 127.0.0.1
   make TARGET ...    make data, models, scores, plans, policies or tables; make --help
   claims             judge the paper's claims by data/results and write docs/claims.md
+  test               run the tests of a checkout
   --version"""
 REPRODUCTION = "reproduction.__main__"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Literal, cast
 
 import gymnasium
@@ -12,13 +12,15 @@ import numpy as np
 import torch
 
 import tsmlib.envs
-from tsmlib import zoo
+from tsmlib import shipped, zoo
 from tsmlib.checks import require_type
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.pusht_field import GOAL
 from tsmlib.envs.spec import EnvSpec
 from tsmlib.planning.pusht import pusht_task
 from tsmlib.planning.tasks import Task
+from tsmlib.shipped import INSTALLED as INSTALLED
+from tsmlib.shipped import ROOT as ROOT
 from tsmlib.storage import artifacts
 
 if TYPE_CHECKING:
@@ -28,9 +30,6 @@ if TYPE_CHECKING:
     from tsmlib.policies.networks import OneStepPolicy
     from tsmlib.storage.files import Json
 
-_PACKAGE = Path(__file__).resolve().parent
-INSTALLED = (_PACKAGE / "_shipped").is_dir()  # from a wheel
-ROOT = _PACKAGE / "_shipped" if INSTALLED else _PACKAGE.parent
 PRETRAINED, TASKS = ROOT / "data" / "pretrained", ROOT / "data" / "tasks"
 TASK_SEED = {"validation": 1_000_003, "test": 1_000_004}
 
@@ -51,14 +50,14 @@ def load_pretrained(model: str, *, env: str) -> DynamicsModel:
     if env.startswith("tsm/PushT-"):
         return _pusht_model(model)
     trained_on = zoo.trained_on(env, model)
-    folder = PRETRAINED / EnvSpec.parse(trained_on).name
-    if not (path := folder / f"{model}.safetensors").exists():
-        there = [path.stem for path in sorted(folder.glob("*.safetensors")) if path.stem in zoo.ZOO]
+    arm = EnvSpec.parse(trained_on).name
+    if not (path := shipped.find(f"data/pretrained/{arm}/{model}.safetensors")).exists():
+        files = [*(PRETRAINED / arm).glob("*.safetensors"), *map(PurePath, shipped.digests())]
+        there = sorted({file.stem for file in files if file.parent.name == arm} & zoo.ZOO.keys())
         known = f"there are {', '.join(there)}" if there else "there are none"
-        name = f"models/{EnvSpec.parse(trained_on).name}/{model}"
         raise ValueError(
-            f"no pretrained {model} of {env} in {folder}: {known}. To train one, type: "
-            f"python -m tsmlib make {name} --scale paper"
+            f"no pretrained {model} of {env} in {PRETRAINED / arm}: {known}. To train one, type: "
+            f"python -m tsmlib make models/{arm}/{model} --scale paper"
         )
     expect = cast("Mapping[str, Json]", tsmlib.envs.fingerprint(trained_on))
     cls = zoo.find(model).load()
@@ -155,7 +154,7 @@ def _pusht_model(word: str) -> DynamicsModel:
     classes = {"egocentric": Egocentric, "rtsm": RecurrentTSM}
     if word not in classes:
         raise ValueError(f"no pretrained {word} of PushT: there are {', '.join(classes)}")
-    path = PRETRAINED / "PushT" / f"{word}.safetensors"
+    path = shipped.find(f"data/pretrained/PushT/{word}.safetensors")
     return cast("DynamicsModel", artifacts.load_model(path, classes[word]))
 
 
