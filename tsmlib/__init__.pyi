@@ -4,6 +4,7 @@ from .collection import collect as collect
 from .collection import collect_random as collect_random
 from .collection import open_loop as open_loop
 from .collection import smooth_torques as smooth_torques
+from .evaluation.conformal import Conformal as Conformal
 from .evaluation.prediction import score as score
 from .exploration.explore import explore as explore
 from .exploration.options import Exploration as Exploration
@@ -17,6 +18,7 @@ from .models.baselines import LSTM as LSTM
 from .models.baselines import OneStep as OneStep
 from .models.egocentric import Egocentric as Egocentric
 from .models.ensemble import Ensemble as Ensemble
+from .models.export import export as export
 from .models.mixture import Mixture as Mixture
 from .models.recurrent import RecurrentTSM as RecurrentTSM
 from .models.tsm import TSM as TSM

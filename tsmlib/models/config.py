@@ -6,13 +6,15 @@ import functools
 import inspect
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Self
 
 import numpy as np
 import torch
 from torch import nn
 
 from tsmlib.checks import require_seed
-from tsmlib.storage.files import Json
+from tsmlib.storage import hub
+from tsmlib.storage.files import Json, PathLike
 
 
 class Configured(nn.Module):
@@ -46,6 +48,54 @@ class Configured(nn.Module):
             The arguments by name, as JSON values.
         """
         return dict(self._config)
+
+    @classmethod
+    def from_pretrained(cls, name: PathLike) -> Self:
+        """Read a model from a folder, or from the Hugging Face Hub.
+
+        Args:
+            name: a folder that ``save_pretrained`` wrote; or "owner/name", where no such folder is.
+
+        Returns:
+            The model, on the CPU.
+
+        Raises:
+            StoreError: it is missing, damaged or of another class.
+            ImportError: the Hub is asked, and the extra "hub" is not installed.
+        """
+        return hub.from_pretrained(cls, name)
+
+    def save_pretrained(
+        self, folder: PathLike, *, scores: Mapping[str, float] | None = None
+    ) -> None:
+        """Write weights, arguments and a card into a folder.
+
+        Args:
+            folder: made if it is not there.
+            scores: numbers for the card, by name.
+
+        Raises:
+            StoreError: weights that are not finite, or no room.
+        """
+        hub.save_pretrained(self, folder, scores=scores)
+
+    def push_to_hub(
+        self, name: str, *, private: bool = False, scores: Mapping[str, float] | None = None
+    ) -> str:
+        """Upload what ``save_pretrained`` writes to the Hugging Face Hub.
+
+        Args:
+            name: "owner/name" there; log in before: hf auth login.
+            private: whether a new repository is private.
+            scores: numbers for the card, by name.
+
+        Returns:
+            Its address.
+
+        Raises:
+            ImportError: the extra "hub" is not installed.
+        """
+        return hub.push_to_hub(self, name, private=private, scores=scores)
 
     def __repr__(self) -> str:
         """The class with its arguments, and how many weights it has."""

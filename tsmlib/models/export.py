@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import os
 import sys
@@ -77,18 +78,23 @@ def export(
             f"pip install 'tsmlib[onnx]', or name {path.stem}.pt2"
         )
     weight = first_weight(model)
-    robot = model.config()
-    dx, du = robot["state_dim"], robot["action_dim"]
+    dx, du = (int(str(model.config()[name])) for name in ("state_dim", "action_dim"))
     examples = tuple(
         torch.zeros(rows, length, size, device=None if weight is None else weight.device)
         for length, size in ((model.past_len, dx), (model.past_len, du), (steps, du))
     )
-    graph = Rollout(model).eval()
+    graph = copy.deepcopy(Rollout(model)).eval().requires_grad_(False)
     program = torch.export.export(graph, examples)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".pt2":
         torch.export.save(program, path)
     else:
-        names = {"input_names": list(INPUTS), "output_names": ["states"]}
-        torch.onnx.export(program, f=path, **names, external_data=False, verbose=False)
+        torch.onnx.export(
+            program,
+            f=path,
+            input_names=INPUTS,
+            output_names=["states"],
+            external_data=False,
+            optimize=False,
+        )
     return program
