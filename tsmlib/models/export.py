@@ -63,7 +63,7 @@ def export(
 
     Raises:
         ImportError: the extra "onnx" is missing.
-        ValueError: a name with another ending.
+        ValueError: a name with another ending, or a model that torch cannot export, such as TSM.
         TypeError: a model that is no ``nn.Module``.
     """
     require_type("model", model, nn.Module, "a model of this package")
@@ -84,7 +84,13 @@ def export(
         for length, size in ((model.past_len, dx), (model.past_len, du), (steps, du))
     )
     graph = copy.deepcopy(Rollout(model)).eval().requires_grad_(False)
-    program = torch.export.export(graph, examples)
+    try:
+        program = torch.export.export(graph, examples)
+    except Exception as error:  # of any kind, from within torch
+        raise ValueError(
+            f"a {type(model).__name__} cannot be exported ({error!s:.200}); a OneStep and a "
+            "RecurrentTSM can"
+        ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".pt2":
         torch.export.save(program, path)
