@@ -37,7 +37,7 @@ from tsmlib.pretrained import load_pusht
 from tsmlib.trajectory import Segment
 
 ROOT = Path(__file__).resolve().parents[1]
-BUDGETS = (5_000, 20_000, 50_000, 100_000)  # steps of the environment
+BUDGETS = (5_000, 20_000, 50_000)  # steps of the environment
 MARKS = (5_000, 10_000, 15_000, 20_000, 30_000, 40_000, 50_000, 75_000, 100_000)  # of SAC
 STAGES: tuple[pusht.Stage, ...] = (  # of the training on the first play, and of a round's
     (1, 1024, 700, (0.0, 0.35)),
