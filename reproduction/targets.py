@@ -39,9 +39,8 @@ FILTERED = ("tsm", "rtsm", *BASELINES, "none", "filter", "exponential")
 
 
 def _scores(run: Run) -> list[str]:
-    pairs = product(
-        ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), zoo.words("dynamics"))
-    )
+    whole = (*zoo.words("dynamics"), "tsm+codes", "tsm+prior")
+    pairs = product(ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), whole))
     return [f"scores/{arm}/{word}" for arm, word in pairs]
 
 
@@ -52,6 +51,11 @@ def _episodes(run: Run) -> list[str]:
 def _ablation(run: Run) -> list[str]:
     words = run.pick(("tsm",), ("tsm",), (*zoo.words("ablation", "choice"), "tsm", "onestep"))
     return [f"scores/ReacherPush/{word}" for word in words]
+
+
+def _codes(run: Run) -> list[tuple[str, str]]:
+    words = run.pick(("tsm",), ("tsm",), ("tsm", "tsm+codes", "tsm+prior"))
+    return [*product(ARMS, words), ("ReacherPush", "rtsm")]
 
 
 def plans_of(run: Run, arm: str) -> list[str]:
@@ -133,7 +137,7 @@ TABLES: dict[str, Callable[[Run], list[str]]] = {  # name -> the rows that it ho
     "03_predict": _scores,
     "03_episodes": _episodes,
     "03_ablation": _ablation,
-    "04_latent": lambda run: [f"codes/{arm}/tsm" for arm in ARMS] + ["codes/ReacherPush/rtsm"],
+    "04_latent": lambda run: [f"codes/{arm}/{word}" for arm, word in _codes(run)],
     "05_control": lambda run: _trials(run) + _learning(run, ("Reacher", "ReacherPush")),
     "05_control_rows": _trials,
     "06_robustness": _robustness,

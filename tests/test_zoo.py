@@ -89,8 +89,8 @@ def test_what_ships_is_loaded_by_word_and_environment_and_knows_its_robot() -> N
     assert (type(model), type(prior)) == (tsmlib.RecurrentTSM, tsmlib.ActionPrior)
     robot = tsmlib.collect_random(push, 1, horizon=1).robot
     model.robot.require_same(robot, "model and data")
-    with pytest.raises(ValueError, match=r"no pretrained tsm\+full of .* there are .*lstm"):
-        tsmlib.load_pretrained("tsm+full", env=push)
+    with pytest.raises(ValueError, match=r"no pretrained tsm\+plain of .* there are .*lstm"):
+        tsmlib.load_pretrained("tsm+plain", env=push)
     with pytest.raises(ValueError, match=r"no model is called 'tms'; there are tsm,"):
         tsmlib.load_pretrained("tms", env=push)
     with pytest.raises(ValueError, match=r"'Push' is none of tsm/Reacher-v0"):

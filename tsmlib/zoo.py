@@ -157,44 +157,12 @@ _TSM, _ONE_STEP, _ENSEMBLE = (
 _PAPER = _free("loss", (16, 10.5))
 
 
-def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
-    """One of the paper's choices, changed; as many updates as TSM."""
-    look = Look(f"TSM, {name}", colour)
-    return ModelSpec(word, look, _TSM, _PAPER, lambda env: _wide(env) | arguments, "choice")
-
-
-def _live(word: str, name: str, colour: str, length: int) -> ModelSpec:
-    """TSM with segments of another length; as many updates after the same decoder."""
-    look = Look(f"TSM, {name}", colour)
-    return ModelSpec(
-        word,
-        look,
-        _TSM,
-        _REVIVED,
-        lambda env: _wide(env) | {"beta": _BETA, "segment_len": length},
-        "choice",
-        budget=_MORE,
-        begins="tsm+beta1",
-    )
-
-
-_BETA, _MORE = 0.3, 200.0  # chosen on validation; seconds of training with codes
 _REVIVED = (
     Stage(Updates("loss", 1, lr=1e-3, batch=128, muon=_SLOW), (16, 10), 0.5),
     Stage(Updates("energy_loss", 1, lr=1e-3, batch=128, muon=_SLOW), (8, 5), 0.5),
 )
 _MODELS = (
-    ModelSpec(  # the paper's: begins with a decoder whose codes are silent, then learns them
-        "tsm",
-        Look("TSM", "#3D9BE0", "o"),
-        _TSM,
-        _REVIVED,
-        lambda env: _wide(env) | {"beta": _BETA},
-        budget=_MORE,
-        planned=True,
-        begins="tsm+beta1",
-    ),
-    _choice("tsm+beta1", "beta = 1", "#8FB8DE"),
+    ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
     ModelSpec(
         "rtsm",
         Look("recurrent TSM", "#0B2F8A", "*"),
@@ -203,6 +171,17 @@ _MODELS = (
         planned=True,
         pushing=_recurrent(0.005),
     ),
+    ModelSpec(  # the paper's N(0, I) with codes in use: a smaller beta, chosen on validation
+        "tsm+codes",
+        Look("TSM, codes in use", "#1F77B4", "<"),
+        _TSM,
+        _REVIVED,
+        lambda env: _wide(env) | {"beta": 0.3},
+        "ablation",
+        budget=200.0,
+        planned=True,
+        begins="tsm",
+    ),
     ModelSpec(  # codes with a learned prior, then the energy score of samples from it
         "tsm+prior",
         Look("TSM + code prior", "#2E86C1", ">"),
@@ -210,9 +189,9 @@ _MODELS = (
         _REVIVED,
         _alive,
         "ablation",
-        budget=_MORE,
+        budget=200.0,
         planned=True,
-        begins="tsm+beta1",
+        begins="tsm",
     ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy",
@@ -266,10 +245,14 @@ _MODELS = (
         group="prior",
         budget=100.0,
     ),
-    _choice("tsm+plain", "no skip connections", "#6C8EBF", plain=True),
-    _live("tsm+h1", "H = 1", "#A6C8E0", 1),
-    _live("tsm+h5", "H = 5", "#4C6A92", 5),
-    _live("tsm+h20", "H = 20", "#1F4E79", 20),
+    ModelSpec(
+        "tsm+plain",
+        Look("TSM, no skip connections", "#6C8EBF"),
+        _TSM,
+        _PAPER,
+        lambda env: _wide(env) | {"plain": True},
+        "choice",
+    ),
 )
 ZOO = {spec.word: spec for spec in _MODELS}
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method

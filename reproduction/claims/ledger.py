@@ -31,6 +31,7 @@ class Claim:
         headline: whether it is one of the main claims.
         comparisons: that test it; control: has to hold for it to be testable.
         note: what is known of the cause; definition: why nothing could contradict it.
+        untested: why no comparison tests it.
     """
 
     id: str
@@ -42,6 +43,7 @@ class Claim:
     control: tuple[Comparison, ...] = ()
     note: str = ""
     definition: str = ""
+    untested: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,11 @@ class Verdict:
 
     @property
     def word(self) -> str:
-        """holds, holds in part, does not hold, open, not testable or true by definition."""
+        """holds, holds in part, does not hold, open, not testable, not tested or by definition."""
         if self.claim.definition:
             return "true by definition"
+        if self.claim.untested:
+            return "not tested with codes in use"
         if any(not control.holds for control in self.controls):
             return "not testable"
         hold, fail, _ = self.counts
@@ -75,6 +79,8 @@ class Verdict:
         """What was found, in plain words."""
         if self.claim.definition:
             return f"True by definition. {self.claim.definition}"
+        if self.claim.untested:
+            return f"Not tested with codes in use. {self.claim.untested}"
         if self.word == "not testable":
             return f"Not testable. {self.claim.note}"
         hold, places = self.counts[0], dict[str, list[bool | None]]()
