@@ -157,6 +157,16 @@ _TSM, _ONE_STEP, _ENSEMBLE = (
 _PAPER = _free("loss", (16, 10.5))
 
 
+def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
+    """One of the paper's choices, changed; as many updates as TSM."""
+    look = Look(f"TSM, {name}", colour)
+    return ModelSpec(word, look, _TSM, _PAPER, lambda env: _wide(env) | arguments, "choice")
+
+
+_H20 = _choice(  # receptive field 2 H
+    "tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)
+)
+_LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
 _REVIVED = (
     Stage(Updates("loss", 1, lr=1e-3, batch=128, muon=_SLOW), (16, 10), 0.5),
     Stage(Updates("energy_loss", 1, lr=1e-3, batch=128, muon=_SLOW), (8, 5), 0.5),
@@ -245,14 +255,9 @@ _MODELS = (
         group="prior",
         budget=100.0,
     ),
-    ModelSpec(
-        "tsm+plain",
-        Look("TSM, no skip connections", "#6C8EBF"),
-        _TSM,
-        _PAPER,
-        lambda env: _wide(env) | {"plain": True},
-        "choice",
-    ),
+    _choice("tsm+plain", "no skip connections", "#6C8EBF", plain=True),
+    _choice("tsm+h1", "H = 1", "#A6C8E0", segment_len=1),
+    replace(_H20, stages=(_LONG, _PAPER[1])),
 )
 ZOO = {spec.word: spec for spec in _MODELS}
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method
