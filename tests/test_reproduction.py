@@ -229,6 +229,7 @@ OTHERS = (
     "11_pusht",
     "64_codes",
     "64_tries",
+    "policies_tried",
     "68_conformal",
 )  # have columns of their own
 PUBLISHED = sorted(p for p in tables.RESULTS.glob("*.csv*") if not p.name.startswith(OTHERS))
