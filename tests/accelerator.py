@@ -52,7 +52,8 @@ class There(Tensor):
             x, index = args
             last = index[-1] if isinstance(index, tuple) else index
             if isinstance(last, list):
-                return x.index_select(-1, There(torch.tensor(last, dtype=torch.int64)))
+                dim = -1 if isinstance(index, tuple) else 0
+                return x.index_select(dim, There(torch.tensor(last, dtype=torch.int64)))
         return torch._C._disabled_torch_function_impl(function, types, args, kwargs or {})
 
     @classmethod

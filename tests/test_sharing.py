@@ -19,7 +19,7 @@ from tsmlib.evaluation.conformal import Conformal
 from tsmlib.storage.files import StoreError
 
 ENV = "tsm/ReacherPush-v1"
-STEPS = {"onestep": 3, "rtsm": 11}  # of rtsm, one more than a segment
+STEPS = {"onestep": 3, "rtsm": 11, "tsm": 11}  # of rtsm, one more than a segment
 
 
 def same(one: torch.nn.Module, other: torch.nn.Module) -> bool:

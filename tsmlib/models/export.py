@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tsmlib.checks import require_count, require_type
 from tsmlib.models.base import DynamicsModel, predict_segment
 from tsmlib.models.layers import first_weight
+from tsmlib.models.tsm import TSM
 from tsmlib.trajectory import Segment
 
 INPUTS = ("past_states", "past_actions", "actions")
@@ -36,10 +37,16 @@ class Rollout(nn.Module):
         past, predicted = Segment(past_states, past_actions), []
         for moves in actions.split(self.model.segment_len, dim=1):
             past = past.last(self.model.past_len)
-            states = predict_segment(self.model, past, moves)
+            states = self._segment(past, moves)
             predicted.append(states)
             past = past.then(Segment(states, moves))
         return torch.cat(predicted, dim=1)
+
+    def _segment(self, past: Segment, moves: Tensor) -> Tensor:
+        if not isinstance(self.model, TSM):
+            return predict_segment(self.model, past, moves)
+        step = self.model.begin(past, planned=moves)  # operations that can be traced
+        return torch.stack([step(u) for u in moves.unbind(1)], dim=1)
 
 
 @torch.no_grad()
@@ -63,7 +70,7 @@ def export(
 
     Raises:
         ImportError: the extra "onnx" is missing.
-        ValueError: a name with another ending, or a model that torch cannot export, such as TSM.
+        ValueError: a name with another ending, or a model that torch cannot export.
         TypeError: a model that is no ``nn.Module``.
     """
     require_type("model", model, nn.Module, "a model of this package")
@@ -88,8 +95,8 @@ def export(
         program = torch.export.export(graph, examples)
     except Exception as error:  # of any kind, from within torch
         raise ValueError(
-            f"a {type(model).__name__} cannot be exported ({error!s:.200}); a OneStep and a "
-            "RecurrentTSM can"
+            f"a {type(model).__name__} cannot be exported ({error!s:.200}); a OneStep, a TSM and "
+            "a RecurrentTSM can"
         ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".pt2":

@@ -198,7 +198,7 @@ class FreeRunning(torch.autograd.Function):
             latest = torch.add(latest, final_bias, out=states[k]).addmm_(a, final)
         if stack.keep:
             ctx.save_for_backward(x, states, inputs, s, gates, h, total, active, *hidden, *weights)
-            ctx.stack, ctx.mixed, ctx.skips = stack, mixed, skips
+            ctx.stack, ctx.mixed, ctx.skips, ctx.final = stack, mixed, skips, final
         return states
 
     @staticmethod
@@ -252,8 +252,7 @@ class FreeRunning(torch.autograd.Function):
         h_steps = h.view(steps, n, layers, channels)[known:].transpose(1, 2).unbind(0)
         act_backward = silu_backward if stack.state_skip else relu_backward
         threshold = () if stack.state_skip else (0,)
-        deviations, (order, unsorted) = stack.features.step_std, _orders(stack.features)
-        final = (head[-1] * deviations[:, None])[order]
+        deviations, final = stack.features.step_std, ctx.final.T
         slopes_ = slopes(stack.features, torch.cat([x, states[:-1]]))
         angles, others = len(stack.features.angles), len(stack.features.others)
         dinputs = s.new_empty(steps, n, width)
@@ -348,7 +347,9 @@ class FreeRunning(torch.autograd.Function):
                 torch.mm(dtotal_rows.T, parts[layer][known * n :], out=douts[layer][channels:])
                 torch.sum(dtotal_rows, 0, out=douts_bias[layer][channels:])
         ins = [active, *(part[1] for part in hidden)]
-        outs = [*dhidden, dx[known + 1 :][..., unsorted] * deviations]
+        columns = dx[known + 1 :].unbind(-1)
+        sorted_ = torch.stack([columns[i] for i in _orders(stack.features)[1]], dim=-1)
+        outs = [*dhidden, sorted_ * deviations]
         for a, dz, dw, db in zip(ins, outs, dhead, dhead_bias, strict=True):
             torch.mm(dz.flatten(0, 1).T, a.flatten(0, 1), out=dw)
             torch.sum(dz, (0, 1), out=db)
