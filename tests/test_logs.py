@@ -76,6 +76,16 @@ def polars_like(frame: pd.DataFrame) -> Any:
     return polars.DataFrame({name: frame[name].tolist() for name in frame})
 
 
+def test_commas_that_may_separate_thousands_are_read_with_a_warning(tmp_path: Path) -> None:
+    lines = ["t;x;u", *(f"{k};{1 + k},25{k};0" for k in range(4))]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    with pytest.warns(UserWarning, match="'1,250' is read as '1.250'.*thousands"):
+        data = tsmlib.Trajectories.from_table(
+            str(tmp_path / "log.csv"), time="t", states=["x"], actions=["u"]
+        )
+    assert data.flat_states[1, 0] == np.float32(2.251)
+
+
 @pytest.mark.parametrize(
     "form", ["csv", "gz", "semicolons", "commas", "dict", "polars", "shuffled"]
 )

@@ -6,6 +6,7 @@ import csv
 import gzip
 import os
 import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -376,6 +377,14 @@ def _with_points(lines: list[list[str]]) -> list[list[str]]:
     )
     if any(points.fullmatch(cell) for line in lines for cell in line):
         return lines
+    fractions = [cell for line in lines for cell in line if commas.fullmatch(cell)]
+    thousands = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")
+    if fractions and all(map(thousands.fullmatch, fractions)):
+        warnings.warn(
+            f"{fractions[0]!r} is read as {fractions[0].replace(',', '.')!r}; where commas "
+            "separate thousands, read the file with pandas.read_csv(path, sep=';', thousands=',')",
+            stacklevel=2,
+        )
     return [
         [cell.replace(",", ".") if commas.fullmatch(cell) else cell for cell in line]
         for line in lines
