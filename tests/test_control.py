@@ -337,6 +337,18 @@ def test_what_is_left_of_a_good_plan_is_what_is_done_next(over: str, every: int)
     torch.testing.assert_close(trial.plan.states[0], trial.states[:, 1:], rtol=1e-3, atol=1e-3)
 
 
+def test_a_plan_begins_with_what_is_proposed_which_are_actions() -> None:
+    task = some_task(PUSH)
+    proposed = 0.5 * torch.ones(len(task), 20, 2)
+    propose = partial(mpc, task, None, proposal=lambda task, past, steps: proposed)
+    trial = propose(DirectActions(20, rms=0.3), as_it_is, every=20)
+    torch.testing.assert_close(trial.actions, proposed)
+    with pytest.raises(TypeError, match="proposal is of actions.*expected DirectActions"):
+        propose(LatentActions(ActionPrior(2, channels=8), 20), as_it_is)
+    with pytest.raises(ValueError, match=r"what proposal gave.*30"):
+        propose(DirectActions(20, rms=0.3), as_it_is, proposal=lambda *_: torch.ones(3, 30, 2))
+
+
 def test_planning_again_through_the_true_simulator_never_makes_a_plan_worse() -> None:
     task = some_task()
     planner = partial(mppi, candidates=12, iterations=2)

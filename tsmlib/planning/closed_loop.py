@@ -6,6 +6,7 @@ Letters in shapes: B targets, T horizon, L past length, dx, du size of state and
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,7 +14,14 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm.auto import tqdm
 
-from tsmlib.checks import MOST, require_callable, require_count, require_seed, require_type
+from tsmlib.checks import (
+    MOST,
+    as_tensor,
+    require_callable,
+    require_count,
+    require_seed,
+    require_type,
+)
 from tsmlib.models.base import Model, as_dynamics
 from tsmlib.planning.base import Judge, Plan, Planner, Predictor, SearchSpace
 from tsmlib.planning.execution import (
@@ -27,9 +35,13 @@ from tsmlib.planning.execution import (
 from tsmlib.planning.planners import reevaluate
 from tsmlib.planning.predictors import fresh_predictor, model_predictor, simulator_predictor
 from tsmlib.planning.search import require_space
+from tsmlib.planning.search_spaces import DirectActions
 from tsmlib.planning.tasks import Task
 from tsmlib.rewards import Reward, rewarded
 from tsmlib.trajectory import Segment
+
+# task of some instances, their past, steps -> actions (B, steps, du)
+Proposal = Callable[[Task, Segment, int], Tensor]
 
 
 def mpc(
@@ -43,6 +55,7 @@ def mpc(
     until_success: bool = False,
     plan: Plan | None = None,
     judge: Judge = model_predictor,
+    proposal: Proposal | None = None,
     seed: int = 0,
     progress: str = "",
 ) -> Trial:
@@ -66,6 +79,9 @@ def mpc(
             what counts, and nothing is planned for them any more.
         plan: the first one, if there is one already, so that closed and open loop begin alike.
         judge: makes what candidates are judged by, by default the model's mode.
+        proposal: gives another start of each plan, such as what a policy does in the model
+            (``imagine``): task, past (B, L, .), steps -> actions (B, steps, du); of
+            ``DirectActions``. A search that begins well needs fewer candidates.
         seed: of what judges and fresh samples draw, 0 or above.
         progress: title of the progress bar; none without.
 
@@ -98,11 +114,17 @@ def mpc(
         open_loop_actions(task, plan)
         plan = replace(plan, start=None)  # sensors may say another
     task.require_robot(getattr(model, "robot", None), "the model and the task")
+    if proposal is not None and not isinstance(space, DirectActions):
+        raise TypeError(
+            f"a proposal is of actions, and space is a {type(space).__name__}; expected "
+            "DirectActions, such as DirectActions.for_data(data, horizon)"
+        )
     began, horizon = time.perf_counter(), task.horizon
     past_len = 1 if model is None else as_dynamics(model).past_len
     planning = _Replanning(
         task, model, planner, every, ahead, until_success, judge, seed, space, len(task), plan
     )
+    planning.proposal = proposal
     with tqdm(total=-(-horizon // every), desc=progress, disable=not progress) as bar:
 
         def controller(past: Segment) -> Tensor:
@@ -142,6 +164,7 @@ class _Replanning:
     space: SearchSpace  # of the rest of the episode, as are start and plan
     start: Tensor | int
     plan: Plan | None
+    proposal: Proposal | None = None
     done: int = 0  # steps
     rollouts: list[Tensor] = field(default_factory=list)  # (1, B, every, dx) of each plan
     returns: list[Tensor] = field(default_factory=list)  # (B,) of each plan
@@ -190,10 +213,24 @@ class _Replanning:
         if self.ahead >= self.task.horizon:
             so_far = Segment(*(part[:, part.shape[1] - self.done :] for part in past))
             reward = _whole_episode(reward, so_far)
+        if self.proposal is not None:
+            begun = self._proposed(task, past)
+            start = torch.cat([start, begun]) if isinstance(start, Tensor) else begun
         predict, fresh = self._predictors(task, past)
         plan, self.plan = self.plan or self.planner(predict, reward, self.space, start), None
         self._require_whole(plan)
         return plan, reevaluate(plan, fresh, reward)
+
+    def _proposed(self, task: Task, past: Segment) -> Tensor:
+        """Parameters (1, B, T, du) of the actions that are proposed."""
+        assert self.proposal is not None
+        steps = min(self.ahead, self.task.horizon - self.done)
+        actions = as_tensor(
+            "what proposal gave",
+            self.proposal(task, past, steps),
+            (len(task), steps, task.action_dim),
+        )
+        return actions.clamp(-0.999, 0.999).atanh()[None]
 
     def _require_whole(self, plan: Plan) -> None:
         require_type("what the planner gave", plan, Plan, "a Plan, as of tsmlib.cem")
