@@ -92,7 +92,10 @@ def ahead(tables: Tables = results) -> Figure:
                 found.ahead, half
             )
     label = "share of episodes, or targets, on which it is ahead"
-    return plots.forest(panels, x_label=label, reference=0.5, better="right", columns=2)
+    figure = plots.forest(panels, x_label=label, reference=0.5, better="right", columns=2)
+    for ax in figure.axes:
+        ax.set_xlim(0.3, 1.01)
+    return figure
 
 
 @styled
