@@ -64,10 +64,8 @@ def of_layer(name: str, layer: nn.Module, scale: Tensor | None = None) -> Arrays
 
 def of_stack(decoder: CausalDecoder, scale: Tensor) -> Arrays:
     """A stack of gated layers (Eq. 1) with its head: ReLU, and perhaps a hidden layer."""
-    if decoder.state_skip or not all(layer.residual for layer in list(decoder.layers)[:-1]):
-        raise ValueError(
-            "the page knows stacks with residual connections and no state skip; export another"
-        )
+    if not all(layer.residual for layer in list(decoder.layers)[:-1]):
+        raise ValueError("the page knows stacks with residual connections; export another")
     channels, found = decoder.inlet.out_features, of_layer("inlet", decoder.inlet)
     for i, (layer, code) in enumerate(
         zip(decoder.layers, decoder.codes.weight.chunk(len(decoder.layers)), strict=True)

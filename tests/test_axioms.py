@@ -88,7 +88,6 @@ MODELS = {
         constant=(6, 7, 8, 9),
         **SAME,
     ),
-    "tsm, state skip": Case(lambda dx: TSM(dx, DU, angles=ANGLES, state_skip=16, **SMALL), **SAME),
     "tsm, learned prior": Case(with_learned_prior, foresees=True, **SAME),
     "onestep": Case(
         lambda dx: OneStep(dx, DU, angles=ANGLES, hidden=16, layers=2),
@@ -99,7 +98,7 @@ MODELS = {
         lambda dx: LSTM(dx, DU, angles=ANGLES, hidden=16, segment_len=10), stochastic=False
     ),
     "rtsm": Case(
-        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20, mode_weight=0.5),
+        lambda dx: RecurrentTSM(dx, DU, angles=ANGLES, hidden=16, segment_len=20),
         losses=(("loss", ()), ("point_loss", ("decoder.codes",))),
     ),
     "rtsm, obstacle": Case(

@@ -243,28 +243,6 @@ def test_actions_themselves_are_searched_without_a_prior_and_any_robot_explores(
     assert "success" not in found.records[0]
 
 
-def test_disagreement_is_worth_the_bonus_and_one_rollout_has_none() -> None:
-    states, actions = torch.zeros(2, 1, 1, 3, 2), torch.zeros(1, 1, 3, 2)
-    states[0, ..., 1, 0] = 4.0  # step 1: 4 and 0, a standard deviation of 2
-
-    def nothing(states: Tensor, actions: Tensor) -> Tensor:
-        return states[..., 0] * 0
-
-    rewarded = exploration.with_bonus(nothing, weight=3.0, scale=torch.tensor([0.5, 0.0]))
-    assert rewarded(states, actions)[:, 0, 0].tolist() == [[0, 6, 0]] * 2  # 3 (2 / 0.5 + 0) / 2
-    assert not rewarded(states[0, 0], actions[0]).any()
-
-
-@pytest.mark.parametrize("changes", [{"noise": 1.0}, {"bonus": 1e4, "candidates": 16}])
-def test_noise_and_bonus_lead_elsewhere(changes: Mapping[str, float]) -> None:
-    def executed(**changes: Any) -> float:
-        return explored(*learners(), options=options(rounds=1, **changes)).records[0][
-            "executed_return"
-        ]
-
-    assert executed(**changes) != executed()
-
-
 def test_an_unstable_episode_is_left_out_and_counted_with_what_was_executed_until_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -350,10 +328,9 @@ def judged_by(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     [
         ({}, tsmlib.expected_predictor, 8, 0.25),
         ({"judging": 2, "screened": 0.5}, tsmlib.expected_predictor, 2, 0.5),
-        ({"bonus": 1.0}, tsmlib.model_predictor, 4, 1.0),
     ],
 )
-def test_candidates_are_judged_by_the_mode_and_samples_and_with_a_bonus_by_its_samples_alone(
+def test_candidates_are_judged_by_the_mode_and_samples(
     changes: Mapping[str, Any],
     judge: Any,
     samples: int,
@@ -379,22 +356,6 @@ def test_a_model_without_samples_is_judged_by_its_rollout_whatever_the_options(
         return explored(model, learners()[1], options=once, folder=tmp_path).records
 
     assert found(judging=0, screened=1.0) == found()
-
-
-def test_what_disturbs_a_plan_is_no_candidate_of_its_search(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    made: list[tuple[Any, float, torch.Generator]] = []
-
-    def perturbed(planner: Any, deviation: float, generator: torch.Generator) -> Any:
-        made.append((planner, deviation, generator))
-        return planner
-
-    monkeypatch.setattr(exploration, "Perturbed", perturbed)
-    explored(*learners(), options=options(rounds=1, noise=0.5))
-    ((planner, _, generator),) = made
-    searched = torch.Generator().manual_seed(planner.keywords["seed"])
-    assert not torch.equal(torch.randn(8, generator=generator), torch.randn(8, generator=searched))
 
 
 def test_a_measure_by_a_name_that_the_record_has_is_refused() -> None:

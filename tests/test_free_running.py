@@ -16,8 +16,6 @@ OPTIONS: dict[str, Any] = {
     "paper's": {},
     "wide head": {"head_channels": 7},
     "plain": {"plain": True},
-    "state skip": {"state_skip": 6},
-    "state skip, plain": {"state_skip": 6, "plain": True},
     "one layer": {"dilations": (3,)},
     "long": {"dilations": (1, 2, 4, 8, 16, 8)},
     "not ordered": {"dilations": (5, 1, 2)},

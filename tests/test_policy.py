@@ -47,7 +47,6 @@ DX, DU, H, DT = 6, 2, 4, 0.5
 SMALL: dict[str, Any] = dict(segment_len=H, channels=8, dilations=(1, 2, 1))
 MODELS: dict[str, Callable[[], Any]] = {
     "tsm": lambda: TSM(DX, DU, **SMALL),
-    "tsm, state skip": lambda: TSM(DX, DU, state_skip=8, **SMALL),
     "onestep": lambda: OneStep(DX, DU, hidden=8, layers=1),
     "lstm": lambda: LSTM(DX, DU, hidden=8, past_len=H, segment_len=8),
     "rtsm": lambda: RecurrentTSM(

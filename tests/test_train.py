@@ -78,9 +78,7 @@ def new_prior(seed: int = 0) -> ActionPrior:
 
 def new_rtsm(seed: int = 0) -> RecurrentTSM:
     torch.manual_seed(seed)
-    model = RecurrentTSM(
-        3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H, mode_weight=0.5
-    )
+    model = RecurrentTSM(3, 2, angles=(0,), hidden=8, latent_dim=2, past_len=H, code_len=H)
     model.take_robot(TRAIN)
     return model
 

@@ -23,7 +23,7 @@ from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.baselines import LSTM, OneStep
 from tsmlib.models.ensemble import Ensemble
 from tsmlib.models.tsm import TSM
-from tsmlib.planning.base import Plan, Planner, Predictor, mean, worst
+from tsmlib.planning.base import Plan, Planner, Predictor
 from tsmlib.planning.execution import execute
 from tsmlib.planning.planners import (
     adam,
@@ -609,7 +609,7 @@ def test_every_planner_plans_through_every_model_over_actions_and_codes(prior: A
         assert (plan.predicted_return > plan.curve[0]).all()
 
 
-# Noise and risk
+# Noise
 
 
 def test_noise_is_as_strong_at_every_step_and_as_smooth_as_is_said() -> None:
@@ -637,19 +637,6 @@ def test_the_space_of_data_searches_actions_as_large_and_as_smooth_as_theirs(
         DirectActions(30, 2)
 
 
-def test_a_plan_by_the_worst_sample_keeps_further_from_an_edge() -> None:
-    def edge(states: Tensor, actions: Tensor) -> Tensor:
-        end = states[..., 0]
-        return end.minimum(torch.tensor(0.5)) - 5.0 * (end > 0.5)
-
-    predict, worst_returns = predictor(0.1, samples=8), []
-    for risk in (mean, worst):
-        plan = cem(predict, edge, SMOOTH, B, candidates=60, elites=6, iterations=8, risk=risk)
-        per_sample = edge(predict(plan.actions[None])[:, 0], plan.actions).sum(-1)
-        worst_returns.append(per_sample.amin(0))
-    assert (worst_returns[1] >= worst_returns[0] - 1e-4).all()
-
-
 # What cannot be
 
 
@@ -675,7 +662,6 @@ def test_a_plan_by_the_worst_sample_keeps_further_from_an_edge() -> None:
         (dict(screened=1.1), "screened is 1.1"),
         (dict(keep=math.nan), "keep is nan"),
         (dict(seed=1.5), "seed is 1.5"),
-        (dict(risk=1), "risk is a int 1"),
     ],
 )
 def test_what_cannot_be_searched_is_refused_by_name(wrong: dict[str, Any], said: str) -> None:

@@ -1,4 +1,4 @@
-"""SensorNoise and ActionDelay do what they say to the signals, and nothing to the world."""
+"""Noise and delay do what they say to the signals, and nothing to the world."""
 
 import itertools
 import warnings
@@ -9,44 +9,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tsmlib.envs.wrappers import ActionDelay, ImperfectArms, SensorNoise, imperfect_arms
+from tsmlib.envs import imperfect
+from tsmlib.envs.wrappers import ImperfectArms, imperfect_arms
 
 ENV = "tsm/PymunkPush-v1"
 SCALE = np.array([3.0, 2.0, 8.0, 6.0, 0.2, 0.2, 0.25, 0.25, 1.0, 1.0])
 STEPS = 60
-
-
-def episode(
-    env: gymnasium.Env, actions: np.ndarray, seed: int = 7
-) -> tuple[np.ndarray, np.ndarray, list[dict]]:
-    """States (T + 1, dx), rewards (T,) and infos (T + 1) of one episode."""
-    state, info = env.reset(seed=seed)
-    states, rewards, infos = [state], [], [info]
-    for action in actions:
-        state, reward, _, _, info = env.step(action)
-        states.append(state)
-        rewards.append(reward)
-        infos.append(info)
-    return np.stack(states), np.array(rewards), infos
-
-
-@pytest.fixture
-def actions() -> np.ndarray:
-    return np.random.default_rng(0).uniform(-0.3, 0.3, (STEPS, 2)).astype(np.float32)
-
-
-def test_an_array_changed_after_it_was_sent_does_not_change_the_action() -> None:
-    buffer = np.full(2, 0.3, np.float32)
-    env = ActionDelay(gymnasium.make(ENV), 1)
-    env.reset(seed=0)
-    env.step(buffer)
-    buffer[:] = -0.3
-    state = env.step(buffer)[0]
-    assert state[2] != 0
-    base = gymnasium.make(ENV)
-    base.reset(seed=0)
-    base.step(np.zeros(2, np.float32))
-    np.testing.assert_array_equal(state, base.step(np.full(2, 0.3, np.float32))[0])
 
 
 @pytest.mark.parametrize("seed", [0, 7])
@@ -59,34 +27,14 @@ def test_noise_of_many_arms_shares_no_random_numbers_with_starts(seed: int) -> N
         assert np.abs(drawn - begun).max(1).min() > 0.1
 
 
-@pytest.mark.parametrize(
-    "wrap", [lambda env: SensorNoise(env, 0.25, SCALE), lambda env: ActionDelay(env, 3)]
-)
-def test_gymnasium_finds_no_fault_with_a_wrapped_environment(wrap) -> None:
+@pytest.mark.parametrize("how", [{"noise": 0.25}, {"delay": 3}])
+def test_gymnasium_finds_no_fault_with_an_imperfect_arm(how: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Said of every wrapped environment, and of every unbounded one.
-        warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
         warnings.filterwarnings(
             "ignore", message=".*Box observation space (minimum|maximum) value is.*"
         )
-        check_env(wrap(gymnasium.make(ENV)), skip_render_check=True)
-
-
-@pytest.mark.parametrize(
-    ("wrap", "message"),
-    [
-        (lambda env: SensorNoise(env, -0.1, SCALE), "sigma is -0.1"),
-        (lambda env: SensorNoise(env, float("nan"), SCALE), "sigma is nan"),
-        (lambda env: SensorNoise(env, 0.1, SCALE[:6]), r"of shape \(10,\)"),
-        (lambda env: SensorNoise(env, 0.1, -SCALE), "at least 0"),
-        (lambda env: ActionDelay(env, -1), "tau is -1"),
-        (lambda env: ActionDelay(env, 1.5), "tau is 1.5"),
-    ],
-)
-def test_a_senseless_wrapper_is_refused(wrap, message: str) -> None:
-    with pytest.raises((TypeError, ValueError), match=message):
-        wrap(gymnasium.make(ENV))
+        check_env(gymnasium.make(imperfect(ENV, **how)).unwrapped, skip_render_check=True)
 
 
 # Many arms at once --------------------------------------------------------------------------------
@@ -164,20 +112,6 @@ def test_the_truth_behind_noise_is_what_plain_arms_do(env_id: str) -> None:
     np.testing.assert_array_equal(info["state"], truth[:, 0])
     for step in range(10):
         np.testing.assert_array_equal(env.step(torques()[:, step])[4]["state"], truth[:, step + 1])
-
-
-@bulk
-def test_one_of_many_imperfect_arms_is_the_wrapped_one(env_id: str) -> None:
-    env = many(env_id, tau=TAU)
-    start, info = env.reset(seed=7)
-    steps = [env.step(one) for one in torques().swapaxes(0, 1)]
-    for i in range(N):
-        one = ActionDelay(SensorNoise(gymnasium.make(env_id), 0.0, SCALE), TAU)
-        one.reset(options={"states": start[i], "target": info["target"][i]})
-        for (states, rewards, _, truncated, _), action in zip(steps, torques()[i], strict=True):
-            state, reward, _, late, _ = one.step(action.astype(np.float64))
-            np.testing.assert_array_equal(state, states[i])
-            assert (reward, late) == (rewards[i], truncated[i])
 
 
 def test_in_bulk_too_noise_has_mean_zero_and_the_given_size_in_every_dimension() -> None:

@@ -47,20 +47,16 @@ MORE = {  # arguments beside those above
         beta=1.0,
         full_encoder=False,
         head_channels=0,
-        state_skip=0,
         plain=False,
         prior="normal",
         residual="square",
     ),
-    "RecurrentTSM": dict(mode_weight=0.0),
     "Ensemble": dict(gaussian=True),
     "ActionPrior": dict(beta=0.03),
 }
 ALLOWED = {
     "beta": NOT_NEGATIVE,
-    "mode_weight": NOT_NEGATIVE,
     "head_channels": COUNT_OR_ZERO,
-    "state_skip": COUNT_OR_ZERO,
 }
 FEW = tsmlib.TrainingOptions(steps=1, batch_size=2)
 TITLE = frozenset({"text"})
@@ -94,10 +90,9 @@ FIT: dict[str, Any] = dict(
 FIT_ALSO = {
     "data": ROBOTS,
     "validation": ROBOTS,
-    "model": {"a mixture": tsmlib.Mixture([new("LSTM")])},
     "loss": {"of another model": new("OneStep").loss, "of nothing": lambda *_: torch.tensor(0.0)},
 }
-FIT_WORDS = {"data": ("robot",), "validation": ("robot",), "model": ("Mixture",)}
+FIT_WORDS = {"data": ("robot",), "validation": ("robot",)}
 FIT_ALLOWED = {
     "validation": OPTIONAL,
     "options": OPTIONAL,
@@ -153,12 +148,6 @@ CALLS = [
         "ActionPrior.plan",
         new("ActionPrior").plan,
         dict(past_actions=torch.zeros(2, 4, DU), z=torch.zeros(2, 3, 2)),
-    ),
-    Call(
-        "Mixture",
-        tsmlib.Mixture,
-        dict(models=[new("TSM"), new("LSTM")]),
-        words={"models": ("model",)},
     ),
     Call("Features", Features, dict(state_dim=DX, angles=(0,))),
     Call("Features.fit", Features(DX).fit, dict(data=OWN), also={"data": {"sizes": SMALLER}}),

@@ -311,16 +311,10 @@ CALLS = [
             iterations=1,
             held_out=0.1,
             rms=None,
-            noise=0.0,
-            bonus=0.0,
-            samples=2,
             judging=0,
             screened=0.5,
         ),
-        dict.fromkeys(
-            ("rounds", "every", "candidates", "iterations", "samples"), frozenset({"huge"})
-        )
-        | dict.fromkeys(("noise", "bonus"), NOT_NEGATIVE)
+        dict.fromkeys(("rounds", "every", "candidates", "iterations"), frozenset({"huge"}))
         | {"prior": OPTIONAL, "rms": OPTIONAL | POSITIVE, "judging": COUNT_OR_ZERO | {"huge"}}
         | {"held_out": frozenset({"a fraction"}), "screened": frozenset({"zero", "a fraction"})},
         {"elites": {"too many": 9}},
@@ -333,7 +327,3 @@ def test_a_wrong_call_is_refused_by_the_name_of_its_argument(case: Call) -> None
     call(case)  # the correct one
     findings = [finding(case, *wrong) for wrong in case.cases()]
     assert not (found := [text for text in findings if text]), "\n".join(found)
-
-
-def test_so_many_wrong_calls_are_tried() -> None:
-    assert sum(len(case.cases()) for case in CALLS) > 1000

@@ -19,7 +19,6 @@ from .models.baselines import OneStep as OneStep
 from .models.egocentric import Egocentric as Egocentric
 from .models.ensemble import Ensemble as Ensemble
 from .models.export import export as export
-from .models.mixture import Mixture as Mixture
 from .models.recurrent import RecurrentTSM as RecurrentTSM
 from .models.tsm import TSM as TSM
 from .planning.base import Plan as Plan

@@ -22,7 +22,7 @@ from tsmlib.envs.spec import CONTROL, CONTROL_IDS, DELAY, ENV_IDS, NOISE, EnvSpe
 
 
 def imperfect(env_id: str, *, noise: float = 0.0, delay: int = 0) -> str:
-    """Name the same arm behind `SensorNoise` and `ActionDelay`, and register it (section 5.3.3).
+    """Name the same arm with noisy sensors or late actions, and register it (section 5.3.3).
 
     Args:
         env_id: of a plain arm or a variant.

@@ -8,7 +8,7 @@ Letters in shapes: N episodes, T steps, dx state size, du = 2 action size. A sim
 import secrets
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -278,12 +278,19 @@ class ArmEnv(Variant, gymnasium.Env):
     dt = DT
 
     def __init__(
-        self, env_id: str, render_mode: str | None = None, **changes: Unpack[Changes]
+        self,
+        env_id: str,
+        render_mode: str | None = None,
+        noise: float = 0.0,
+        delay: int = 0,
+        **changes: Unpack[Changes],
     ) -> None:
-        name = EnvSpec.parse(env_id).varied(**changes).registered().id
-        vector = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode).unwrapped
+        plain = EnvSpec.parse(env_id).varied(**changes)
+        name = replace(plain, noise=noise, delay=delay).registered().id
+        self._made: Any = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode)
+        vector = self._made.unwrapped
         assert isinstance(vector, ArmVectorEnv)
-        self.vector, self.env_id, self.render_mode = vector, name, render_mode
+        self.vector, self.env_id, self.render_mode = vector, plain.registered().id, render_mode
         self.names, self.units, self.task = vector.names, vector.units, vector.task
         self.physics = vector.physics
         self.observation_space = vector.single_observation_space
@@ -300,17 +307,18 @@ class ArmEnv(Variant, gymnasium.Env):
         """As `ArmVectorEnv.reset`; ``options["states"]`` is (dx,), ``options["target"]`` (2,)."""
         super().reset(seed=seed)
         options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
-        states, info = self.vector.reset(seed=seed, options=options)
-        return states[0], {"target": info["target"][0]}
+        states, info = self._made.reset(seed=seed, options=options)
+        return states[0], {key: value[0] for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """One step by an action (2,). Never terminates; the registered time limit truncates."""
-        states, reward, _, _, info = self.vector.step(np.asarray(action)[None])
-        return states[0], float(reward[0]), False, False, {"target": info["target"][0]}
+        states, reward, _, _, info = self._made.step(np.asarray(action)[None])
+        info = {key: value[0] for key, value in info.items()}
+        return states[0], float(reward[0]), False, False, info
 
     def rollout(self, actions: np.ndarray) -> np.ndarray:
         """States (T, dx) after actions (T, 2)."""
-        return self.vector.rollout(np.asarray(actions)[None])[0]
+        return self._made.rollout(np.asarray(actions)[None])[0]
 
     def render(self) -> np.ndarray | None:
         """A uint8 image (height, width, 3), or None without ``render_mode="rgb_array"``."""
@@ -318,4 +326,4 @@ class ArmEnv(Variant, gymnasium.Env):
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        self.vector.close()
+        self._made.close()

@@ -141,15 +141,14 @@ def _register(spec: EnvSpec) -> None:
     """
     if spec.id in registry:
         return
-    made_by = ("tsmlib.envs.arm:ArmEnv", _VECTOR_ARMS[spec.simulator])
-    kwargs: dict[str, object] = {"env_id": spec.arm.id}
+    many, kwargs = _VECTOR_ARMS[spec.simulator], dict[str, object](env_id=spec.arm.id)
     if spec != spec.arm:
-        made_by = ("tsmlib.envs.wrappers:imperfect_arm", "tsmlib.envs.wrappers:imperfect_arms")
+        many = "tsmlib.envs.wrappers:imperfect_arms"
         kwargs |= {"noise": spec.noise, "delay": spec.delay}
     register(
         spec.id,
-        entry_point=made_by[0],
-        vector_entry_point=made_by[1],
+        entry_point="tsmlib.envs.arm:ArmEnv",
+        vector_entry_point=many,
         kwargs=kwargs,
         max_episode_steps=100,
     )

@@ -1,105 +1,38 @@
-"""Imperfect sensors and actuators, as ordinary Gymnasium wrappers (section 5.3.3)."""
+"""Imperfect sensors and actuators, as a Gymnasium wrapper of N arms (section 5.3.3)."""
 
-from collections import deque
-from typing import Any, Unpack
+from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from tsmlib.checks import require_count, require_number
 from tsmlib.envs.arm import ArmVectorEnv, Info
 from tsmlib.envs.geometry import HALF_RANGE
-from tsmlib.envs.physics import Changes
 from tsmlib.envs.spec import EnvSpec
 
 # It keeps the noise apart from the starts and targets of any reset, counted from 0, of this seed.
 NOISE_STREAM = 2**32 - 1
 
 
-class SensorNoise(gymnasium.Wrapper, RecordConstructorArgs):
-    """The observed state is x + sigma * scale * eps with eps ~ N(0, 1), drawn anew at each step.
-
-    The world and the reward stay as they are; ``info["state"]`` (dx,) holds the true state. Noise
-    is drawn from the seed given to ``reset``.
-    """
-
-    def __init__(self, env: gymnasium.Env, sigma: float, scale: np.ndarray) -> None:
-        """Wrap one environment.
-
-        Args:
-            env: whose state is a vector (dx,).
-            sigma: noise in units of data scaled to [-1, 1].
-            scale: (dx,), half of each dimension's range in the data.
-        """
-        RecordConstructorArgs.__init__(self, sigma=sigma, scale=scale)
-        super().__init__(env)
-        self.sigma, self.scale = require_number("sigma", sigma, 0), np.array(scale, np.float64)
-        shape = env.observation_space.shape
-        if self.scale.shape != shape or not (self.scale >= 0).all():
-            raise ValueError(
-                f"scale is {self.scale}; expected half ranges of at least 0, of shape {shape}"
-            )
-        self._noise = np.random.default_rng()
-
-    def reset(
-        self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[np.ndarray, Info]:
-        if seed is not None:
-            self._noise = np.random.default_rng([seed, NOISE_STREAM])
-        state, info = self.env.reset(seed=seed, options=options)
-        return self._observed(state), info | {"state": state}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        state, reward, terminated, truncated, info = self.env.step(action)
-        return self._observed(state), float(reward), terminated, truncated, info | {"state": state}
-
-    def _observed(self, state: np.ndarray) -> np.ndarray:
-        return state + self.sigma * self.scale * self._noise.standard_normal(state.shape)
-
-
-class ActionDelay(gymnasium.Wrapper, RecordConstructorArgs):
-    """Actions arrive late: step t applies u_{t - tau}, and the first ``tau`` steps apply zero.
-
-    The reward charges the action that is applied; ``reset`` forgets those on the way.
-    """
-
-    def __init__(self, env: gymnasium.Env, tau: int) -> None:
-        """Wrap one environment.
-
-        Args:
-            env: whose action zero does nothing.
-            tau: delay, steps.
-        """
-        RecordConstructorArgs.__init__(self, tau=tau)
-        super().__init__(env)
-        self.tau = require_count("tau", tau, least=0)
-        self._on_the_way: deque[np.ndarray] = deque()
-
-    def reset(
-        self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[np.ndarray, Info]:
-        nothing = np.zeros(self.action_space.shape or (), self.action_space.dtype)
-        self._on_the_way = deque([nothing] * self.tau)
-        return self.env.reset(seed=seed, options=options)
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Take ``action`` now, apply the one from ``tau`` steps ago."""
-        self._on_the_way.append(np.array(action))
-        state, reward, terminated, truncated, info = self.env.step(self._on_the_way.popleft())
-        return state, float(reward), terminated, truncated, info
-
-
 class ImperfectArms(VectorWrapper):
-    """`SensorNoise` and `ActionDelay` of N arms, with ``rollout`` for whole sequences.
+    """N arms with noisy sensors and late actions, with ``rollout`` for whole sequences.
 
-    The noise of episode i is a function of the seed given to ``reset`` and of i, so it does not
-    depend on N. The reward is that of the true states.
+    The observed state is x + sigma * scale * eps with eps ~ N(0, 1), drawn anew at each step. Step
+    t applies u_{t - tau}, the first ``tau`` steps apply zero, and ``reset`` forgets the actions on
+    the way. World and reward stay as they are: the reward is that of the true states and charges
+    the action that is applied; ``info["state"]`` (N, dx) holds the true states. The noise of
+    episode i is a function of the seed given to ``reset`` and of i, so it does not depend on N.
     """
 
     def __init__(self, env: VectorEnv, *, sigma: float, scale: np.ndarray, tau: int) -> None:
-        """Wrap N arms; sigma, scale (dx,) and tau are those of the single wrappers."""
+        """Wrap N arms.
+
+        Args:
+            env: the arms.
+            sigma: noise in units of data scaled to [-1, 1].
+            scale: (dx,), half of each dimension's range in the data.
+            tau: delay, steps.
+        """
         super().__init__(env)
         self.sigma, self.scale, self.tau = sigma, np.asarray(scale, np.float64), tau
         assert isinstance(env.unwrapped, ArmVectorEnv)
@@ -152,18 +85,6 @@ class ImperfectArms(VectorWrapper):
             return states.copy()
         drawn = np.stack([generator.standard_normal(states.shape[1:]) for generator in self._noise])
         return states + self.sigma * self.scale * drawn
-
-
-def imperfect_arm(
-    env_id: str,
-    noise: float,
-    delay: int,
-    render_mode: str | None = None,
-    **changes: Unpack[Changes],
-) -> ActionDelay:
-    """One arm behind both wrappers, as Gymnasium makes it."""
-    made = gymnasium.make(env_id, disable_env_checker=True, render_mode=render_mode, **changes)
-    return ActionDelay(SensorNoise(made.unwrapped, noise, _half_range(env_id)), delay)
 
 
 def imperfect_arms(

@@ -22,17 +22,13 @@ import torch
 from torch import nn
 from tqdm.auto import tqdm
 
-from tsmlib.checks import (
-    require_callable,
-    require_seed,
-    require_type,
-)
-from tsmlib.exploration.curiosity import Perturbed, with_bonus
+from tsmlib.checks import require_callable, require_seed, require_type
 from tsmlib.exploration.options import Exploration, ExplorationOptions
-from tsmlib.exploration.rounds import RoundFiles, Trainable
+from tsmlib.exploration.rounds import RoundFiles
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import DynamicsModel, as_dynamics, require_robot
-from tsmlib.planning.base import Judge, Plan, Planner, SearchSpace
+from tsmlib.models.config import Configured
+from tsmlib.planning.base import Judge, Plan, SearchSpace
 from tsmlib.planning.closed_loop import mpc
 from tsmlib.planning.execution import Trial, without_unstable
 from tsmlib.planning.planners import cem
@@ -54,7 +50,7 @@ SECONDS = ("cpu_seconds", "wall_seconds")
 
 
 def explore(
-    model: Trainable,
+    model: DynamicsModel,
     prior: ActionPrior | None,
     train: Trajectories,
     held_out: Trajectories,
@@ -94,17 +90,17 @@ def explore(
         All data, and a record of every round.
 
     Raises:
-        ValueError: model, prior, data and tasks are not of one robot, or a bonus where the model
-            has no samples.
+        ValueError: model, prior, data and tasks are not of one robot.
         StoreError: ``folder`` is of another loop, or in use.
     """
     options = _checked(model, prior, train, held_out, options)
+    net = cast(Configured, model)
     seed = require_seed("seed", seed)
     for name, function in (("tasks", tasks), ("measure", measure), ("callback", callback)):
         if function is not None:
             require_callable(name, function, "a function")
     folder = None if folder is None else Path(folder)
-    identity = {} if folder is None else _identity(model, prior, train, held_out, options, seed)
+    identity = {} if folder is None else _identity(net, prior, train, held_out, options, seed)
     if augmented is not None and folder is not None:
         identity["augmented"] = artifacts.trajectories_digest(augmented(train))
     found, began = Exploration(train, held_out), time.process_time()
@@ -134,7 +130,7 @@ def explore(
                 steps += int(new.steps.sum())
             record = {"round": k, "env_steps": steps} | record
             data = found.train if augmented is None else augmented(found.train)
-            record = _trained(k, model, prior, found, data, record, options, seed, files, measure)
+            record = _trained(k, net, prior, found, data, record, options, seed, files, measure)
             found.seconds.append({name: record.pop(name) for name in SECONDS if name in record})
             found.records.append(record)
             if callback is not None:
@@ -143,7 +139,7 @@ def explore(
 
 
 def _checked(
-    model: Trainable,
+    model: DynamicsModel,
     prior: ActionPrior | None,
     train: Trajectories,
     held_out: Trajectories,
@@ -162,19 +158,13 @@ def _checked(
     options = replace(options, model=options.model.for_model(cast(nn.Module, model), train))
     if prior is not None and options.prior is not None:
         options = replace(options, prior=options.prior.for_model(prior, train))
-    stochastic = as_dynamics(model).stochastic
-    if options.bonus and not stochastic:
-        raise ValueError(
-            f"bonus is {options.bonus:g}, but {type(model).__name__} is deterministic: its samples "
-            "do not disagree. Take bonus=0, or an ensemble or a segment model"
-        )
-    if options.bonus or not stochastic:  # by the bonus's samples, or by the one rollout
+    if not as_dynamics(model).stochastic:  # by its one rollout
         options = replace(options, judging=0, screened=1.0)
     return options
 
 
 def _identity(
-    model: Trainable,
+    model: Configured,
     prior: ActionPrior | None,
     train: Trajectories,
     held_out: Trajectories,
@@ -220,7 +210,7 @@ def _task(tasks: Tasks, k: int, like: Trajectories) -> Task:
 
 def _collected(
     k: int,
-    model: Trainable,
+    model: DynamicsModel,
     prior: ActionPrior | None,
     like: Trajectories,
     task: Task,
@@ -231,11 +221,7 @@ def _collected(
     """The episodes of round k, None where all are lost, and what is said of them."""
     if files is not None and (stored := files.episodes()) is not None:
         return stored
-    began, aim = _now(), task
-    if options.bonus:
-        scale = torch.from_numpy(like.flat_states.std(0))
-        bonus = partial(with_bonus, weight=options.bonus, scale=scale)
-        aim = replace(task, reward_for=lambda target: bonus(task.reward_for(target)))
+    began = _now()
     space: SearchSpace
     if prior is not None:
         space = LatentActions(prior, task.horizon)
@@ -244,7 +230,7 @@ def _collected(
     else:
         space = DirectActions.for_data(like, task.horizon)
     draw = (seed * 1_000_003 + 1000 * k) % 2**31
-    planner: Planner = partial(
+    planner = partial(
         cem,
         candidates=options.candidates,
         elites=options.elites,
@@ -252,17 +238,12 @@ def _collected(
         screened=options.screened,
         seed=draw,
     )
-    if options.noise:  # of no search
-        generator = torch.Generator().manual_seed(-1 - draw)
-        planner = Perturbed(planner, options.noise, generator)
     judge: Judge = model_predictor
-    if options.bonus:
-        judge = partial(model_predictor, samples=options.samples)
-    elif options.judging:
+    if options.judging:
         judge = partial(expected_predictor, samples=options.judging)
     run = partial(mpc, every=options.every, judge=judge, seed=draw + 1)
-    stable = without_unstable(aim, lambda left, _: run(left, model, space, planner))
-    record = _means(task, stable.found, bonus=bool(options.bonus))
+    stable = without_unstable(task, lambda left, _: run(left, model, space, planner))
+    record = _means(task, stable.found)
     record |= {"lost": stable.lost, "discarded_steps": stable.discarded_steps} | _since(began)
     if stable.found is None:
         return None, record
@@ -274,7 +255,7 @@ def _collected(
 
 def _trained(
     k: int,
-    model: Trainable,
+    model: Configured,
     prior: ActionPrior | None,
     found: Exploration,
     augmented: Trajectories,
@@ -287,11 +268,12 @@ def _trained(
     """The record of round k with what training gave; the nets trained, or loaded."""
     if files is not None and (stored := files.models(model, prior)) is not None:
         return stored
-    began, parts = _now(), list[tuple[str, nn.Module, Loss, Trajectories, TrainingOptions]]()
+    began, parts = _now(), list[tuple[str, Configured, Trajectories, TrainingOptions]]()
     if prior is not None and options.prior is not None:
-        parts.append(("prior_validation", prior, prior.loss, found.train, options.prior))
-    parts.append(("validation", cast(nn.Module, model), model.loss, augmented, options.model))
-    for name, part, loss, data, training in parts:
+        parts.append(("prior_validation", prior, found.train, options.prior))
+    parts.append(("validation", model, augmented, options.model))
+    for name, part, data, training in parts:
+        loss = cast(Loss, part.loss)
         checkpoint = None if files is None else files.folder / f"{name}.checkpoint"
         fine_tune(
             part,
@@ -308,7 +290,7 @@ def _trained(
         record[name] = validate(loss, windows, seed + k)
     record |= {name: record.get(name, 0.0) + spent for name, spent in _since(began).items()}
     if measure is not None:
-        measured = measure(model, prior)
+        measured = measure(cast(DynamicsModel, model), prior)
         if taken := sorted(record.keys() & measured):
             raise ValueError(
                 f"measure gave {', '.join(map(repr, taken))}, which the record of a round has of "
@@ -329,7 +311,7 @@ def _since(began: tuple[float, float]) -> dict[str, float]:
     return {name: now - then for name, now, then in zip(SECONDS, _now(), began, strict=True)}
 
 
-def _means(task: Task, trial: Trial | None, *, bonus: bool) -> dict[str, float]:
+def _means(task: Task, trial: Trial | None) -> dict[str, float]:
     """Means over the episodes of a trial; NaN by the same names where all were lost."""
     if trial is None:
         still = torch.from_numpy(task.start)[:, None].expand(-1, task.horizon + 1, -1)
@@ -339,8 +321,6 @@ def _means(task: Task, trial: Trial | None, *, bonus: bool) -> dict[str, float]:
         distance, success, plan = trial.final_distance, trial.success, cast(Plan, trial.plan)
         values = {"executed_return": trial.executed_return}
         values |= {"predicted_return": plan.predicted_return, "gap": trial.gap.abs()}
-    if bonus:  # a prediction holds the bonus too
-        values = {"executed_return": values["executed_return"]}
     if success is not None:
         values["success"] = success.float()
     if not distance.isnan().any():

@@ -26,11 +26,6 @@ class ExplorationOptions:
             all, but none of a single one, which is trained on.
         rms: of the actions that are searched where there is no prior; None takes their size and
             smoothness from the training data.
-        noise: standard deviation of what is added to the parameters of every plan, in those of the
-            search space.
-        bonus: reward for each step per unit of disagreement, the standard deviation over
-            ``samples`` predicted states as a share of the data's, mean over dimensions; 0: none.
-        samples: that judge the candidates where there is a bonus, in place of the mode; at least 2.
         judging: samples by which candidates are judged beside the mode; 0: by the mode alone.
         screened: share of the candidates that all samples judge (``cem``).
     """
@@ -44,9 +39,6 @@ class ExplorationOptions:
     iterations: int = 4
     held_out: float = 0.1
     rms: float | None = None
-    noise: float = 0.0
-    bonus: float = 0.0
-    samples: int = 4
     judging: int = JUDGING
     screened: float = 0.25
 
@@ -56,7 +48,7 @@ class ExplorationOptions:
                 value = getattr(self, name)
                 require_type(name, value, TrainingOptions, "tsmlib.TrainingOptions(...)")
         least = {"rounds": 1, "every": 1, "candidates": 2, "elites": 2, "iterations": 1}
-        for name, low in (least | {"samples": 2, "judging": 0}).items():
+        for name, low in (least | {"judging": 0}).items():
             require_count(name, getattr(self, name), least=low)
         if self.elites > self.candidates:
             raise ValueError(
@@ -64,8 +56,6 @@ class ExplorationOptions:
             )
         if self.rms is not None:
             require_number("rms", self.rms, 0, above=True)
-        for name in ("noise", "bonus"):
-            require_number(name, getattr(self, name), 0)
         require_number("screened", self.screened, 0, 1)
         if require_number("held_out", self.held_out, 0, 1, above=True) == 1:
             raise ValueError("held_out is 1; expected a share below 1, for some to be trained on")
@@ -80,8 +70,8 @@ class Exploration:
         held_out: all held-out data.
         records: one per round: ``round``; ``env_steps`` executed so far; ``executed_return``,
             ``success`` and ``final_distance``, means over its episodes, by the task's measures;
-            without a bonus ``predicted_return`` and the mean size of the ``gap``; ``lost``,
-            episodes whose simulation became unstable, whereupon the others begin anew, and
+            ``predicted_return`` and the mean size of the ``gap``; ``lost``, episodes whose
+            simulation became unstable, whereupon the others begin anew, and
             ``discarded_steps`` that all had executed until then, which ``env_steps`` counts;
             ``validation`` and ``prior_validation``, losses on held-out data; and what ``measure``
             gave. Means of a round that lost all its episodes are NaN.

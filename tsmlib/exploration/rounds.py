@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import cast
 
-from torch import Tensor, nn
-
-from tsmlib.models.action_prior import ActionPrior
-from tsmlib.models.base import DynamicsModel
+from tsmlib.models.config import Configured
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, StoreError, decode_nonfinite, encode_nonfinite
-from tsmlib.training.fit import Loss
 from tsmlib.trajectory import Trajectories
-
-
-class Trainable(DynamicsModel, Protocol):
-    """A dynamics model of this package: a module with a loss and the arguments that made it."""
-
-    @property
-    def loss(self) -> Loss: ...
-    @property
-    def config(self) -> Callable[[], dict[str, Json]]: ...
-    @property
-    def state_dict(self) -> Callable[[], dict[str, Tensor]]: ...
 
 
 @dataclass(frozen=True)
@@ -53,27 +38,26 @@ class RoundFiles:
         path = self.folder / "episodes.safetensors"
         artifacts.save_trajectories(path, episodes, self._header(record))
 
-    def models(self, model: Trainable, prior: ActionPrior | None) -> dict[str, float] | None:
+    def models(self, model: Configured, prior: Configured | None) -> dict[str, float] | None:
         """The record of the whole round, its weights now in the nets; None if not all is there."""
         path = self.folder / "model.safetensors"
         if not path.exists():
             return None
         record = self._record(path)
-        for name, net in {"model": cast(nn.Module, model), "prior": prior}.items():
+        for name, net in {"model": model, "prior": prior}.items():
             if net is not None:
-                file = self.folder / f"{name}.safetensors"
-                stored = artifacts.load_model(file, cast(Any, type(net)))
+                stored = artifacts.load_model(self.folder / f"{name}.safetensors", type(net))
                 net.load_state_dict(stored.state_dict())
         return record
 
     def keep_models(
-        self, model: Trainable, prior: ActionPrior | None, record: Mapping[str, float]
+        self, model: Configured, prior: Configured | None, record: Mapping[str, float]
     ) -> None:
         """Write the nets and the record of the whole round; its checkpoints go."""
         header = self._header(record)
         if prior is not None:
             artifacts.save_model(self.folder / "prior.safetensors", prior, header)
-        artifacts.save_model(self.folder / "model.safetensors", cast(Any, model), header)
+        artifacts.save_model(self.folder / "model.safetensors", model, header)
         for checkpoint in self.folder.glob("*.checkpoint"):
             shutil.rmtree(checkpoint)
 

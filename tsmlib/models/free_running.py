@@ -27,9 +27,8 @@ from tsmlib.models.layers import CausalDecoder
 from tsmlib.models.recurrence import see, slopes
 from tsmlib.trajectory import Segment
 
-relu, silu = torch.ops.aten.relu.out, torch.ops.aten.silu.out
+relu = torch.ops.aten.relu.out
 relu_backward = torch.ops.aten.threshold_backward.grad_input
-silu_backward = torch.ops.aten.silu_backward.grad_input
 
 
 def free_running(
@@ -43,8 +42,7 @@ def free_running(
     taps, outs = ([getattr(layer, name) for layer in decoder.layers] for name in ("taps", "out"))
     linears = [decoder.inlet, *taps, *outs, *head]
     weights = [part for layer in linears for part in (layer.weight, layer.bias)]
-    residual, skip = not decoder.plain, bool(decoder.state_skip)
-    stack = Stack(features, decoder.dilations, residual, skip, torch.is_grad_enabled())
+    stack = Stack(features, decoder.dilations, not decoder.plain, torch.is_grad_enabled())
     states = FreeRunning.apply(
         stack, x.transpose(0, 1), u.transpose(0, 1), decoder.codes(z), *weights
     )
@@ -58,7 +56,6 @@ class Stack:
     features: Features
     dilations: tuple[int, ...]
     residual: bool
-    state_skip: bool
     keep: bool
 
     def first(self, known: int) -> list[int]:
@@ -110,10 +107,9 @@ class FreeRunning(torch.autograd.Function):
         inputs, s = x.new_empty(steps, n, width), x.new_empty(layers, steps * n, channels)
         gates = x.new_empty(layers if stack.keep else 1, room * n, 2 * channels)
         h = x.new_empty(room * n, layers * channels)
-        wide = channels + (width if stack.state_skip else 0)
-        total = x.new_empty(kept - known, n, wide)
+        total = x.new_empty(kept - known, n, channels)
         hidden = [x.new_empty(2, kept - known, n, len(part)) for part in head[:-1]]
-        active = total if stack.state_skip else torch.empty_like(total)
+        active = torch.empty_like(total)
         states = x.new_empty(steps - known, n, x.shape[2])
         minus = x.new_full((), -1.0)
 
@@ -170,7 +166,6 @@ class FreeRunning(torch.autograd.Function):
         h_steps = [_steps(part[late:], n, repeat) for part in parts]
         mix_steps = _steps(h[late:, lowest * channels :], n, repeat)
         in_steps, seen_steps = inputs[known:].unbind(0), inputs[known:, :, :seen].unbind(0)
-        act = silu if stack.state_skip else relu
         latest, deviations, (order, _) = x[known], stack.features.step_std, _orders(stack.features)
         final = (head[-1] * deviations[:, None])[order].T
         final_bias = (head_bias[-1] * deviations)[order]
@@ -186,15 +181,11 @@ class FreeRunning(torch.autograd.Function):
                 after = None if layer == last else s_steps[layer + 1][k]
                 q, f, g, h_ = (v[layer][k] for v in (q_steps, f_steps, g_steps, h_steps))
                 gate(layer, s_steps[layer][k], q, f, g, h_, after)
-            torch.addmm(skip_bias, mix_steps[k], skips, out=total[kept_k, :, :channels])
-            if stack.state_skip:
-                total[kept_k, :, channels:] = inputs[t]
-            else:
-                relu(total[kept_k], out=active[kept_k])
-            a = active[kept_k]
+            torch.addmm(skip_bias, mix_steps[k], skips, out=total[kept_k])
+            a = relu(total[kept_k], out=active[kept_k])
             for buffer, weight, bias in zip(hidden, head[:-1], head_bias[:-1], strict=True):
                 before, after = buffer[:, kept_k].unbind(0)
-                a = act(torch.addmm(bias, a, weight.T, out=before), out=after)
+                a = relu(torch.addmm(bias, a, weight.T, out=before), out=after)
             latest = torch.add(latest, final_bias, out=states[k]).addmm_(a, final)
         if stack.keep:
             ctx.save_for_backward(x, states, inputs, s, gates, h, total, active, *hidden, *weights)
@@ -250,8 +241,6 @@ class FreeRunning(torch.autograd.Function):
         )
         f_steps, g_steps, df_steps, dg_steps = halves
         h_steps = h.view(steps, n, layers, channels)[known:].transpose(1, 2).unbind(0)
-        act_backward = silu_backward if stack.state_skip else relu_backward
-        threshold = () if stack.state_skip else (0,)
         deviations, final = stack.features.step_std, ctx.final.T
         slopes_ = slopes(stack.features, torch.cat([x, states[:-1]]))
         angles, others = len(stack.features.angles), len(stack.features.others)
@@ -260,13 +249,10 @@ class FreeRunning(torch.autograd.Function):
             k = t - known
             da = dx[t + 1] @ final
             for j in reversed(range(len(hidden))):
-                act_backward(da, hidden[j][0, k], *threshold, grad_input=dhidden[j][k])
+                relu_backward(da, hidden[j][0, k], 0, grad_input=dhidden[j][k])
                 da = dhidden[j][k] @ head[j]
-            if stack.state_skip:
-                dtotal[k] = da
-            else:
-                relu_backward(da, total[k], 0, grad_input=dtotal[k])
-            torch.mm(dtotal[k, :, :channels], skips, out=dh_skips)
+            relu_backward(da, total[k], 0, grad_input=dtotal[k])
+            torch.mm(dtotal[k], skips, out=dh_skips)
             slope(f_steps[k], g_steps[k], h_steps[k], df_steps[k], dg_steps[k])
             for layer in reversed(range(layers)):
                 after = None
@@ -287,8 +273,6 @@ class FreeRunning(torch.autograd.Function):
                         out=ds[layer, (begin - d) * n : (end - d) * n],
                     )
             row = torch.mm(ds_steps[0][k], inlet, out=dinputs[t])
-            if stack.state_skip:
-                row += dtotal[k, :, channels:]
             cos, sin, rest_ = (row[:, :seen] * slopes_[t]).split_with_sizes(
                 [angles, angles, others], 1
             )
@@ -327,7 +311,7 @@ class FreeRunning(torch.autograd.Function):
         torch.mm(ds[0, begin * n :].T, inputs[begin:].flatten(0, 1), out=dinlet)
         torch.sum(ds[0, begin * n :], 0, out=dinlet_bias)
         dgiven = s.new_empty(n, layers, 2 * channels)
-        dtotal_rows = dtotal.flatten(0, 1)[:, :channels]
+        dtotal_rows = dtotal.flatten(0, 1)
         for layer, d in enumerate(stack.dilations):
             begin = first[layer + 1] * n
             torch.mm(dq[layer, begin:].T, s[layer, begin:], out=dtaps[layer][:, channels:])

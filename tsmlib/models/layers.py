@@ -117,14 +117,12 @@ class CausalDecoder(nn.Module):
         *,
         channels: int = 32,
         head_channels: int = 0,
-        state_skip: int = 0,
         dilations: Sequence[int] = (1, 2, 4, 8, 4),
         plain: bool = False,
     ) -> None:
         super().__init__()
         require_counts(channels=channels)
         require_count("head_channels", head_channels, least=0, most=LARGEST)
-        require_count("state_skip", state_skip, least=0, most=LARGEST)
         require_flag("plain", plain)
         if isinstance(dilations, str) or not isinstance(dilations, Sequence) or not dilations:
             raise TypeError(f"dilations is {dilations!r:.80}; expected a tuple such as (1, 2, 4)")
@@ -144,20 +142,15 @@ class CausalDecoder(nn.Module):
         )
         # V_f, V_g of every layer
         self.codes = nn.Linear(latent_dim, 2 * channels * len(dilations), bias=False)
-        self.state_skip = state_skip
-        if state_skip:
-            self.head = silu_network(channels + input_dim, state_skip, state_skip, output_dim)
-        else:
-            head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
-            self.head = nn.Sequential(
-                nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim)
-            )
+        head = [nn.Linear(channels, head_channels), nn.ReLU()] if head_channels else []
+        self.head = nn.Sequential(
+            nn.ReLU(), *head, nn.Linear(head_channels or channels, output_dim)
+        )
 
     def forward(self, inputs: Tensor, z: Tensor, n: int | None = None) -> Tensor:
         """(B, P, input_dim), (B, dz) -> (B, n, output_dim) at the last ``n`` positions, or all."""
-        first = 0 if n is None else inputs.shape[1] - n
-        _, skips = self._parallel(inputs, z, inputs.shape[1] - first)
-        return self._out(reduce(torch.add, skips), inputs[:, first:])
+        _, skips = self._parallel(inputs, z, inputs.shape[1] if n is None else n)
+        return self.head(reduce(torch.add, skips))
 
     def begin(self, inputs: Tensor, z: Tensor) -> Cache:
         """The cache after the known inputs (B, P, input_dim), P >= 0."""
@@ -169,10 +162,7 @@ class CausalDecoder(nn.Module):
 
     def step(self, inputs: Tensor, codes: Tensor, cache: Cache) -> Tensor:
         """One position: (B, input_dim), ``self.codes(z)`` -> (B, output_dim). Moves ``cache``."""
-        return self._out(advance(self.inlet, self.layers, inputs, codes, cache), inputs)
-
-    def _out(self, total: Tensor, inputs: Tensor) -> Tensor:
-        return self.head(torch.cat([total, inputs], dim=-1) if self.state_skip else total)
+        return self.head(advance(self.inlet, self.layers, inputs, codes, cache))
 
     def _parallel(self, inputs: Tensor, z: Tensor, n: int) -> tuple[list[Tensor], list[Tensor]]:
         """Each layer's inputs, as far as the last ``n`` outputs see them, and its skips there.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.checks import require_counts, require_number
+from tsmlib.checks import require_counts
 from tsmlib.models.base import Step
 from tsmlib.models.energy import distance, energy_score
 from tsmlib.models.features import Features
@@ -68,8 +68,6 @@ class RecurrentTSM(StateModel):
         code_len: H, steps for which a code is held; 10 as in section 5.1.
         segment_len: most steps until the hidden state is read anew from the last ``past_len``
             states; 100, an episode of section 5.1, so that it is carried to the end.
-        mode_weight: weight of the distance of the mode (z = 0) from the truth beside the energy
-            score; 0, for a score that is proper.
     """
 
     stochastic, code_statistics = True, None  # no encoder
@@ -88,14 +86,12 @@ class RecurrentTSM(StateModel):
         past_len: int = 10,
         code_len: int = 10,
         segment_len: int = 100,
-        mode_weight: float = 0.0,
     ) -> None:
         super().__init__(state_dim, action_dim, angles)
         require_counts(hidden=hidden, latent_dim=latent_dim, past_len=past_len)
         require_counts(code_len=code_len, segment_len=segment_len)
         self.hidden, self.latent_dim = hidden, latent_dim
         self.past_len, self.code_len, self.segment_len = past_len, code_len, segment_len
-        self.mode_weight = require_number("mode_weight", mode_weight, 0)
         seen = self.features.dim + action_dim
         self.decoder = Decoder(seen, state_dim, hidden=hidden, latent_dim=latent_dim)
 
@@ -179,9 +175,9 @@ class RecurrentTSM(StateModel):
         return torch.stack([distance(mode, x) for mode, x in parts]).mean()
 
     def loss(self, window: Window, generator: Noise) -> Tensor:
-        """Average mean_i |X_i - x| - |X_1 - X_2| / 2 + w |m - x| over the pieces of H steps.
+        """Average mean_i |X_i - x| - |X_1 - X_2| / 2 over the pieces of H steps.
 
-        X_1, X_2: samples. m: the mode. w: ``mode_weight``. All are free-running through the future.
+        X_1, X_2: samples, free-running through the future.
 
         Args:
             window: past (B, L, .) and future (B, K, .), in physical units; actions in [-1, 1].
@@ -190,20 +186,15 @@ class RecurrentTSM(StateModel):
         Returns:
             The mean over the batch, a scalar without unit.
         """
-        (past, future), draws, decoder = window, SAMPLES + (self.mode_weight > 0), self._recurrent()
-        n, steps = future.actions.shape[:2]
-        x = past.states[:, -1].repeat(draws, 1)
-        z = self._codes(x[: SAMPLES * n], steps, generator)
-        if self.mode_weight > 0:
-            z = torch.cat([z, z.new_zeros(n, *z.shape[1:])])
-        h, c = (part.repeat(draws, 1) for part in decoder.read(past))
-        states = self._run(decoder, x, (h, c), future.actions.repeat(draws, 1, 1), z)
+        (past, future), decoder = window, self._recurrent()
+        x = past.states[:, -1].repeat(SAMPLES, 1)
+        z = self._codes(x, future.actions.shape[1], generator)
+        h, c = (part.repeat(SAMPLES, 1) for part in decoder.read(past))
+        states = self._run(decoder, x, (h, c), future.actions.repeat(SAMPLES, 1, 1), z)
         total = x.new_zeros(())
-        parts = self._parts(states.unflatten(0, (draws, n)), future.states)
+        parts = self._parts(states.unflatten(0, (SAMPLES, -1)), future.states)
         for samples, truth in parts:
-            total = total + energy_score(samples[:SAMPLES], truth)
-            if self.mode_weight > 0:
-                total = total + self.mode_weight * distance(samples[-1], truth)
+            total = total + energy_score(samples, truth)
         return total / len(parts)
 
     def _run(

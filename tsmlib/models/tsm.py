@@ -67,7 +67,6 @@ class TSM(StateModel):
         channels: C of every gated layer; 32, and 64 where there are contacts (A.1).
         head_channels: of the extra 1x1 layer before the last; 0 for none, 128 where there are
             contacts (A.1).
-        state_skip: above 0, width of a head that sees state and action; not in the paper.
         dilations: of the gated layers, in steps; their sum plus one, 20 = 2 H, is what the decoder
             sees.
         plain: neither residual nor skip connections, which section 3.1 finds slightly worse.
@@ -89,7 +88,6 @@ class TSM(StateModel):
         full_encoder: bool = False,
         channels: int = 32,
         head_channels: int = 0,
-        state_skip: int = 0,
         dilations: Sequence[int] = (1, 2, 4, 8, 4),
         plain: bool = False,
     ) -> None:
@@ -110,7 +108,6 @@ class TSM(StateModel):
             latent_dim,
             channels=channels,
             head_channels=head_channels,
-            state_skip=state_skip,
             dilations=dilations,
             plain=plain,
         )

@@ -17,17 +17,6 @@ from tsmlib.rewards import Reward
 from tsmlib.trajectory import Robot, Segment
 
 Predictor = Callable[[Tensor], Tensor]  # actions (C, B, T, du) -> sampled states (S, C, B, T, dx)
-Risk = Callable[[Tensor], Tensor]  # returns of the samples (S, C, B) -> of candidates (C, B)
-
-
-def mean(returns: Tensor) -> Tensor:
-    """Judge by the expectation over samples, as the paper does (Eqs. 2 and 3)."""
-    return returns.mean(0)
-
-
-def worst(returns: Tensor) -> Tensor:
-    """Judge by the worst sample."""
-    return returns.amin(0)
 
 
 class Judge(Protocol):

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from tsmlib.checks import MOST, require_count, require_number, require_seed, require_type
-from tsmlib.planning.base import Plan, Predictor, Risk, SearchSpace, mean
+from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.planning.search import (
     Search,
     best_of,
@@ -97,7 +97,6 @@ def cem(
     iterations: int = 10,
     keep: float = 0.1,
     screened: float = 1.0,
-    risk: Risk = mean,
     seed: int = 0,
     progress: str = "",
 ) -> Plan:
@@ -116,8 +115,6 @@ def cem(
         keep: share of the old mean and deviation that stays, against collapse; below 1.
         screened: share of the candidates that all parts of an ``EnsemblePredictor`` judge, those
             best by its first part; never fewer than the elites. 1: all candidates.
-        risk: of the returns of the samples (S, C, B) what a candidate is judged by; ``base.mean``
-            or ``base.worst``.
         seed: of the candidates, 0 or above.
         progress: title of the progress bar; none without.
 
@@ -143,7 +140,7 @@ def cem(
         return centre, keep * deviation + (1 - keep) * best.std(0)
 
     judged = max(elites, round(screened * candidates))
-    search = Search(predict, reward, space, start, risk=risk, judged=judged)
+    search = Search(predict, reward, space, start, judged=judged)
     return _sample(search, refit, candidates, iterations, seed, progress)
 
 
@@ -157,7 +154,6 @@ def mppi(
     iterations: int = 10,
     temperature: float = 0.3,
     shrink: float = 0.8,
-    risk: Risk = mean,
     seed: int = 0,
     progress: str = "",
 ) -> Plan:
@@ -177,7 +173,6 @@ def mppi(
         iterations: at least 1.
         temperature: in standard deviations of the candidates' returns, above 0.
         shrink: of the noise from one iteration to the next, above 0 and at most 1.
-        risk: of the returns of the samples (S, C, B) what a candidate is judged by.
         seed: of the candidates, 0 or above.
         progress: title of the progress bar; none without.
 
@@ -199,7 +194,7 @@ def mppi(
         weights = ((returns - returns.max(0).values) / (temperature * spread)).softmax(0)
         return (like(weights, parameters) * parameters).sum(0), shrink * deviation
 
-    search = Search(predict, reward, space, start, risk=risk)
+    search = Search(predict, reward, space, start)
     return _sample(search, refit, candidates, iterations, seed, progress)
 
 

@@ -21,7 +21,6 @@ from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec, is_arm
 from tsmlib.envs.stepping import UnsupportedEnvironment, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
-from tsmlib.models.mixture import Mixture
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
 from tsmlib.sampling import Noise, NoNoise, SeparateNoise, SharedNoise
@@ -148,8 +147,8 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
         past: what was observed, states (B, L, dx) and actions (B, L, du), L at least
             ``model.past_len``; ``task.past(model.past_len)`` at the start of an episode.
         samples: 0 rolls out the mode (z = 0) of every candidate, S = 1; of an ensemble the mode of
-            each member, of a ``Mixture`` those of all its models. n draws n samples of each, with
-            the same noise for every candidate and call.
+            each member. n draws n samples of each, with the same noise for every candidate and
+            call.
         seed: of the noise, 0 or above.
 
     Returns:
@@ -174,12 +173,6 @@ def model_predictor(model: Model, past: Segment, *, samples: int = 0, seed: int 
             return SharedNoise(torch.Generator().manual_seed(seed), samples * len(past.states))
 
         return ModelPredictor(model, past, samples, common)
-    if isinstance(model, Mixture):
-        parts: list[Predictor] = []
-        for part in model.models:
-            predict = model_predictor(part, past)
-            parts += predict.each if isinstance(predict, EnsemblePredictor) else [predict]
-        return EnsemblePredictor(tuple(parts))
     if (n := members(model)) > 1:
         alone = (partial(NoNoise, sys.maxsize, first=k) for k in range(n))
         together = ModelPredictor(model, past, n, partial(NoNoise, len(past.states)))

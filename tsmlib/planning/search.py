@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tsmlib.checks import MOST, as_tensor, described, require_callable, require_count
 from tsmlib.models.layers import BLOCK
-from tsmlib.planning.base import Plan, Predictor, Risk, SearchSpace, mean
+from tsmlib.planning.base import Plan, Predictor, SearchSpace
 from tsmlib.planning.predictors import EnsemblePredictor
 from tsmlib.rewards import Reward, require_reward, rewarded
 
@@ -35,27 +35,19 @@ def expected_return(states: Tensor, actions: Tensor, reward: Reward) -> Tensor:
 
 
 @torch.no_grad()
-def evaluate(
-    predict: Predictor,
-    reward: Reward,
-    space: SearchSpace,
-    parameters: Tensor,
-    *,
-    risk: Risk = mean,
-) -> Tensor:
-    """What candidates are judged by.
+def evaluate(predict: Predictor, reward: Reward, space: SearchSpace, parameters: Tensor) -> Tensor:
+    """What candidates are judged by, the mean over samples as in the paper (Eqs. 2 and 3).
 
     Args:
         predict: of actions (C, B, T, du) the states (S, C, B, T, dx).
         reward: of states and actions, one number per step.
         space: decodes the parameters.
         parameters: (C, B, *shape).
-        risk: of the samples' returns (S, C, B) one number per candidate.
 
     Returns:
         (C, B).
     """
-    return risk(_returns(predict, reward, _decoded(space, parameters)))
+    return _returns(predict, reward, _decoded(space, parameters)).mean(0)
 
 
 def like(values: Tensor, parameters: Tensor) -> Tensor:
@@ -89,7 +81,6 @@ class Search:
         reward: of states and actions, one number per step.
         space: what is searched.
         start: parameters (C, B, *shape), or the number of targets, to begin at zero.
-        risk: of the samples' returns (S, C, B) one number per candidate.
         judged: candidates that all parts of an ``EnsemblePredictor`` judge, of many; 0: all.
 
     Raises:
@@ -104,15 +95,13 @@ class Search:
         space: SearchSpace,
         start: Tensor | int,
         *,
-        risk: Risk = mean,
         judged: int = 0,
     ) -> None:
         require_predictor(predict)
         require_reward(reward)
         require_space(space)
-        require_callable("risk", risk, "tsmlib.planning.base.mean or worst")
         self.predict, self.reward, self.space = predict, reward, space
-        self.risk, self.judged = risk, judged
+        self.judged = judged
         self.start = _starts(space, start)
         self.began = time.perf_counter()
         self.parameters = self.start[0].clone()
@@ -121,7 +110,7 @@ class Search:
 
     def returns_of(self, parameters: Tensor) -> Tensor:
         """What candidates (C, B, *shape) are judged by: (C, B)."""
-        return evaluate(self.predict, self.reward, self.space, parameters, risk=self.risk)
+        return evaluate(self.predict, self.reward, self.space, parameters)
 
     def returns_of_many(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """``returns_of``, and which candidates were judged, (C, B) bool each.
@@ -138,7 +127,7 @@ class Search:
         best = rough.topk(self.judged, dim=0).indices  # (judged, B)
         chosen = actions.gather(0, like(best, actions).expand(-1, -1, *actions.shape[2:]))
         judgements = [_returns(other, self.reward, chosen) for other in others]
-        returns = self.risk(torch.cat([rough.gather(0, best)[None], *judgements]))
+        returns = torch.cat([rough.gather(0, best)[None], *judgements]).mean(0)
         judged_by_all = torch.zeros_like(rough, dtype=torch.bool).scatter(0, best, True)
         return torch.full_like(rough, -torch.inf).scatter(0, best, returns), judged_by_all
 

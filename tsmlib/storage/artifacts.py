@@ -9,6 +9,7 @@ byte is found when it is loaded. Nothing is pickled, and nothing in a file is ex
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 from collections.abc import Mapping
@@ -269,7 +270,7 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
         )
     try:
         with torch.device("meta"):
-            model = cls(**header["config"])
+            model = cls(**_known(header["config"], cls))
         differing = differences(_layout(tensors), _layout(model.state_dict()))
         differing += [f"{name} is unknown" for name in tensors.keys() - model.state_dict().keys()]
         fingerprint = {**header.get("fingerprint", {})}
@@ -286,6 +287,12 @@ def load_model(path: PathLike, cls: type[M], *, expect: Mapping[str, Json] | Non
     if robot is not None and hasattr(model, "robot"):
         model.robot = robot  # type: ignore[assignment] # of any model
     return model
+
+
+def _known(config: Mapping[str, Json], cls: type) -> dict[str, Json]:
+    """Arguments without those that are off, 0 or False, and that the class no longer has."""
+    names = inspect.signature(cls).parameters
+    return {name: value for name, value in config.items() if value or name in names}
 
 
 def _robot(header: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> Robot | None:
