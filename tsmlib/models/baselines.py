@@ -4,6 +4,8 @@ OneStep    x_{t+1} = f(x_t, u_t)                  (i) one-step loss, (ii) multi-
 LSTM       x_{t+1}, h_{t+1} = f(x_t, u_t, h_t)    (iii) multi-step loss, h warmed up on the past
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import torch
@@ -16,6 +18,12 @@ from tsmlib.models.recurrence import Recurrent
 from tsmlib.models.state_model import StateModel
 from tsmlib.sampling import Noise
 from tsmlib.trajectory import Segment, Window, states_before
+
+
+def _free_running_error(model: OneStep | LSTM, window: Window) -> Tensor:
+    """Squared error of the features that a model reaches on its own predictions."""
+    predicted = predict_segment(model, window.past, window.future.actions)
+    return model.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
 
 
 class OneStep(StateModel):
@@ -96,8 +104,7 @@ class OneStep(StateModel):
         Returns:
             The mean over the batch, a scalar without unit.
         """
-        predicted = predict_segment(self, window.past, window.future.actions)
-        return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
+        return _free_running_error(self, window)
 
 
 class LSTM(StateModel):
@@ -182,5 +189,4 @@ class LSTM(StateModel):
         Returns:
             The mean over the batch, a scalar without unit.
         """
-        predicted = predict_segment(self, window.past, window.future.actions)
-        return self.features.difference(predicted, window.future.states).square().sum((1, 2)).mean()
+        return _free_running_error(self, window)

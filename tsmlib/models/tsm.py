@@ -293,14 +293,7 @@ class TSM(StateModel):
         Raises:
             ValueError: the future is not a whole number of segments.
         """
-        past, loss = window.past, window.past.states.new_zeros(())
-        for future in self._segments(window.future):
-            z, kl = self._posterior_code(past, future, generator)
-            predicted = self.decode(past, future.actions, z)
-            error = self.features.difference(predicted, future.states)
-            loss = loss + (self._misfit(error) + self.beta * kl).mean()
-            past = past.then(Segment(predicted, future.actions)).last(self.past_len)
-        return loss
+        return self._bound(window, generator, forced=False)
 
     def teacher_forced_loss(self, window: Window, generator: torch.Generator) -> Tensor:
         """Sum residual of one-step increments and beta KL over segments, true states as inputs.
@@ -315,13 +308,23 @@ class TSM(StateModel):
         Raises:
             ValueError: the future is not a whole number of segments.
         """
+        return self._bound(window, generator, forced=True)
+
+    def _bound(self, window: Window, generator: torch.Generator, *, forced: bool) -> Tensor:
+        """A.1, with the model's own or, ``forced``, with true states as inputs."""
         past, loss = window.past, window.past.states.new_zeros(())
         for future in self._segments(window.future):
             z, kl = self._posterior_code(past, future, generator)
-            predicted = self.decode_teacher_forced(Window(past, future), z)
-            error = self.features.increments(predicted, future.states)
+            if forced:
+                seen = future
+                predicted = self.decode_teacher_forced(Window(past, future), z)
+                error = self.features.increments(predicted, future.states)
+            else:
+                predicted = self.decode(past, future.actions, z)
+                seen = Segment(predicted, future.actions)
+                error = self.features.difference(predicted, future.states)
             loss = loss + (self._misfit(error) + self.beta * kl).mean()
-            past = past.then(future).last(self.past_len)
+            past = past.then(seen).last(self.past_len)
         return loss
 
     def energy_loss(self, window: Window, generator: Noise) -> Tensor:
