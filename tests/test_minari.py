@@ -8,16 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.spaces import Box, Dict, Discrete, Space
 
-import tsmlib as tsm
-from tsmlib.contrib.minari import load_minari, save_minari
+from tsmlib.contrib.minari import load_minari
 from tsmlib.storage.files import StoreError
-from tsmlib.trajectory import Trajectories
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
@@ -193,47 +189,6 @@ def test_another_kind_of_data_is_refused_by_name(options: dict[str, Any], messag
     ("change", "message"),
     [
         (
-            {
-                "tsmlib": {
-                    "env": 3,
-                    "dt": 1,
-                    "names": ["a", "b", "c"],
-                    "units": ["m"] * 3,
-                    "angles": [],
-                }
-            },
-            "env is 3, expected a text",
-        ),
-        (
-            {
-                "tsmlib": {
-                    "env": "a",
-                    "dt": -1,
-                    "names": ["a", "b", "c"],
-                    "units": ["m"] * 3,
-                    "angles": [],
-                }
-            },
-            "dt is -1",
-        ),
-        (
-            {
-                "tsmlib": {
-                    "env": "a",
-                    "dt": 1,
-                    "names": ["a", "b", "c"],
-                    "units": ["m"] * 3,
-                    "angles": [3],
-                }
-            },
-            "angles are",
-        ),
-        (
-            {"tsmlib": {"env": "a", "dt": 1, "names": ["a"] * 2, "units": ["m"] * 3, "angles": []}},
-            "expected one of each",
-        ),
-        ({"tsmlib": []}, "no usable Minari"),
-        (
             {"env_spec": json.dumps({"id": ["os:system"]})},
             "no usable Minari data set",
         ),
@@ -246,65 +201,3 @@ def test_metadata_that_say_something_else_are_refused(change: dict[str, Any], me
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(StoreError, match=message):
         load_minari(folder)
-
-
-def test_ours_comes_back_as_it_was(recwarn: pytest.WarningsRecorder) -> None:
-    rng = np.random.default_rng(0)
-    sizes = (4, 9, 1)
-    data = Trajectories(
-        [rng.normal(size=(n + 1, DX)).astype(np.float32) for n in sizes],
-        [rng.uniform(-1, 1, (n, DU)).astype(np.float32) for n in sizes],
-        "my-cart",
-        0.05,
-        ("a", "b", "c"),
-        ("m", "m/s", "rad"),
-        (2,),
-        terminated=(False, True, True),
-    )
-    folder = save_minari("made/cart-v0", data, rewards=np.arange(27.0).reshape(3, 9))
-    again = load_minari(folder)
-    for name in ("env", "dt", "names", "units", "angles", "lengths", "terminated"):
-        assert getattr(again, name) == getattr(data, name), name
-    np.testing.assert_array_equal(again.flat_states, data.flat_states)
-    np.testing.assert_array_equal(again.flat_actions, data.flat_actions)
-    theirs = list(minari.load_dataset("made/cart-v0").iterate_episodes())
-    assert [episode.rewards.tolist() for episode in theirs] == [[0, 1, 2, 3], [*range(9, 18)], [18]]
-    assert [(episode.terminations[-1], episode.truncations[-1]) for episode in theirs] == [
-        (0, 1),
-        (1, 0),
-        (1, 0),
-    ]
-    assert not [warning for warning in recwarn.list if "second" in str(warning.message)]
-
-
-def test_data_of_an_environment_are_written_in_its_own_units_and_replay_in_it() -> None:
-    torques = tsm.smooth_torques(
-        3, 20, generator=torch.Generator().manual_seed(0), action_dim=1, rms=0.5, dt=0.05
-    )
-    data = tsm.collect(
-        gymnasium.make_vec("Pendulum-v1", num_envs=3), tsm.open_loop(torques), horizon=20, seed=7
-    )
-    save_minari("made/pendulum-v0", data)
-    again = load_minari("made/pendulum-v0")
-    np.testing.assert_allclose(again.actions, data.actions, atol=1e-6)
-    np.testing.assert_array_equal(again.states, data.states)
-    theirs = minari.load_dataset("made/pendulum-v0")
-    env = theirs.recover_environment()
-    assert env.action_space.high.tolist() == [2.0]
-    episode = next(iter(theirs.iterate_episodes()))
-    assert np.abs(episode.actions).max() > 1.0
-    env.reset(seed=7)
-    np.testing.assert_allclose(
-        [env.step(u)[0] for u in episode.actions], episode.observations[1:], atol=1e-5
-    )
-
-
-def test_data_of_an_arm_and_of_its_variant_come_back() -> None:
-    for number, env in enumerate(
-        ("tsm/Reacher-v0", tsm.envs.variant("tsm/Reacher-v0", damping=2.0))
-    ):
-        arms = gymnasium.make_vec(env, num_envs=2)
-        data = tsm.collect(arms, tsm.open_loop(torch.zeros(2, 5, 2)), horizon=5, seed=0)
-        again = load_minari(save_minari(f"made/arm-v{number}", data))
-        assert (again.env, again.dt, again.angles) == (env, 0.02, (0, 1))
-        np.testing.assert_array_equal(again.states, data.states)

@@ -32,8 +32,8 @@ from reproduction.episodes import load_data
 from reproduction.runs import Run, env_id
 from reproduction.scores import OPEN, SEGMENTS, STARTS, summarised
 from reproduction.symmetry import symmetric
-from tsmlib.contrib.one_step_ensemble import OneStepEnsemble
 from tsmlib.evaluation.prediction import score
+from tsmlib.models.ensemble import Members
 from tsmlib.models.features import Features
 from tsmlib.trajectory import Trajectories
 
@@ -70,7 +70,7 @@ def transitions(data: Trajectories, unit: Tensor) -> tuple[np.ndarray, np.ndarra
     return before, data.actions.reshape(-1, data.actions.shape[2]), after
 
 
-class Peer(OneStepEnsemble):
+class Peer(Members):
     """An ensemble of one-step networks fed by ``Features``, by trajectory sampling with a fixed
     member (TS-inf).
 
@@ -79,21 +79,20 @@ class Peer(OneStepEnsemble):
     """
 
     def __init__(self, network: Network, features: Features, *, members: int = MEMBERS) -> None:
-        self.network, self.features, self.members, self.unit = (
-            network,
-            features,
-            members,
-            unit_of(features),
-        )
+        self.network, self.features, self.members = network, features, members
+        # What never changes stays exactly as it is.
+        self.scale = unit_of(features) * features.moving
 
     @torch.no_grad()
-    def step(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(M, R, dx), (M, R, du) -> mean and standard deviation of the increments (M, R, dx),
-        physical units.
-        """
-        mean, log_variance = self.network(torch.cat([self.features(x), u], dim=-1))
-        scale = self.unit * self.features.moving  # what never changes stays exactly as it is
-        return scale * mean, None if log_variance is None else scale * (0.5 * log_variance).exp()
+    def increments(
+        self, x: Tensor, u: Tensor, which: slice = slice(None)
+    ) -> tuple[Tensor, Tensor | None]:
+        """(M, R, dx), (M, R, du) -> mean and log variance of the increments (M, R, dx)."""
+        inputs = torch.cat([self.features(x), u], dim=-1)
+        every = inputs.new_zeros(self.members, *inputs.shape[1:])
+        every[which] = inputs
+        mean, log_variance = self.network(every)
+        return mean[which], None if log_variance is None else log_variance[which]
 
 
 # Theirs -------------------------------------------------------------------------------------------
@@ -262,15 +261,15 @@ def check(model: Any, peer: Peer, data: Trajectories) -> None:
     """End with an error where ``peer`` does not do what mbrl-lib's own ``sample`` does, on one step
     of ``data``.
     """
-    before, actions, _ = transitions(data, peer.unit)
+    before, actions, _ = transitions(data, unit := unit_of(peer.features))
     rows = torch.randperm(len(actions))[: 20 * MEMBERS]
     x, u = torch.from_numpy(before)[rows], torch.from_numpy(actions)[rows]
     state = model.reset(x, rng=torch.Generator())
     theirs, *_ = model.sample(u, state, deterministic=True)
     members = state["propagation_indices"].view(MEMBERS, -1)  # (M, R): which rows each member takes
-    mean, _ = peer.step((x * peer.unit)[members], u[members])
+    mean, _ = peer.increments((x * unit)[members], u[members])
     moving = peer.features.moving
-    off = ((mean / peer.unit) - (theirs - x)[members])[..., moving].abs().max().item()
+    off = (mean - (theirs - x)[members])[..., moving].abs().max().item()
     if not off < 1e-3:  # x in units of its increments is up to 1e3, in single precision
         raise SystemExit(
             f"the adapter is {off:.1e} standard deviations off mbrl-lib's own prediction"

@@ -1,4 +1,4 @@
-"""Minari data sets: read as ``Trajectories``, and written from them. Needs tsmlib[minari].
+"""Minari data sets, read as ``Trajectories``. Needs tsmlib[minari].
 
 An HDF5 file from a stranger can point at other files on this machine and declare terabytes in a
 kilobyte, and Minari imports the environment that a data set names where it states no spaces. So
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tsmlib.checks import as_tensor, require_type
+from tsmlib.envs.ids import stated_id
 from tsmlib.storage.files import Json, PathLike, StoreError, read_bytes
 from tsmlib.trajectory import Trajectories
 
@@ -32,17 +32,17 @@ def load_minari(
     dt: float | None = None,
     names: tuple[str, ...] | None = None,
     units: tuple[str, ...] | None = None,
-    angles: tuple[int, ...] | None = None,
+    angles: tuple[int, ...] = (),
 ) -> Trajectories:
     """Read the episodes of a local Minari data set; rewards are not read.
 
     Args:
         path: its folder, or its id where Minari keeps it.
         env: id of the environment; by default the data set's, or the name of the data set.
-        dt: seconds per step; by default that of ``save_minari``, else one with a warning.
-        names: one word per state dimension; by default as saved, else x0, x1, ...
-        units: one per state dimension; by default as saved, else none.
-        angles: state dimensions that are angles in radians; by default as saved, else none.
+        dt: seconds per step; by default one, with a warning.
+        names: one word per state dimension; x0, x1, ... by default.
+        units: one per state dimension; none by default.
+        angles: state dimensions that are angles in radians.
 
     Returns:
         Trajectories whose actions are scaled from the bounds of the action space to [-1, 1].
@@ -56,88 +56,27 @@ def load_minari(
     try:
         metadata = json.loads(read_bytes(folder / "metadata.json"))
         low, high = _require_plain(folder, metadata)
-        meaning = _meaning(metadata, len(json.loads(metadata["observation_space"])["low"]))
-        given = {"env": env, "dt": dt, "names": names, "units": units, "angles": angles}
-        meaning |= {name: value for name, value in given.items() if value is not None}
+        if env is None:
+            stated = metadata.get("env_spec")
+            env = metadata["dataset_id"] if stated is None else stated_id(json.loads(stated))
         states, actions, terminated = [], [], []
         for x, u, ended in _episodes(minari.MinariDataset(folder), low, high):
             states.append(x)
             actions.append(u)
             terminated.append(ended)
-        if meaning["dt"] is None:
+        if dt is None:
             warnings.warn(
                 f"{place} does not say how long a step is; one step counts as one second: "
                 "give dt=...",
                 stacklevel=2,
             )
-            meaning["dt"] = 1.0
-        return Trajectories(states, actions, **meaning, terminated=terminated)
-    except (
-        Exception
-    ) as error:  # what the files say goes through other libraries, which may fail in any way
+            dt = 1.0
+        return Trajectories(states, actions, env, dt, names, units, angles, terminated=terminated)
+    except Exception as error:  # of other libraries, which may fail in any way
         raise StoreError(
             f"{place} holds no usable Minari data set: {str(error) or repr(error):.500}. Expected "
             "flat Box spaces and plain numbers in main_data.hdf5, as Minari itself writes them."
         ) from error
-
-
-def save_minari(
-    dataset_id: str, trajectories: Trajectories, rewards: np.ndarray | None = None
-) -> Path:
-    """Write trajectories as a local Minari data set, in $MINARI_DATASETS_PATH or ~/.minari.
-
-    Args:
-        dataset_id: such as "tsm/reacher/random-v0".
-        trajectories: actions are written in the bounds of the environment's action space where
-            Gymnasium knows its id, else in [-1, 1].
-        rewards: (N, T) of each step; zeros by default.
-
-    Returns:
-        The folder of the data set.
-    """
-    from gymnasium.spaces import Box
-
-    from tsmlib.envs.stepping import within_bounds
-
-    require_type("trajectories", trajectories, Trajectories, "tsmlib.Trajectories")
-    minari, t = _minari(dataset_id), trajectories
-    buffer = minari.data_collector.EpisodeBuffer
-    size = (len(t), t.horizon)
-    given = np.zeros(size) if rewards is None else as_tensor("rewards", rewards, size).numpy()
-    made_by, actions = _environment(t), Box(-1, 1, (t.robot.action_dim,))
-    if made_by is not None:
-        actions = made_by.action_space
-    ended = t.terminated
-    episodes = []
-    for i, steps in enumerate(t.steps):
-        last = np.arange(steps) == steps - 1
-        x, u = t.episode(i)
-        u = within_bounds(u, actions)
-        episodes.append(
-            buffer(
-                observations=x,
-                actions=u,
-                rewards=given[i, :steps],
-                terminations=last & ended[i],
-                truncations=last & (not ended[i]),
-            )
-        )
-    fields = ", ".join(f"{name} ({unit})" for name, unit in zip(t.names, t.units, strict=True))
-    with warnings.catch_warnings():
-        # Of author, licence and evaluation, which data need not have.
-        warnings.simplefilter("ignore")
-        made = minari.create_dataset_from_buffers(
-            dataset_id,
-            episodes,
-            env=None if made_by is None else made_by.spec,
-            observation_space=Box(-np.inf, np.inf, (t.robot.state_dim,)),
-            action_space=actions,
-            description=f"{t.env}, {t.dt} s per step. Observations: {fields}.",
-        )
-        about = {"env": t.env, "dt": t.dt, "names": t.names, "units": t.units, "angles": t.angles}
-        about["jumps"] = t.jumps
-        made.storage.update_metadata({"tsmlib": about})
-    return Path(made.spec.data_path).parent
 
 
 def _minari(what: PathLike) -> ModuleType:
@@ -149,51 +88,6 @@ def _minari(what: PathLike) -> ModuleType:
             f"{what}: Minari data sets need minari and h5py: pip install 'tsmlib[minari]'"
         ) from None
     return minari
-
-
-def _environment(t: Trajectories) -> Any:
-    """The Gymnasium environment of these data, where its id is known and its spaces fit."""
-    import gymnasium
-
-    from tsmlib.envs.stepping import UnsupportedEnvironment, make
-
-    if ":" in t.env:
-        return None
-    try:
-        env = make(t.env)
-    except (gymnasium.error.Error, UnsupportedEnvironment, ValueError):
-        return None
-    spaces = (env.observation_space, env.action_space)
-    fits = [getattr(space, "shape", None) for space in spaces] == [
-        (t.robot.state_dim,),
-        (t.robot.action_dim,),
-    ]
-    bounded = all(np.isfinite(getattr(spaces[1], side, np.inf)).all() for side in ("low", "high"))
-    return env if fits and bounded else None
-
-
-def _meaning(metadata: Mapping[str, Json], dx: int) -> dict[str, Any]:
-    """What the metadata say of environment and states. ValueError for nonsense."""
-    about: Any = metadata.get("tsmlib")
-    if about is None:
-        stated: Any = metadata.get("env_spec")
-        env = metadata["dataset_id"]
-        if stated is not None:
-            from tsmlib.envs.ids import stated_id
-
-            env = stated_id(json.loads(stated))
-        about = {
-            "env": env,
-            "dt": None,
-            "names": [f"x{d}" for d in range(dx)],
-            "units": [""] * dx,
-            "angles": [],
-        }
-    if not isinstance(about["env"], str):
-        raise ValueError(f"env is {about['env']!r:.80}, expected a text")
-    lists = {name: tuple(about[name]) for name in ("names", "units", "angles")}
-    jumps = bool(about.get("jumps"))
-    return {"env": about["env"], "dt": about["dt"], "jumps": jumps} | lists
 
 
 def _episodes(

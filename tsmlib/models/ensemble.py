@@ -17,63 +17,18 @@ from tsmlib.sampling import Noise, draw_members, random_indices, standard_normal
 from tsmlib.trajectory import Segment, Window, states_before
 
 
-class Ensemble(StateModel, EnsembleModel):
-    """PETS: networks that differ in their first weights and in the order of their data.
+class Members(EnsembleModel):
+    """M one-step networks as one model: trajectory sampling with a fixed member (TS-inf of PETS).
 
-    ``Ensemble.for_data(data)`` makes one that fits the data. Each member states a Gaussian.
-
-    Args:
-        state_dim: dx, dimensions of a state.
-        action_dim: du, dimensions of an action.
-        angles: indices of state dimensions that are angles in radians; the model sees their cosine
-            and sine.
-        gaussian: whether each member states a variance and is trained by likelihood, as in PETS; if
-            not, by squared error, and only the choice of the member is random.
-        members: M, number of networks; 5 in PETS.
-        hidden: size of each hidden layer; 200 in PETS.
-        layers: hidden layers; 3 in PETS.
-        segment_len: most steps for which a row keeps its member; 100, an episode of section 5.1,
-            which makes it trajectory sampling with a fixed member.
+    Attributes:
+        members: M.
+        segment_len: most steps for which a row keeps its member.
+        gaussian: whether members may state a variance.
+        scale: of the increments, in physical units.
     """
 
-    past_len, stochastic = 1, True
-
-    def __init__(
-        self,
-        state_dim: int,
-        action_dim: int,
-        *,
-        angles: Sequence[int] = (),
-        gaussian: bool = True,
-        members: int = 5,
-        hidden: int = 200,
-        layers: int = 3,
-        segment_len: int = 100,
-    ) -> None:
-        super().__init__(state_dim, action_dim, angles)
-        require_counts(members=members, hidden=hidden, layers=layers, segment_len=segment_len)
-        self.gaussian = require_flag("gaussian", gaussian)
-        self.members, self.segment_len = members, segment_len
-        widths = [
-            self.features.dim + action_dim,
-            *[hidden] * layers,
-            state_dim * (2 if gaussian else 1),
-        ]
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for i, o in pairwise(widths):
-            drawn = [nn.Linear(i, o) for _ in range(members)]
-            # (M, i, o)
-            self.weights.append(
-                nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn]))
-            )
-            # (M, 1, o)
-            self.biases.append(
-                nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn]))
-            )
-        self.output_layers = (f"weights.{layers}", f"biases.{layers}")
-        if gaussian:  # limits of the stated log variance, learned as in PETS
-            self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
-            self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
+    segment_len, past_len, stochastic, gaussian = 100, 1, True, True
+    scale: Tensor | float = 1.0
 
     def increments(
         self, x: Tensor, u: Tensor, which: slice = slice(None)
@@ -86,17 +41,10 @@ class Ensemble(StateModel, EnsembleModel):
             which: the members that are asked, M of them.
 
         Returns:
-            Mean and log variance (M, R, dx), in units of ``step_std``; None for the log variance of
-            members that are not Gaussian.
+            Mean and log variance (M, R, dx), in units of ``scale``; None for the log variance of
+            members that state none.
         """
-        s = torch.cat([self.features(x), u], dim=-1)
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            s = torch.baddbmm(bias[which], F.silu(s) if i else s, weight[which])
-        if not self.gaussian:
-            return s, None
-        mean, log_variance = s.chunk(2, dim=-1)
-        log_variance = self.log_variance_max - F.softplus(self.log_variance_max - log_variance)
-        return mean, self.log_variance_min + F.softplus(log_variance - self.log_variance_min)
+        raise NotImplementedError
 
     def begin(self, past: Segment, *, generator: Noise | None = None) -> Step:
         """Go on from the last state, by the mean of all members or by one member per row.
@@ -160,10 +108,85 @@ class Ensemble(StateModel, EnsembleModel):
                 if log_variance is not None:
                     stated = (0.5 * log_variance.flatten(0, 1).index_select(0, slot)).exp()
                     change = change + stated * noise[:, taken]
-            x, taken = x + self.features.step_std * change, taken + 1
+            x, taken = x + self.scale * change, taken + 1
             return x
 
         return step
+
+
+class Ensemble(StateModel, Members):
+    """PETS: networks that differ in their first weights and in the order of their data.
+
+    ``Ensemble.for_data(data)`` makes one that fits the data. Each member states a Gaussian.
+
+    Args:
+        state_dim: dx, dimensions of a state.
+        action_dim: du, dimensions of an action.
+        angles: indices of state dimensions that are angles in radians; the model sees their cosine
+            and sine.
+        gaussian: whether each member states a variance and is trained by likelihood, as in PETS; if
+            not, by squared error, and only the choice of the member is random.
+        members: M, number of networks; 5 in PETS.
+        hidden: size of each hidden layer; 200 in PETS.
+        layers: hidden layers; 3 in PETS.
+        segment_len: most steps for which a row keeps its member; 100, an episode of section 5.1,
+            which makes it trajectory sampling with a fixed member.
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        angles: Sequence[int] = (),
+        gaussian: bool = True,
+        members: int = 5,
+        hidden: int = 200,
+        layers: int = 3,
+        segment_len: int = 100,
+    ) -> None:
+        super().__init__(state_dim, action_dim, angles)
+        require_counts(members=members, hidden=hidden, layers=layers, segment_len=segment_len)
+        self.gaussian = require_flag("gaussian", gaussian)
+        self.members, self.segment_len = members, segment_len
+        widths = [
+            self.features.dim + action_dim,
+            *[hidden] * layers,
+            state_dim * (2 if gaussian else 1),
+        ]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for i, o in pairwise(widths):
+            drawn = [nn.Linear(i, o) for _ in range(members)]
+            # (M, i, o)
+            self.weights.append(
+                nn.Parameter(torch.stack([linear.weight.detach().T for linear in drawn]))
+            )
+            # (M, 1, o)
+            self.biases.append(
+                nn.Parameter(torch.stack([linear.bias.detach()[None] for linear in drawn]))
+            )
+        self.output_layers = (f"weights.{layers}", f"biases.{layers}")
+        if gaussian:  # limits of the stated log variance, learned as in PETS
+            self.log_variance_max = nn.Parameter(torch.full((state_dim,), 0.5))
+            self.log_variance_min = nn.Parameter(torch.full((state_dim,), -10.0))
+
+    @property
+    def scale(self) -> Tensor:  # type: ignore[override]
+        """The deviation of one step."""
+        return self.features.step_std
+
+    def increments(
+        self, x: Tensor, u: Tensor, which: slice = slice(None)
+    ) -> tuple[Tensor, Tensor | None]:
+        """Predict the increments of a step by each member, see ``Members``."""
+        s = torch.cat([self.features(x), u], dim=-1)
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            s = torch.baddbmm(bias[which], F.silu(s) if i else s, weight[which])
+        if not self.gaussian:
+            return s, None
+        mean, log_variance = s.chunk(2, dim=-1)
+        log_variance = self.log_variance_max - F.softplus(self.log_variance_max - log_variance)
+        return mean, self.log_variance_min + F.softplus(log_variance - self.log_variance_min)
 
     def loss(self, window: Window, generator: torch.Generator) -> Tensor:
         """Compute the negative log-likelihood, or squared error, of one-step increments.
