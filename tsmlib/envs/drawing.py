@@ -75,7 +75,7 @@ def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 def drawable(env_id: str) -> bool:
     """Whether ``frames`` can draw this environment."""
-    return env_id == "Pendulum-v1" or env_id in CONTROL_IDS or _hidden_positions(env_id) is not None
+    return env_id == "Pendulum-v1" or _hidden_positions(env_id) is not None
 
 
 def frames(env_id: str, states: np.ndarray) -> np.ndarray:
@@ -84,15 +84,13 @@ def frames(env_id: str, states: np.ndarray) -> np.ndarray:
     """
     if env_id == "Pendulum-v1":
         return np.stack([_pendulum(state) for state in states])
-    if env_id in CONTROL_IDS:
-        return _of_control(_robot(env_id), np.asarray(states, np.float64))
     hidden = _hidden_positions(env_id)
     if hidden is None:
         raise ValueError(
             f"{env_id} cannot be drawn from its observations; film it by its own "
             "render_mode='rgb_array'"
         )
-    return _from_the_side(_robot(env_id), np.asarray(states, np.float64), hidden)
+    return _of_mujoco(_robot(env_id), np.asarray(states, np.float64), hidden)
 
 
 def _pendulum(state: np.ndarray) -> np.ndarray:
@@ -104,75 +102,60 @@ def _pendulum(state: np.ndarray) -> np.ndarray:
     return picture.array()
 
 
-def _from_the_side(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
-    """hidden: how many of the first positions are not observed; they are summed up from their
+def _of_mujoco(robot: Any, states: np.ndarray, hidden: int) -> np.ndarray:
+    """A robot of MuJoCo from the side, or from above where it has a target, the reacher of ``dmc``.
+
+    hidden: how many of the first positions are not observed; they are summed up from their
     velocities.
     """
     import mujoco
 
-    model, data = robot.model, mujoco.MjData(robot.model)
-    speeds = states[:, -model.nv :]
-    unseen = np.cumsum(speeds[:, :hidden], 0) * robot.dt
+    model, data, pictures = robot.model, mujoco.MjData(robot.model), []
+    view, target = getattr(robot, "view", None), getattr(robot, "target_radius", 0.0)
+    axes = [0, 1] if target else [0, 2]
+    unseen = np.cumsum(states[:, -model.nv :][:, :hidden], 0) * robot.dt
     positions = np.concatenate([unseen, states[:, : model.nq - hidden]], 1)
     bodies = np.flatnonzero(model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))
-    found = []
-    for position in positions:
+    for state, position in zip(states, positions, strict=True):
         data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
-        middle = data.geom_xpos[bodies][:, [0, 2]]
-        picture = _Picture(float(position[0]) - ACROSS / 2, -BELOW)
-        picture.ground()
-        for place, i in sorted(
-            zip(middle, bodies, strict=True), key=lambda pair: -data.geom_xpos[pair[1], 1]
-        ):
-            half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[[0, 2], 2]
-            # Left leg, or hind leg.
-            second = "left" in (name := model.geom(i).name) or name.startswith("b")
-            picture.rod(
-                np.stack([place - half, place + half]),
-                float(model.geom_size[i, 0]),
-                OTHER if second else BODY,
-            )
-        found.append(picture.array())
-    return np.stack(found)
-
-
-def _of_control(robot: Any, states: np.ndarray) -> np.ndarray:
-    """The tasks of ``dmc``: the reacher from above, the others from the side."""
-    import mujoco
-
-    model, data, target = robot.model, mujoco.MjData(robot.model), robot.target_radius
-    (left, bottom, across), axes = robot.view, [0, 1] if target else [0, 2]
-    kinds, pictures = mujoco.mjtGeom, []
-    for state in states:
-        data.qpos[:] = state[: model.nq]
-        mujoco.mj_kinematics(model, data)
-        picture = _Picture(left, bottom, across)
+        if view is None:  # it is followed
+            picture = _Picture(float(position[0]) - ACROSS / 2, -BELOW)
+            picture.ground()
+        else:
+            picture = _Picture(*view)
         if target:
             picture.rod(np.stack([state[-2:]] * 2), target, OTHER)
         if model.ntendon:
             picture.draw.line(picture.pixels(data.site_xpos[:, axes]), EDGE, 2)
-        for i in np.flatnonzero(model.geom_type != int(kinds.mjGEOM_PLANE)):
-            place, (wide, _, high) = data.geom_xpos[i, axes], model.geom_size[i]
-            if model.geom_type[i] == int(kinds.mjGEOM_BOX):
-                corners = picture.pixels(place + np.array([[-wide, high], [wide, -high]]))
-                picture.draw.rectangle((*corners[0], *corners[1]), MARK, EDGE, 2 * SMOOTH)
-                continue
-            half = _half_length(model, int(i)) * data.geom_xmat[i].reshape(3, 3)[axes, 2]
-            ball = model.geom_type[i] == int(kinds.mjGEOM_SPHERE) and not target
-            picture.rod(np.stack([place - half, place + half]), wide, OTHER if ball else BODY)
+        away = 0 * bodies if target else data.geom_xpos[bodies, 1].round(6)
+        for i in bodies[np.argsort(-away, kind="stable")]:
+            _draw_body(picture, model, data, int(i), axes)
         pictures.append(picture.array())
     return np.stack(pictures)
 
 
-def _half_length(model: Any, geom: int) -> float:
-    """Of a capsule or a cylinder along its own third axis; of a ball 0."""
-    import mujoco
+def _draw_body(picture: _Picture, model: Any, data: Any, i: int, axes: list[int]) -> None:
+    """A box, capsule or ball; a left or hind leg and a ball seen from the side in another hue."""
+    from mujoco import mjtGeom
 
-    long = int(model.geom_type[geom]) in map(
-        int, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+    place, kind, (wide, half, high) = (
+        data.geom_xpos[i, axes],
+        model.geom_type[i],
+        model.geom_size[i],
     )
-    return float(model.geom_size[geom, 1]) if long else 0.0
+    if kind == int(mjtGeom.mjGEOM_BOX):
+        corners = picture.pixels(place + np.array([[-wide, high], [wide, -high]]))
+        picture.draw.rectangle((*corners[0], *corners[1]), MARK, EDGE, 2 * SMOOTH)
+        return
+    ball, name = kind == int(mjtGeom.mjGEOM_SPHERE), model.geom(i).name
+    second = "left" in name or name.startswith("b") or (ball and axes == [0, 2])
+    reach = (0.0 if ball else half) * data.geom_xmat[i].reshape(3, 3)[axes, 2]
+    picture.rod(
+        np.stack([place - reach, place + reach]),
+        wide,
+        OTHER if second else BODY,
+    )
 
 
 @cache
@@ -186,6 +169,8 @@ def _hidden_positions(env_id: str) -> int | None:
     """How many of the first positions an observation leaves out, 0 or 1; None: it is something
     else.
     """
+    if env_id in CONTROL_IDS:
+        return 0
     robot = _robot(env_id)
     if type(getattr(robot, "data", None)).__name__ != "MjData":
         return None

@@ -41,16 +41,16 @@ def draw_scene(
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    arm = EnvSpec.parse(env_id)
-    state, task, radius, lengths = (
-        np.asarray(state, np.float64),
-        arm.task,
-        arm.physics.object_radius,
-        arm.physics.link_lengths,
-    )
-    expected = arm.state_dim
-    if state.shape != (expected,):
-        raise ValueError(f"the state is {state.shape}; {env_id} expected ({expected},)")
+    arm, state = EnvSpec.parse(env_id), np.asarray(state, np.float64)
+    task, radius = arm.task, arm.physics.object_radius
+    if state.shape != (arm.state_dim,):
+        raise ValueError(f"the state is {state.shape}; {env_id} expected ({arm.state_dim},)")
+
+    def disc(
+        centre: np.ndarray, size: float, face: str, edge: str, lw: float, order: float
+    ) -> None:
+        place = (float(centre[0]), float(centre[1]))
+        ax.add_artist(Circle(place, size, fc=face, ec=edge, lw=lw, alpha=alpha, zorder=order))
 
     if background:
         draw_floor(ax, env_id)
@@ -62,42 +62,18 @@ def draw_scene(
             ax.add_artist(line)
     if target is not None:
         _target(ax, np.asarray(target), radius if task == "push" else 1.2 * ARM_RADIUS)
-    if task != "reach":
-        fixed = task == "obstacle"
-        face, edge = (STEEL, INK) if fixed else (BLOCK, "#8A5F00")
-        ax.add_artist(
-            Circle((state[6], state[7]), radius, fc=face, ec=edge, lw=1.0, alpha=alpha, zorder=3)
-        )
-        if fixed:  # a bolt: it does not move
-            ax.add_artist(
-                Circle(
-                    (state[6], state[7]), 0.25 * radius, fc=INK, ec="none", alpha=alpha, zorder=3
-                )
-            )
-    elbow, _, tip = arm_points(state[:2], lengths)
-    # The pedestal.
-    ax.add_artist(
-        Circle((0, 0), 1.7 * ARM_RADIUS, fc=STEEL, ec=INK, lw=0.9, alpha=alpha, zorder=3.9)
-    )
-    _capsule(ax, np.zeros(2), elbow, LINK1, alpha, 4.0)
+    if task == "push":
+        disc(state[6:8], radius, BLOCK, "#8A5F00", 1.0, 3)
+    elif task == "obstacle":
+        disc(state[6:8], radius, STEEL, INK, 1.0, 3)
+        disc(state[6:8], 0.25 * radius, INK, "none", 1.0, 3)  # a bolt: it does not move
+    shoulder, (elbow, _, tip) = np.zeros(2), arm_points(state[:2], arm.physics.link_lengths)
+    disc(shoulder, 1.7 * ARM_RADIUS, STEEL, INK, 0.9, 3.9)  # the pedestal
+    _capsule(ax, shoulder, elbow, LINK1, alpha, 4.0)
     _capsule(ax, elbow, tip, LINK2, alpha, 4.2)
-    ax.add_artist(
-        Circle(
-            (tip[0], tip[1]), 0.72 * ARM_RADIUS, fc=TIP, ec="white", lw=0.8, alpha=alpha, zorder=4.3
-        )
-    )
-    for joint in (np.zeros(2), elbow):
-        ax.add_artist(
-            Circle(
-                (joint[0], joint[1]),
-                0.5 * ARM_RADIUS,
-                fc="white",
-                ec=INK,
-                lw=0.8,
-                alpha=alpha,
-                zorder=4.4,
-            )
-        )
+    disc(tip, 0.72 * ARM_RADIUS, TIP, "white", 0.8, 4.3)
+    for joint in (shoulder, elbow):
+        disc(joint, 0.5 * ARM_RADIUS, "white", INK, 0.8, 4.4)
 
 
 def draw_floor(ax: Axes, env_id: str) -> None:
