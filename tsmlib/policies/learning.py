@@ -35,11 +35,10 @@ from tsmlib.checks import (
     require_type,
 )
 from tsmlib.models.base import Model, as_dynamics
-from tsmlib.policies.gradients import clip_gradients, discounted
 from tsmlib.policies.imagination import imagine
 from tsmlib.policies.networks import Policy
 from tsmlib.policies.options import LearningCurve, LearningOptions
-from tsmlib.policies.value import RATE, Bootstrap, Lesson
+from tsmlib.policies.value import RATE, Bootstrap, Lesson, clip_gradients, discounted
 from tsmlib.rewards import Reward, fingerprint, rewarded
 from tsmlib.sampling import Noise, SeparateNoise
 from tsmlib.storage import artifacts

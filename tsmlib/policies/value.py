@@ -11,13 +11,13 @@ Letters in shapes: as in ``networks``; H steps of a piece.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 
 import torch
 from torch import Tensor, nn
 
 from tsmlib.models.base import Model
-from tsmlib.policies.gradients import clip_gradients, discounted
 from tsmlib.policies.imagination import imagined_past
 from tsmlib.policies.networks import OneStepPolicy, Policy
 from tsmlib.policies.options import LearningOptions
@@ -29,6 +29,21 @@ HIDDEN = 256  # units of the value's two layers
 LAMBDA = 0.95
 RATE = 0.5  # of the value's Adam, as a share of the policy's
 SLOW = 0.02  # by which V' follows V at each of its updates
+
+
+def discounted(rewards: Tensor, gamma: float) -> Tensor:
+    """sum_t gamma^t r_t over the last dimension, the first step in full (Eq. 4 up to gamma)."""
+    steps = torch.arange(rewards.shape[-1], dtype=rewards.dtype, device=rewards.device)
+    return (rewards * gamma**steps).sum(-1)
+
+
+def clip_gradients(gradients: Sequence[Tensor], norm: float) -> Tensor:
+    """Shorten each copy's gradients (M, ...) to ``norm`` unless it is 0; the norms before (M,)."""
+    norms = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
+    if norm:
+        for g in gradients:
+            g *= (norm / norms).clamp(max=1).reshape(-1, *[1] * (g.ndim - 1))
+    return norms
 
 
 class Bootstrap(nn.Module):

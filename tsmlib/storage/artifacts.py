@@ -25,8 +25,6 @@ from torch import Tensor
 
 from tsmlib.checks import described, require_type
 from tsmlib.robot import Robot
-from tsmlib.storage.digests import digest as digest
-from tsmlib.storage.digests import trajectories_digest as trajectories_digest
 from tsmlib.storage.files import Json, PathLike, StoreError, dumps, loads, read_bytes, write_bytes
 from tsmlib.storage.provenance import provenance
 from tsmlib.trajectory import Trajectories
@@ -346,3 +344,20 @@ def _layout(tensors: Mapping[str, Tensor]) -> dict[str, Json]:
     return {
         name: f"{x.dtype} {list(x.shape)}".removeprefix("torch.") for name, x in tensors.items()
     }
+
+
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of named arrays, by name and content."""
+    sha = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        sha.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()
+
+
+def trajectories_digest(data: Trajectories) -> str:
+    """Sixteen digits that tell the states and actions of data sets apart."""
+    arrays = {"states": data.flat_states, "actions": data.flat_actions}
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    if len(set(data.lengths)) > 1:
+        tensors["lengths"] = torch.tensor(data.lengths)
+    return digest(tensors)[:16]

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import socket
-import sys
 import threading
 import time
 import warnings
@@ -21,6 +20,7 @@ from filelock import FileLock, Timeout
 
 PathLike = str | os.PathLike[str]
 Json: TypeAlias = bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"] | None
+NO_LOCKS = (errno.EOPNOTSUPP, errno.ENOLCK)  # of flock, as on some network folders
 LEFT_AFTER = 3600  # s, after which a temporary file was left by a process that was killed
 
 
@@ -103,24 +103,18 @@ def writer_lock(folder: PathLike, purpose: str) -> Iterator[None]:
         StoreError: another process writes there; process, machine, purpose and since are named.
     """
     folder = Path(folder)
+    lock, holder = FileLock(folder / ".lock"), folder / ".writer"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        locks = _has_locks(folder)
+        _acquire(lock, holder)
     except OSError as error:
-        raise _cannot_write(f"in {folder}", error) from error
-    if not locks:
+        if error.errno not in NO_LOCKS:
+            raise _cannot_write(f"in {folder}", error) from error
         warnings.warn(
             f"{folder} is on a file system without locks (flock): see to it that no other process "
             "writes there, or name a folder on a local disk",
             stacklevel=3,
         )
-        yield
-        return
-    lock, holder = FileLock(folder / ".lock"), folder / ".writer"
-    try:
-        _acquire(lock, holder)
-    except OSError as error:
-        raise _cannot_write(f"in {folder}", error) from error
     try:
         since, host = time.strftime("%F %T%z"), socket.gethostname()
         with contextlib.suppress(OSError):  # a full disk: nameless, but locked
@@ -146,22 +140,6 @@ def _acquire(lock: FileLock, holder: Path) -> None:
         f"{holder.parent} is being written by another process ({who or 'unknown'}). Wait for it, "
         "end it, or name another folder."
     )
-
-
-def _has_locks(folder: Path) -> bool:
-    """Whether ``flock`` works here; a network folder may lack it."""
-    if sys.platform == "win32":
-        return True
-    import fcntl
-
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
-    finally:
-        os.close(descriptor)
-    return True
 
 
 def loads(text: str | bytes) -> Json:
