@@ -182,10 +182,35 @@ def figure7(tables: Tables = results) -> Figure:
     return figure
 
 
+def figure8(tables: Tables = results) -> Figure:
+    """Share of targets that policies come within 5 cm of, with noisy sensors and late actions.
+
+    Means over training seeds with their 95 % intervals; a policy gives torques, or codes.
+    """
+    rows = select(tables("06_robustness"), planner="policy", metric="success50")
+    kinds = [*((word, "codes") for word in OURS), *((word, "torques") for word in BASELINES)]
+    kinds.insert(1, ("tsm", "torques"))
+    panels: dict[str, dict[str, np.ndarray]] = {}
+    for title, place in {
+        "noisy sensors: share within 5 cm": {"noise": 0.25, "delay": None},
+        "actions five steps late: share within 5 cm": {"noise": None, "delay": 5},
+    }.items():
+        for word, acts in kinds:
+            space = "latent" if acts == "codes" else "direct"
+            own = select(rows, model=word, search_space=space, **place)
+            means = own.groupby("seed")["value"].mean().to_numpy(float)
+            panels.setdefault(title, {})[f"{word}, {acts}"] = _interval(means)
+    figure = plots.forest(panels, reference=None, columns=2)
+    for ax in figure.axes:
+        ax.set_xlim(0, 1.02)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "figure5": figure5,
     "figure6": figure6,
     "figure7": figure7,
+    "figure8": figure8,
     "ahead": ahead,
     "rounds": rounds,
 }
