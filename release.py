@@ -102,6 +102,9 @@ def models(source: Path, page: Path, folder: Path) -> None:
     """The wheel tsmlib-models: models and tables of data/, and the explorer's page."""
     if not (page / "index.html").exists():
         raise ReleaseError(f"there is no page in {page}: type make explorer")
+    for built in (page / "src").glob("*.js"):
+        if built.read_bytes() != (source / "explorer" / "src" / built.name).read_bytes():
+            raise ReleaseError(f"{built} is not of explorer/src as it is: type make explorer")
     with tempfile.TemporaryDirectory() as place:
         package = Path(place) / "tsmlib_models"
         shutil.copytree(
