@@ -28,10 +28,11 @@ from torch import Tensor
 import tsmlib
 from reproduction import pusht
 from tsmlib.envs.pusht import PushTEnv
+from tsmlib.envs.pusht_field import ENV_ID, in_field, pusht_physics
 from tsmlib.exploration.options import ExplorationOptions
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.egocentric import Egocentric
-from tsmlib.planning.pusht import pusht_task, random_play, success_c
+from tsmlib.planning.pusht import PROTOCOLS, pusht_task, random_play
 from tsmlib.plots.style import BLUE, NOTE, ORANGE, RED, styled
 from tsmlib.pretrained import load_pusht
 from tsmlib.trajectory import Segment
@@ -55,32 +56,40 @@ LINES = {  # method -> colour, name at its line
 }
 
 
-def pairs(n: int, seed: int) -> tsmlib.Task:
-    """Starts and goals as the frozen ones are, of other play."""
-    starts, goals = [], []
+def pairs(n: int, seed: int, protocol: str = "C", env: str = ENV_ID) -> tsmlib.Task:
+    """Starts and goals as the frozen ones are, of other play, in any field."""
+    starts, goals, physics = [], [], pusht_physics(env)
     while sum(map(len, starts)) < n:
-        played = random_play(100, horizon=EPISODE, seed=seed, symmetries=False).cut(EPISODE)
-        states = played.states
-        start, goal = states[:, :-25:5].reshape(-1, 7), states[:, 25::5].reshape(-1, 7)
+        played = random_play(100, horizon=EPISODE, seed=seed, symmetries=False, env=env).cut(
+            EPISODE
+        )
+        start, goal = (
+            played.states[:, :-25:5].reshape(-1, 7),
+            played.states[:, 25::5].reshape(-1, 7),
+        )
         apart = np.linalg.norm(goal[:, 2:4] - start[:, 2:4], axis=1) >= 10
         still = torch.from_numpy(start)[:, None].expand(-1, 3, -1)
-        solved = success_c(still, torch.from_numpy(goal)).numpy()
-        kept = apart & ~solved & tsmlib.envs.pusht_field.in_field(goal)
+        solved = PROTOCOLS[protocol][0](still, torch.from_numpy(goal)).numpy()
+        kept = apart & ~solved & in_field(goal, physics)
         starts, goals, seed = [*starts, start[kept]], [*goals, goal[kept]], seed + 1
     order = np.random.default_rng(seed).permutation(sum(map(len, starts)))[:n]
-    return pusht_task(np.concatenate(starts)[order], np.concatenate(goals)[order], "C")
+    return pusht_task(
+        np.concatenate(starts)[order], np.concatenate(goals)[order], protocol, env=env
+    )
 
 
-def line(trial: tsmlib.Trial, method: str, seed: int, env_steps: int, began: float) -> dict:
+def line(
+    task: tsmlib.Task, trial: tsmlib.Trial, method: str, seed: int, env_steps: int, began: float
+) -> pusht.Row:
     """One row of the table."""
-    return pusht.row(trial, time.process_time() - began, method, "C", seed) | {
-        "env_steps": env_steps
-    }
+    seconds = round(time.process_time() - began, 1)
+    more: pusht.Row = {"seconds": seconds, "env_steps": env_steps}
+    return pusht.row(task, trial, method, "C", seed) | more
 
 
-def rounds(method: str, seed: int, add: Callable[[dict], None]) -> None:
+def rounds(method: str, seed: int, add: Callable[[pusht.Row], None]) -> None:
     """A model on 5,000 steps of random play, then on three rounds of its own or of more."""
-    began = time.process_time()
+    began, task = time.process_time(), load_pusht("test", "C").take(PAIRS)
     play = partial(random_play, horizon=LONG, symmetries=False)
     first = play(BUDGETS[0] // LONG, seed=10_000 * seed + 1)
     held_out = play(20, seed=10_000 * seed + 2)
@@ -94,10 +103,9 @@ def rounds(method: str, seed: int, add: Callable[[dict], None]) -> None:
         )
 
     def measure(model: tsmlib.DynamicsModel, prior: object = None) -> dict[str, float]:
-        trial = pusht.trial(model, "C", PAIRS, seed=seed, **SEARCH)
-        steps = BUDGETS[len(done)]
-        done.append(steps)
-        add(line(trial, method, seed, steps, began))
+        trial = pusht.trial(model, task, "C", seed=seed, **SEARCH)
+        done.append(BUDGETS[len(done)])
+        add(line(task, trial, method, seed, done[-1], began))
         return {}
 
     done: list[int] = []
@@ -178,7 +186,7 @@ class FromTheT(gymnasium.Env):
         return self._seen(), reward, False, self.taken == EPISODE, {}
 
 
-def sac(seed: int, steps: int, add: Callable[[dict], None]) -> None:
+def sac(seed: int, steps: int, add: Callable[[pusht.Row], None]) -> None:
     """Soft actor-critic, one update a step."""
     from stable_baselines3 import SAC
 
@@ -196,7 +204,8 @@ def sac(seed: int, steps: int, add: Callable[[dict], None]) -> None:
     for mark in MARKS:
         if mark <= steps:
             model.learn(mark - model.num_timesteps, reset_num_timesteps=False)
-            add(line(tsmlib.execute(task, control, past_len=1), "sac", seed, mark, began))
+            trial = tsmlib.execute(task, control, past_len=1)
+            add(line(task, trial, "sac", seed, mark, began))
 
 
 @styled

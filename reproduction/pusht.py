@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import pandas as pd
 import torch
+from scipy.stats import binomtest
 
 import tsmlib
 from tsmlib.envs.pusht import weak_policy
@@ -27,6 +28,8 @@ from tsmlib.training.options import TrainingOptions
 from tsmlib.trajectory import Trajectories
 
 EPISODES, HELD_OUT = 5800, 60  # of 100 steps
+Row = dict[str, str | int | float]
+Executed = Callable[[tsmlib.Task], tsmlib.Trial]
 Stage = tuple[int, int, int, tuple[float, float]]  # steps ahead, batch, updates, part of a schedule
 STAGES: tuple[Stage, ...] = (
     (1, 1024, 15_555, (0.0, 0.35)),
@@ -65,44 +68,40 @@ def options(stage: Stage, share: float = 1.0) -> TrainingOptions:
 
 def trial(
     model: tsmlib.DynamicsModel | None,
+    task: tsmlib.Task,
     protocol: str,
-    pairs: int,
     *,
     seed: int,
-    split: Literal["validation", "test"] = "test",
     space: SearchSpace | None = None,
-    every: int = EVERY,
+    once: bool = False,
     **search: int,
 ) -> tsmlib.Trial:
-    """Planning again every few steps on the first frozen pairs; None plans in the simulator."""
-    task = load_pusht(split, protocol)
-    task = task.take(min(pairs, len(task)))
+    """Planning again for what is not solved, or once; without a model in the simulator."""
     ahead, smoothness = AHEAD[protocol]
     space = space or tsmlib.DirectActions(ahead, rms=RMS, smoothness=smoothness)
     planner = partial(tsmlib.cem, **(SEARCH | search), seed=seed)
+    if once:
+        return tsmlib.mpc(replace(task, horizon=ahead), model, space, planner, every=ahead)
     return tsmlib.mpc(
-        task, model, space, planner, every=every, lookahead=ahead, until_success=True, seed=seed
+        task, model, space, planner, every=EVERY, lookahead=ahead, until_success=True, seed=seed
     )
 
 
-def row(
-    trial: tsmlib.Trial, seconds: float, method: str, protocol: str, seed: int
-) -> dict[str, object]:
-    """One line of the table."""
-    success = trial.success
-    assert success is not None
-    n, share = len(success), float(success.float().mean())
-    half = 1.96 * (share * (1 - share) / n) ** 0.5
-    return {
-        "method": method,
-        "protocol": protocol,
-        "seed": seed,
-        "pairs": n,
-        "success": round(share, 4),
-        "low": round(max(0.0, share - half), 4),
-        "high": round(min(1.0, share + half), 4),
-        "seconds": round(seconds, 1),
-    }
+def row(task: tsmlib.Task, trial: tsmlib.Trial, method: str, protocol: str, seed: int) -> Row:
+    """One line of the table: success with Wilson's 95 % interval.
+
+    ``predicted`` is the share of pairs that are solved in what the plans said would happen.
+    """
+    assert trial.success is not None
+    solved = int(trial.success.sum())
+    line: Row = {"method": method, "protocol": protocol, "seed": seed, "pairs": len(task)}
+    line["success"] = round(solved / len(task), 4)
+    interval = binomtest(solved, len(task)).proportion_ci(method="wilson")
+    line |= {"low": round(float(interval.low), 4), "high": round(float(interval.high), 4)}
+    if trial.plan is not None:
+        said = torch.cat([trial.states[:, :1], trial.plan.states[0]], dim=1)
+        line["predicted"] = round(float(task.judged(said)[1].float().mean()), 4)
+    return line
 
 
 class Table:
@@ -114,16 +113,14 @@ class Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows: list[dict[str, object]] = []
-        if path.exists():
-            self.rows = [dict(line) for _, line in pd.read_csv(path).iterrows()]
+        self.rows: list[Row] = pd.read_csv(path).to_dict("records") if path.exists() else []
 
     def has(self, method: str, protocol: str, seed: int) -> bool:
         """Whether a row is there."""
         key = (method, protocol, seed)
         return any((row["method"], row["protocol"], row["seed"]) == key for row in self.rows)
 
-    def add(self, row: dict[str, object]) -> None:
+    def add(self, row: Row) -> None:
         """Append a row."""
         self.rows.append(row)
         print(row, flush=True)
@@ -131,42 +128,44 @@ class Table:
         pd.DataFrame(self.rows).to_csv(self.path, index=False)
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--pairs", type=int, default=500)
-    parser.add_argument("--simulator", type=int, default=100, help="pairs planned in the simulator")
+    parser.add_argument("--simulator", type=int, default=50, help="pairs planned in the simulator")
     parser.add_argument("--protocols", default="BCA")
+    parser.add_argument("--share", type=float, default=1.0, help="of play and updates; a test: 0")
     parser.add_argument("--models", type=Path, default=Path("runs/pusht"))
     parser.add_argument("--out", type=Path, default=Path("data/results/11_pusht.csv"))
-    given = parser.parse_args()
+    given = parser.parse_args(words)
     table = Table(given.out)
 
-    def add(method: str, protocol: str, seed: int, make: Callable[[], tsmlib.Trial]) -> None:
-        if not table.has(method, protocol, seed):
-            began = time.process_time()
-            result = make()
-            table.add(row(result, time.process_time() - began, method, protocol, seed))
+    def add(method: str, protocol: str, seed: int, pairs: int, make: Executed) -> None:
+        if pairs and not table.has(method, protocol, seed):
+            task, began = load_pusht("test", protocol), time.process_time()
+            task = task.take(min(pairs, len(task)))
+            line = row(task, make(task), method, protocol, seed)
+            table.add(line | {"seconds": round(time.process_time() - began, 1)})
 
     for seed in given.seeds:
         path = given.models / f"egocentric-{seed}.safetensors"
         if not path.exists():
-            data = random_play(EPISODES, seed=1000 * seed)
+            data = random_play(max(2, round(given.share * EPISODES)), seed=1000 * seed)
             held_out = random_play(HELD_OUT, seed=1000 * seed + 999, symmetries=False)
-            model = train(data, held_out, seed=seed)
             path.parent.mkdir(parents=True, exist_ok=True)
-            tsmlib.save_model(path, model)
+            tsmlib.save_model(path, train(data, held_out, seed=seed, share=given.share))
         model = tsmlib.load_model(path, Egocentric)
-        for protocol in given.protocols:
-            task = load_pusht("test", protocol)
-            task = task.take(min(given.pairs, len(task)))
+        for word in given.protocols:
             play = weak_policy(torch.Generator().manual_seed(seed))
-            add("random play", protocol, seed, partial(tsmlib.execute, task, play))
-            plans = partial(trial, model, protocol, given.pairs, seed=seed)
-            add("egocentric", protocol, seed, plans)
-    for protocol in given.protocols if given.simulator else "":
-        plans = partial(trial, None, protocol, given.simulator, seed=0)
-        add("simulator", protocol, 0, plans)
+            add("random play", word, seed, given.pairs, partial(tsmlib.execute, plan=play))
+            plans = partial(trial, model, protocol=word, seed=seed)
+            add("egocentric", word, seed, given.pairs, plans)
+            add("one plan", word, seed, given.pairs, partial(plans, once=True))
+    for word in given.protocols:
+        plans = partial(trial, None, protocol=word, seed=0)
+        add("simulator", word, 0, given.simulator, plans)
+        more = partial(plans, candidates=4 * SEARCH["candidates"], elites=4 * SEARCH["elites"])
+        add("simulator, four times", word, 0, given.simulator // 4, more)
 
 
 if __name__ == "__main__":

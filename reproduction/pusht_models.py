@@ -3,8 +3,7 @@
 All learn from the same play in the same seconds of one core, and plan by the same search, a third
 of the shipped one. ``egocentric`` and ``world`` are one network and one schedule, that sees places
 from the T or from the world, trained on several of its own steps; the others are the zoo's, by its
-settings. States, not pixels; random
-play, no demonstrations.
+settings. States, not pixels; random play, no demonstrations.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import argparse
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -23,13 +23,14 @@ from reproduction import pusht, schedules
 from tsmlib.models.baselines import OneStep
 from tsmlib.models.egocentric import Egocentric
 from tsmlib.planning.pusht import random_play
+from tsmlib.pretrained import load_pusht
 from tsmlib.training.fit import fit
 from tsmlib.training.options import TrainingOptions
 from tsmlib.trajectory import Trajectories
 from tsmlib.zoo import find
 
 EPISODES = 1450  # of play, a quarter of the shipped model's
-SECONDS = 45.0
+SECONDS = 200.0
 WORDS = ("egocentric", "world", "rtsm", "onestep", "tsm", "lstm", "ensemble+mse")
 SEARCH = {"candidates": 64, "elites": 8, "iterations": 3}
 Stages = list[tuple[str, TrainingOptions, float]]  # loss, options, share of the seconds
@@ -60,7 +61,7 @@ def train(
     seed: int,
 ) -> tuple[int, float]:
     """As many updates as fit in the seconds, by the time that a few take: updates and seconds."""
-    total, spent = 0, 0.0
+    total, spent, left = 0, 0.0, 1.0
     for loss, options, share in parts:
         trial = copy.deepcopy(model)
         marks = []
@@ -69,22 +70,23 @@ def train(
             few = replace(options, steps=steps, validate_every=steps)
             fit(trial, data, held_out, few, getattr(trial, loss), seed=seed, progress=False)
             marks.append(time.process_time() - began)
-        updates = max(20, round(share * seconds * 30 / (marks[1] - marks[0])))
+        ahead = share / left * (seconds - spent)
+        updates = max(20, round(ahead * 30 / (marks[1] - marks[0])))
         whole = replace(options, steps=updates, validate_every=max(10, updates // 2))
         began = time.process_time()
         fit(model, data, held_out, whole, getattr(model, loss), seed=seed, progress=False)
-        total, spent = total + updates, spent + time.process_time() - began
+        total, spent, left = total + updates, spent + time.process_time() - began, left - share
     return total, spent
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--words", nargs="+", default=WORDS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--pairs", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("data/results/11_pusht_models.csv"))
-    given = parser.parse_args()
+    given = parser.parse_args(words)
     table = pusht.Table(given.out)
     data = random_play(EPISODES, seed=1000 * given.seed)
     held_out = random_play(pusht.HELD_OUT, seed=1000 * given.seed + 999, symmetries=False)
@@ -94,11 +96,11 @@ def main() -> None:
         model, parts = stages(word, data, given.seed)
         updates, spent = train(model, parts, data, held_out, given.seconds, given.seed)
         weights = sum(weight.numel() for weight in model.parameters())
+        about: pusht.Row = {"trained": round(spent, 1), "updates": updates, "weights": weights}
         for protocol in "BC":
-            began = time.process_time()
-            trial = pusht.trial(model, protocol, given.pairs, seed=given.seed, **SEARCH)
-            line = pusht.row(trial, time.process_time() - began, word, protocol, given.seed)
-            table.add(line | {"trained": round(spent, 1), "updates": updates, "weights": weights})
+            task = load_pusht("test", protocol).take(given.pairs)
+            trial = pusht.trial(model, task, protocol, seed=given.seed, **SEARCH)
+            table.add(pusht.row(task, trial, word, protocol, given.seed) | about)
 
 
 if __name__ == "__main__":

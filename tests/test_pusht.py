@@ -5,10 +5,12 @@ from functools import partial
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 import tsmlib
+from reproduction import pusht
 from tsmlib.collection import collect
 from tsmlib.envs.pusht import PushT, weak_policy
 from tsmlib.envs.pusht_field import (
@@ -139,7 +141,6 @@ def test_all_shapes_can_be_pushed():
     ("options", "words"),
     [
         ({"states": np.zeros((1, 5))}, "five numbers lack the pusher's velocity"),
-        ({"goal": [20, 20, 256, 256, 0, 0, 0]}, None),
         ({"goal": [10, 20, 256, 256, 0, 0, 0]}, "goal 0 is outside the field or inside a wall"),
         ({"goal": [256, 400, 30, 256, 0, 0, 0]}, "goal 0 is outside the field"),
         ({"goal": [np.nan, 400, 30, 256, 0, 0, 0]}, "goal is not finite"),
@@ -147,12 +148,9 @@ def test_all_shapes_can_be_pushed():
     ],
 )
 def test_bad_starts_and_goals_are_named(options, words):
-    if words is None:
-        options = {"goal": [23, 23, 256, 256, 0, 0, 0]}
+    PushT(1).reset(options={"goal": [23, 23, 256, 256, 0, 0, 0]})
+    with pytest.raises(ValueError, match=words):
         PushT(1).reset(options=options)
-    else:
-        with pytest.raises(ValueError, match=words):
-            PushT(1).reset(options=options)
 
 
 def test_bad_actions_are_named():
@@ -309,12 +307,26 @@ def test_the_shipped_model_predicts_a_second_of_play_within_pixels(data):
     assert off.median() < 2
 
 
+def test_the_tables_command_goes_from_play_to_rows_and_makes_none_twice(tmp_path):
+    words = "--seeds 0 --pairs 2 --simulator 1 --share 0 --protocols C".split()
+    words += ["--models", str(tmp_path), "--out", str(tmp_path / "rows.csv")]
+    tables = []
+    for _ in range(2):
+        pusht.main(words)
+        tables.append(pd.read_csv(tmp_path / "rows.csv"))
+    assert tables[0].method.tolist() == ["random play", "egocentric", "one plan", "simulator"]
+    assert tables[1].equals(tables[0])
+    assert (tmp_path / "egocentric-0.safetensors").exists()
+
+
 def test_bad_pairs_are_named():
     start, goal, _ = pairs(1)
     with pytest.raises(ValueError, match="pair 0 is solved at the start by protocol B"):
         pusht_task(start, start)
     with pytest.raises(ValueError, match="goal 0 is outside the field"):
         pusht_task(start, goal + np.array([0, 0, 400, 0, 0, 0, 0]))
+    with pytest.raises(ValueError, match="goal is .* five numbers lack the pusher's velocity"):
+        pusht_task(start, goal[:, :5])
     with pytest.raises(ValueError, match="protocol is 'D'"):
         pusht_task(start, goal, "D")
 
@@ -329,27 +341,17 @@ def model(data):
     [
         ((3, 2), {"angles": (2,), "body": (0, 1, 2)}, "vectors is"),
         ((0, 2), {}, "state_dim is 0"),
-        ((7.0, 2), {}, "state_dim is 7.0"),
         ((7, 3), {}, "action_dim is 3; expected 2"),
-        ((7, "2"), {}, "action_dim is '2'"),
         ((7, 2), {"body": (2, 3)}, "body is .*; expected 3 different columns"),
-        ((7, 2), {"body": "234"}, "body is '234'"),
         ((7, 2), {"body": None}, "body is None"),
-        ((7, 2), {"body": (2, 3, -3)}, "body is"),
-        ((7, 2), {"body": (2.0, 3, 4)}, "body is"),
         ((7, 2), {"body": (2, 2, 4)}, "body is"),
         ((7, 2), {"places": (0, 1)}, "places is 0"),
-        ((7, 2), {"places": 5}, "places is a int 5"),
         ((7, 2), {"places": ((0, True),)}, "places is"),
-        ((7, 2), {"places": ()}, "column 0 0 times"),
         ((7, 2), {"places": ((0, 1), (0, 1))}, "column 0 2 times"),
         ((7, 2), {"vectors": ((5, 7),)}, "vectors is"),
-        ((7, 2), {"vectors": {5: 6}}, "vectors is a dict"),
         ((7, 2), {"angles": (0,)}, "angles is .*; expected the body's alone"),
-        ((7, 2), {"angles": (4, 0)}, "expected the body's alone"),
         ((7, 2), {"angles": 4}, "angles is 4"),
         ((7, 2), {"hidden": -1}, "hidden is -1"),
-        ((7, 2), {"layers": 1.5}, "layers is 1.5"),
     ],
 )
 def test_columns_that_make_no_sense_are_named(sizes, arguments, words):

@@ -149,13 +149,12 @@ def load_pusht(
 
 def _pusht_model(word: str) -> DynamicsModel:
     from tsmlib.models.egocentric import Egocentric  # heavy
-    from tsmlib.models.recurrent import RecurrentTSM
 
-    classes = {"egocentric": Egocentric, "rtsm": RecurrentTSM}
-    if word not in classes:
-        raise ValueError(f"no pretrained {word} of PushT: there are {', '.join(classes)}")
-    path = shipped.find(f"data/pretrained/PushT/{word}.safetensors")
-    return cast("DynamicsModel", artifacts.load_model(path, classes[word]))
+    if word != "egocentric":
+        raise ValueError(f"no pretrained {word} of PushT; there is egocentric")
+    return artifacts.load_model(
+        shipped.find(f"data/pretrained/PushT/{word}.safetensors"), Egocentric
+    )
 
 
 def draw_task(env: str, *, seed: int, n: int = 100) -> Task:
