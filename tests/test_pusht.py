@@ -308,7 +308,7 @@ def test_the_shipped_model_predicts_a_second_of_play_within_pixels(data):
 
 
 def test_the_tables_command_goes_from_play_to_rows_and_makes_none_twice(tmp_path):
-    words = "--seeds 0 --pairs 2 --simulator 1 --share 0 --protocols C".split()
+    words = ["--seeds", "0", "--pairs", "2", "--simulator", "1", "--share", "0", "--protocols", "C"]
     words += ["--models", str(tmp_path), "--out", str(tmp_path / "rows.csv")]
     tables = []
     for _ in range(2):
