@@ -153,7 +153,9 @@ def main(words: Sequence[str] | None = None) -> None:
             data = random_play(max(2, round(given.share * EPISODES)), seed=1000 * seed)
             held_out = random_play(HELD_OUT, seed=1000 * seed + 999, symmetries=False)
             path.parent.mkdir(parents=True, exist_ok=True)
-            tsmlib.save_model(path, train(data, held_out, seed=seed, share=given.share))
+            model = train(data, held_out, seed=seed, share=given.share)
+            about = {"trained": f"{given.share:g} of {STAGES}, seed {seed}"}
+            tsmlib.save_model(path, model, about)
         model = tsmlib.load_model(path, Egocentric)
         for word in given.protocols:
             play = weak_policy(torch.Generator().manual_seed(seed))
