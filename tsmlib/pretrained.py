@@ -13,7 +13,7 @@ import torch
 
 import tsmlib.envs
 from tsmlib import shipped, zoo
-from tsmlib.checks import require_type
+from tsmlib.checks import require_choice, require_type
 from tsmlib.envs.physics import Physics
 from tsmlib.envs.pusht_field import GOAL
 from tsmlib.envs.spec import EnvSpec
@@ -103,6 +103,7 @@ def load_task(env: str, split: Literal["validation", "test"] = "test") -> Task:
         The task.
     """
     require_type("env", env, str, "an id, such as 'tsm/ReacherPush-v1'")
+    require_choice("split", split, TASK_SEED)
     if env.startswith("tsm/PushT-"):
         return load_pusht(split, env=env)
     spec = EnvSpec.parse(env)
@@ -139,7 +140,7 @@ def load_pusht(
     """
     name = "PushT-A" if protocol == "A" else "PushT"
     tensors, _ = artifacts.load(TASKS / f"{name}.safetensors", kind="task")
-    word = "validation_" if split == "validation" else ""
+    word = "" if require_choice("split", split, TASK_SEED) == "test" else "validation_"
     start = tensors[f"{word}start"].numpy()
     goal = np.tile(GOAL, (len(start), 1))
     if protocol != "A":

@@ -140,7 +140,7 @@ def clearance(states: np.ndarray, physics: PushTPhysics | None = None) -> np.nda
 def require_states(name: str, value: object, n: int) -> np.ndarray:
     """``value`` as finite float64 states (n, 7); ValueError that names it otherwise."""
     states = np.array(value, np.float64)
-    if states.shape == (n, 5):
+    if states.shape[-1:] == (5,):
         raise ValueError(
             f"{name} is {states.shape}: gym-pusht's five numbers lack the pusher's velocity; "
             f"expected ({n}, 7), append two zeros: np.pad({name}, ((0, 0), (0, 2)))"

@@ -189,7 +189,7 @@ def pusht_task(
     """
     success, horizon, pusher, held = PROTOCOLS[require_choice("protocol", protocol, PROTOCOLS)]
     physics = pusht_physics(env)
-    start = require_states("start", start, len(start)).astype(np.float32)
+    start = require_states("start", start, len(np.atleast_2d(start))).astype(np.float32)
     goal = require_states("goal", goal, len(start)).astype(np.float32)
     require_in_field("goal", goal, physics)
     target = torch.from_numpy(goal)
