@@ -1,6 +1,6 @@
-"""Measurement of the explorer against what it is to reach; the table of docs/explorer.md.
+"""Measurement of the explorer; docs/explorer.md tells the numbers.
 
-    python explorer/measure.py [--targets 100] [parity] [plans] [closed] [drags] [page] [table]
+    python explorer/measure.py [--targets 100] [parity] [plans] [closed] [drags] [page]
 
 parity: largest differences of the page from Python, over 100 frozen starts, and CPU time of a try.
 plans: returns of open-loop plans for the frozen targets, in the page and in Python.
@@ -8,7 +8,7 @@ closed: success of closed loops over random scenes.
 drags: of 20 random scenes, as the page plans after a first drag.
 page: times, sizes and accessibility in Chromium, by test/measure.mjs.
 
-Each is kept in measured.json, from which ``table`` writes. The page must be built.
+Each is kept in measured.json. The page must be built.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import subprocess
 import threading
 from collections.abc import Callable
@@ -29,7 +28,6 @@ import numpy as np
 import torch
 
 from reproduction import explorer
-from tsmlib import statistics
 from tsmlib.collection import smooth_torques
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import rollout
@@ -45,9 +43,7 @@ from tsmlib.storage import files
 
 HERE = Path(__file__).parent
 MEASURED = HERE / "measured.json"
-PAGE = HERE.parent / "docs" / "explorer.md"
 ENV = "tsm/ReacherPush-v1"
-TIMES = ("ready_ms", "plan_ms", "plan_least_ms", "plan_cpu_ms", "replan_ms")
 BUSY = 4  # load beyond which times by the clock say nothing
 OPEN = {"candidates": 64, "iterations": 6}  # src/session.js
 AGAIN = {"candidates": 64, "iterations": 4}
@@ -133,15 +129,13 @@ def closed(targets: int) -> list[dict[str, Any]]:
 
 
 def drags() -> dict[str, Any]:
-    """A first drag: the recurrent model plans again every ten steps; and one plan, both ways."""
+    """A first drag, as shipped: planned again every ten steps; and the one-step model's plan."""
     task = draw_task(ENV, seed=DRAGS, n=20)
     onestep = {"model": "onestep", "space": "direct"}
     return {
         "n": len(task),
         "first": in_page(task, seed=1, replan=True),
-        "one plan": in_page(task, seed=1),
-        "one plan, one search": in_page(task, seed=1, rounds=1),
-        "one plan, one-step model, any torques": in_page(task, seed=1, **onestep),
+        "one-step model, any torques": in_page(task, seed=1, **onestep),
     }
 
 
@@ -212,124 +206,6 @@ def keep(part: str, found: object) -> None:
     files.write_bytes(MEASURED, (json.dumps(read() | {part: found}, indent=1) + "\n").encode())
 
 
-def table(measured: dict[str, Any]) -> None:
-    """Write the table of docs/explorer.md, with a dash for what has not been measured."""
-    found = "| what | to reach | measured |\n|---|---|---|\n"
-    found += "".join(f"| {' | '.join(row)} |\n" for row in rows(measured))
-    text = PAGE.read_text()
-    pattern = r"(?s)(<!-- table -->\n).*?(<!-- end of table -->)"
-    files.write_bytes(
-        PAGE, re.sub(pattern, lambda match: f"{match[1]}\n{found}\n{match[2]}", text).encode()
-    )
-
-
-def rows(measured: dict[str, Any]) -> list[tuple[str, str, str]]:
-    seen, near, open_loop, loops = (
-        measured.get(part) for part in ("page", "parity", "plans", "closed")
-    )
-    found = []
-    if seen:
-        seconds = {word: f"{seen[word] / 1000:.2f} s" for word in TIMES}
-        found += [
-            ("ready after load", "2 s", f"{seconds['ready_ms']} (median of {seen['loads']})"),
-            (
-                "open-loop plan, 64 candidates x 6",
-                "1.0 s",
-                f"{seconds['plan_ms']} (median of {seen['plans']}; {seconds['plan_least_ms']})",
-            ),
-            (
-                "CPU time of an open-loop try, the busiest worker",
-                "",
-                f"{seconds['plan_cpu_ms']} (mean of 10)",
-            ),
-            (
-                "longest task of the main thread",
-                "50 ms",
-                f"{seen['longest_task_ms']:.0f} ms of CPU",
-            ),
-            (
-                "later plan, for 0.2 s of arm time",
-                "0.2 s, else a smaller search",
-                f"{seconds['replan_ms']} (median of {seen['replans']}, "
-                f"{seen['replan_within_200_ms']:.0%} within 0.2 s), "
-                f"candidates x iterations chosen: {seen['replan_searches']}",
-            ),
-            (
-                "page, compressed (gzip), until it is ready",
-                "4 MB",
-                f"{1e-6 * seen['gzip_bytes']:.2f} MB",
-            ),
-            (
-                "violations that axe-core finds",
-                "0",
-                f"{seen['violations']} ({seen['looked_at']} states of the page)",
-            ),
-        ]
-        found.append(
-            (
-                "load while times by the clock were taken",
-                "",
-                f"{seen['load']} on {seen['processors']} cores",
-            )
-        )
-    if near:
-        found += [
-            (
-                "CPU time of an open-loop try, node, one thread",
-                "",
-                f"{near['cpu']:.2f} s (mean of 10)",
-            ),
-            (
-                "model in page against torch, 50 steps",
-                "1e-4",
-                f"{near['model']:.0e} m, rad (n = {near['n']})",
-            ),
-            (
-                "MuJoCo in page against Python, 100 steps",
-                "1e-9",
-                f"{near['physics']:.0e} m, rad (n = {near['n']})",
-            ),
-        ]
-    if open_loop:
-        executed = [one["executed"] for one in open_loop["python"]]
-        middle, half = statistics.interval(executed)
-        mean = np.mean([one["executed"] for one in open_loop["page"]])
-        found.append(
-            (
-                f"executed return, {open_loop['n']} frozen targets",
-                "within the interval of planner seeds",
-                f"{mean:.2f} (two seeds); in Python {middle:.2f} ± {half:.2f} (95 % interval), "
-                f"{min(executed):.2f} to {max(executed):.2f} over {len(executed)} seeds",
-            )
-        )
-    return found + loop_rows(loops or [])
-
-
-def loop_rows(runs: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """Means over planner seeds of closed loops; the page's beside Python's."""
-    groups: dict[tuple[int, str, str], list[dict[str, Any]]] = {}
-    for run in sorted(runs, key=lambda run: (-run["n"], run["search"], run["by"])):
-        groups.setdefault((run["n"], run["search"], run["by"]), []).append(run)
-    found = []
-    for (n, search, by), same in groups.items():
-        success, executed = (
-            np.mean([run[word] for run in same]) for word in ("success", "executed")
-        )
-        seeds = ", ".join(str(run["seed"]) for run in same)
-        said = f"{success:.2f}, executed return {executed:.2f} (planner's seed {seeds})"
-        python = groups.get((n, search, "python"), [])
-        if by == "page" and python:
-            said += (
-                f"; {success / np.mean([run['success'] for run in python]):.2f} of Python's share"
-            )
-        where = "the page" if by == "page" else "Python"
-        what = (
-            f"success within 5 cm, closed loop in {where}, later plans {search}, {n} random scenes"
-        )
-        found.append((what, "0.9 of Python's share" if by == "page" else "", said))
-    return found
-
-
 @torch.no_grad()
 def main(asked: list[str], targets: int) -> None:
     parts: dict[str, Callable[[], object]] = {
@@ -341,16 +217,11 @@ def main(asked: list[str], targets: int) -> None:
     }
     for part in [word for word in parts if word in asked or not asked]:
         keep(part, parts[part]())
-    table(read())
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description="Measure the explorer and write the table of docs/explorer.md."
-    )
-    parser.add_argument(
-        "parts", nargs="*", choices=["parity", "plans", "closed", "drags", "page", "table"]
-    )
+    parser = argparse.ArgumentParser(description="Measure the explorer, into measured.json.")
+    parser.add_argument("parts", nargs="*", choices=["parity", "plans", "closed", "drags", "page"])
     parser.add_argument("--targets", type=int, default=100)
     arguments = parser.parse_args()
     main(arguments.parts, arguments.targets)
