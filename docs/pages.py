@@ -63,11 +63,20 @@ def page_of(stored: Path, executed: Path) -> nbformat.NotebookNode:
             )
         else:
             said += f": `{os.path.relpath(executed, ROOT)}` is of another version of it"
+    heading = ""
     for cell in notebook.cells:
-        if cell.cell_type == "markdown":
+        if cell.cell_type == "code":  # what a picture is read out as
+            cell.metadata["mystnb"] = {"image": {"alt": f"Picture: {heading}"}}
+        else:
+            heading = [heading, *re.findall(r"^#+ (?:\d+\. )?(.+)", cell.source, re.M)][-1]
             cell.source = linked(
                 cell.source.replace("](../docs/", "](../").replace("../figures/", "../../figures/")
             )
+    notebook.cells = [
+        cell
+        for cell in notebook.cells
+        if "injected-parameters" not in cell.metadata.get("tags", [])
+    ]
     command = f"`python -m tsmlib run {stored.stem.partition('_')[2]}`, then `make docs`"
     notebook.cells.insert(
         1, nbformat.v4.new_markdown_cell(f"*{said}. Your own run here: {command}.*")
