@@ -47,6 +47,6 @@ toc_object_entries = False
 html_theme = "furo"
 html_title = f"tsmlib {release}"
 html_copy_source = False
-html_search_scorer = "scorer.js"
+html_search_scorer = str(Path(__file__).with_name("scorer.js"))
 html_math_renderer = "mathml"  # of pages.py
 html_static_path: list[str] = []
