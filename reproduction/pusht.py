@@ -167,7 +167,7 @@ def main(words: Sequence[str] | None = None) -> None:
         plans = partial(trial, None, protocol=word, seed=0)
         add("simulator", word, 0, given.simulator, plans)
         more = partial(plans, candidates=4 * SEARCH["candidates"], elites=4 * SEARCH["elites"])
-        add("simulator, four times", word, 0, given.simulator // 4, more)
+        add("simulator, four times", word, 0, given.simulator // 8, more)
 
 
 if __name__ == "__main__":
