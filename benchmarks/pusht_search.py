@@ -167,7 +167,7 @@ def main() -> None:
     parser.add_argument("--split", choices=("validation", "test"), default="validation")
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--plans", type=int, default=4000, help="that a proposal learns from")
+    parser.add_argument("--plans", type=int, default=2500, help="that a proposal learns from")
     parser.add_argument("--updates", type=int, default=2500, help="of the prior and the proposal")
     parser.add_argument("--out", type=Path, default=TABLE)
     given = parser.parse_args()
