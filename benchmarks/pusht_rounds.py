@@ -39,7 +39,7 @@ from tsmlib.trajectory import Segment
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = (5_000, 20_000, 50_000)  # steps of the environment
-MARKS = (5_000, 10_000, 15_000, 20_000, 30_000, 40_000, 50_000, 75_000, 100_000)  # of SAC
+MARKS = (2_500, 5_000, 10_000, 15_000, 20_000, 30_000, 40_000, 50_000, 75_000, 100_000)  # of SAC
 STAGES: tuple[pusht.Stage, ...] = (  # of the training on the first play, and of a round's
     (1, 1024, 700, (0.0, 0.35)),
     (4, 384, 500, (0.35, 0.65)),
