@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import tsmlib
-from tsmlib.contrib.stable_worldmodel import Cost
+from tsmlib.contrib.stable_worldmodel import Cost, Solver
 from tsmlib.evaluation.conformal import Conformal
 from tsmlib.storage.files import StoreError
 
@@ -156,13 +156,34 @@ def test_a_cost_for_stable_worldmodel_is_minus_the_return_that_our_search_maximi
         cost.get_cost({"pixels": info["state"]}, candidates)
 
 
+def test_a_search_of_ours_is_a_solver_that_their_policy_can_execute() -> None:
+    cost, info, _ = costs(2, 1)
+    space, block = tsmlib.DirectActions(10, 2, rms=0.1), 2
+
+    def search(past: tsmlib.Segment) -> tsmlib.Plan:
+        predict = tsmlib.model_predictor(cost.model, past)
+        return tsmlib.cem(predict, cost.reward, space, 2, candidates=8, elites=2, iterations=1)
+
+    solver = Solver(search, cost.model.past_len)
+    config = SimpleNamespace(horizon=10 // block, action_block=block)
+    solver.configure(
+        action_space=gymnasium.spaces.Box(-1, 1, (2, 2), np.float32), n_envs=2, config=config
+    )
+    found = solver({"state": info["state"][:, 0]})["actions"]
+    assert found.shape == (2, solver.horizon, solver.action_dim) == (2, 5, 4)
+    wide = Cost(cost.model, cost.reward, action_block=block)
+    actions = found.reshape(2, 1, 10, 2)  # each of theirs is two of ours, in turn
+    torch.testing.assert_close(wide.get_cost(info, found[:, None]), cost.get_cost(info, actions))
+
+
 def test_the_solver_of_stable_worldmodel_finds_cheaper_plans_by_our_cost() -> None:
-    solvers = pytest.importorskip("stable_worldmodel.planning.solver.cem")
+    theirs = pytest.importorskip("stable_worldmodel")
+    solvers = theirs.planning.solver if hasattr(theirs, "planning") else theirs.solver  # 0.1.1
     cost, info, _ = costs(2, 32)
+    solver = solvers.CEMSolver(cost, batch_size=2, num_samples=32, n_steps=4, topk=6)
     space = gymnasium.spaces.Box(-1, 1, (2, 2), np.float32)
-    solver = solvers.CEMSolver(cost, num_samples=32, n_steps=4, topk=6, device="cpu")
-    plan = SimpleNamespace(horizon=10, action_block=1, warm_start=True, receding_horizon=10)
-    solver.configure(action_space=space, n_envs=2, config=plan)
+    config = SimpleNamespace(horizon=10, action_block=1)
+    solver.configure(action_space=space, n_envs=2, config=config)
     found = solver.solve({"state": info["state"][:, 0]})["actions"]
     still = torch.zeros(2, 32, 10, 2)
     best = cost.get_cost(info, found[:, None].expand_as(still))
