@@ -1,6 +1,7 @@
-"""Everything of a release into dist/: ``make release``, which builds explorer and docs first.
+"""Everything of a release into dist/, and tried: ``make release``, which builds explorer and docs.
 
 ``--draft`` allows uncommitted changes and a changelog without a date.
+``try`` tries dist/ again.
 ``address https://github.com/OWNER/tsmlib`` writes where the repository lies to the files that
 state it.
 """
@@ -17,11 +18,15 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import time
+import urllib.request
+import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
 DIST = ROOT / "dist"
 PAGE, SITE = ROOT / "explorer" / "dist", ROOT / "docs" / "_build" / "html"
+PLAIN = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
 ON_COLAB = ("00_quickstart", "11_pusht")
 COLAB = "[Open in Colab](https://colab.research.google.com/github/{}/blob/main/notebooks/{}.ipynb)"
 MODELS = """
@@ -73,7 +78,7 @@ def notes(*, draft: bool) -> tuple[str, str]:
 
 def run(*command: str | Path, cwd: Path = ROOT) -> str:
     done = subprocess.run(
-        [*map(str, command)], cwd=cwd, capture_output=True, text=True, check=False
+        [*map(str, command)], cwd=cwd, env=PLAIN, capture_output=True, text=True, check=False
     )
     if done.returncode:
         raise ReleaseError(
@@ -153,17 +158,12 @@ def build(*, draft: bool = False) -> Path:
         )
     if not (SITE / "index.html").exists():
         raise ReleaseError(f"there is no documentation in {SITE}: type make docs")
-    os.environ["SOURCE_DATE_EPOCH"] = run(
-        "git", "log", "-1", "--format=%ct"
-    )  # the same bytes again
+    PLAIN["SOURCE_DATE_EPOCH"] = run("git", "log", "-1", "--format=%ct")  # the same bytes again
     shutil.rmtree(DIST, ignore_errors=True)
     DIST.mkdir()
-    with (
-        tempfile.TemporaryDirectory() as place
-    ):  # a clean tree: nothing that building leaves gets in
-        for name in run(
-            "git", "ls-files", "--cached", "--others", "--exclude-standard"
-        ).splitlines():
+    listed = run("git", "ls-files", "--cached", "--others", "--exclude-standard")
+    with tempfile.TemporaryDirectory() as place:  # without what building leaves behind
+        for name in listed.splitlines():
             (Path(place) / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, Path(place) / name)
         core(Path(place), DIST)
@@ -176,6 +176,38 @@ def build(*, draft: bool = False) -> Path:
     for path in files:
         print(f"{path.stat().st_size / 1e6:8.2f} MB  {path.name}")
     return DIST
+
+
+def attempt(folder: Path = DIST) -> None:
+    """README's words in an empty environment, from that folder alone but for the dependencies."""
+    readme = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
+    (example,) = [block for block in readme if "save_video" in block]
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        venv.create(place / "fresh", with_pip=True)
+        scripts = place / "fresh" / ("Scripts" if os.name == "nt" else "bin")
+        python, tsmlib = scripts / "python", scripts / "tsmlib"
+        pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "-q"]
+        ours = ["--no-index", "--no-deps", "--find-links", folder, "tsmlib", "tsmlib-models"]
+        for title, *command in [
+            ("both packages", *pip, *ours),
+            ("torch", *pip, "torch"),
+            ("the other dependencies", *pip, "tsmlib"),
+            ("the version", tsmlib, "--version"),
+            ("README's example", python, "-c", example),
+            ("the notebooks", tsmlib, "notebooks", "mine"),
+        ]:
+            begin = time.perf_counter()
+            said = run(*command, cwd=place)
+            print(f"{time.perf_counter() - begin:6.1f} s  {title}: {said[-60:]!r}", flush=True)
+        served = [tsmlib, "explore", "--port", "0"]
+        with subprocess.Popen(served, cwd=place, stdout=subprocess.PIPE, text=True) as page:
+            try:
+                url = page.stdout.readline().split()[0]
+                with urllib.request.urlopen(url + "manifest.json") as answer:
+                    print(f"          the explorer: {len(json.load(answer)['tasks'])} tasks")
+            finally:
+                page.terminate()
 
 
 def address(url: str, root: Path = ROOT) -> None:
@@ -210,15 +242,18 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--draft", action="store_true")
-    parser.add_argument("words", nargs="*", metavar="address URL")
+    parser.add_argument("words", nargs="*", metavar="try | address URL")
     given = parser.parse_args()
     try:
         if not given.words:
             build(draft=given.draft)
+            attempt()
+        elif given.words == ["try"]:
+            attempt()
         elif len(given.words) == 2 and given.words[0] == "address":
             address(given.words[1])
         else:
-            parser.error("expected nothing, or: address URL")
+            parser.error("expected nothing, or: try, or: address URL")
     except ReleaseError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

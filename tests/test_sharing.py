@@ -19,7 +19,8 @@ from tsmlib.evaluation.conformal import Conformal
 from tsmlib.storage.files import StoreError
 
 ENV = "tsm/ReacherPush-v1"
-STEPS = {"onestep": 3, "rtsm": 11, "tsm": 11}  # of rtsm, one more than a segment
+STEPS = {"onestep": 3, "rtsm": 11, "tsm": 11}  # one more than a segment
+ALL = STEPS | {"lstm": 3, "egocentric": 3}
 
 
 def same(one: torch.nn.Module, other: torch.nn.Module) -> bool:
@@ -72,7 +73,8 @@ def test_a_model_goes_to_the_hub_and_comes_from_it(
 
 
 def rollout_of(word: str, steps: int) -> tuple[torch.nn.Module, tuple[torch.Tensor, ...]]:
-    model, task = tsmlib.load_pretrained(word, env=ENV), tsmlib.load_task(ENV).take(2)
+    env = "tsm/PushT-v0" if word == "egocentric" else ENV
+    model, task = tsmlib.load_pretrained(word, env=env), tsmlib.load_task(env).take(2)
     actions = 0.1 * torch.randn(2, steps, 2, generator=torch.Generator().manual_seed(0))
     return model, (*task.past(model.past_len), actions)
 
@@ -88,7 +90,7 @@ def test_an_exported_program_predicts_what_the_model_does(
     torch.testing.assert_close(program(states, moves, actions), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("word", "steps"), STEPS.items())
+@pytest.mark.parametrize(("word", "steps"), ALL.items())
 def test_an_onnx_file_predicts_what_the_model_does(word: str, steps: int, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")

@@ -95,8 +95,8 @@ def export(
         program = torch.export.export(graph, examples)
     except Exception as error:  # of any kind, from within torch
         raise ValueError(
-            f"a {type(model).__name__} cannot be exported ({error!s:.200}); a OneStep, a TSM and "
-            "a RecurrentTSM can"
+            f"a {type(model).__name__} cannot be exported ({error!s:.200}); a OneStep, LSTM, "
+            "Egocentric, TSM and RecurrentTSM can"
         ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".pt2":
