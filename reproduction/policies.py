@@ -45,11 +45,9 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
         load_data(run, name, "train"),
         the_task(run, name),
     )
-    copies, seed = run.pick(1, 1, 3), 1000 * run.seed
     dx, du = data.states.shape[2], data.actions.shape[2]
-    if space == "value":
-        copies = 1
-    how = {"angles": data.angles, "copies": copies, "seed": seed}
+    seed = 1000 * run.seed
+    how = {"angles": data.angles, "seed": seed}
     if space == "value":
         tip, block = rewards.TIP.start, rewards.BLOCK.start
         places = (tip, block) if task.name == "push" else (tip,)
@@ -90,28 +88,25 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
 
 
 @torch.no_grad()
-def assess(
-    policy: Policy, model: DynamicsModel, task: Task, *, seed: int
-) -> dict[str, torch.Tensor]:
-    """Executed and predicted return of a policy, without noise: means, one for each copy."""
-    many, done = _times(task, policy.copies), executed(policy, task)
-    start, draw = torch.from_numpy(many.start).float(), torch.Generator().manual_seed(seed)
+def assess(policy: Policy, model: DynamicsModel, task: Task, *, seed: int) -> dict[str, float]:
+    """Executed and predicted return of a policy, without noise: means."""
+    done = executed(policy, task)
+    start, draw = torch.from_numpy(task.start).float(), torch.Generator().manual_seed(seed)
     seen = imagine(
-        policy, model, start, many.target, horizon=task.horizon, noise=0.0, generator=draw
+        policy, model, start, task.target, horizon=task.horizon, noise=0.0, generator=draw
     )
     found = {
         "return_true": done.executed_return,
-        "return_predicted": many.reward(*seen).sum(-1),
+        "return_predicted": task.reward(*seen).sum(-1),
         "final_distance": done.final_distance,
         "success": (done.final_distance <= task.tolerance).float(),
     }
-    return {k: values.unflatten(0, (policy.copies, -1)).mean(1) for k, values in found.items()}
+    return {k: float(values.mean()) for k, values in found.items()}
 
 
 def executed(policy: Policy, task: Task) -> Trial:
-    """Every copy of a policy on every target, one copy after the other."""
-    many = _times(task, policy.copies)
-    return tsmlib.execute(many, controller(policy, many.target), past_len=policy.past_len)
+    """A policy on every target."""
+    return tsmlib.execute(task, controller(policy, task.target), past_len=policy.past_len)
 
 
 @torch.no_grad()
@@ -128,10 +123,9 @@ def learning_rows(run: Run, name: str, policy_name: str) -> list[Row]:
     measured = {k: torch.tensor(values) for k, values in curve["measured"].items()}
     measured["exploitation_gap"] = measured["return_predicted"] - measured["return_true"]
     rows = [
-        about | {"iteration": i, "metric": k, "value": v, "copy": c, "n": header["targets"]}
+        about | {"iteration": i, "metric": k, "value": v, "copy": 0, "n": header["targets"]}
         for k, values in measured.items()
-        for i, record in zip(curve["iteration"], values.tolist(), strict=True)
-        for c, v in enumerate(record)
+        for i, v in zip(curve["iteration"], values.tolist(), strict=True)
     ]
     rows += [
         about | {"iteration": i, "metric": "seconds", "value": s, "unit": "s"}
@@ -146,13 +140,7 @@ def learning_rows(run: Run, name: str, policy_name: str) -> list[Row]:
         *rows,
         about | about_data,
         *(
-            about | {"metric": k, "value": v, "unit": "share", "copy": c}
+            about | {"metric": k, "value": float(values.mean()), "unit": "share", "copy": 0}
             for k, values in ends.items()
-            for c, v in enumerate(values.unflatten(0, (policy.copies, -1)).mean(1).tolist())
         ),
     ]
-
-
-def _times(task: Task, n: int) -> Task:
-    """All of its targets n times, one round after the other."""
-    return task.take(n * list(range(len(task))))

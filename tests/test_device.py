@@ -217,9 +217,9 @@ def test_a_policy_learned_there_is_the_same_and_acts_here(through: str, device: 
 
     def learned(place: str) -> tuple[Any, Tensor]:
         if through == "codes":
-            policy: Any = SegmentPolicy(6, new_prior().float(), angles=(0, 1), channels=8, copies=2)
+            policy: Any = SegmentPolicy(6, new_prior().float(), angles=(0, 1), channels=8)
         else:
-            policy = OneStepPolicy(6, DU, angles=(0, 1), copies=2)
+            policy = OneStepPolicy(6, DU, angles=(0, 1))
 
         def draw(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
             return starts[torch.randint(8, (n,), generator=generator)], torch.randn(

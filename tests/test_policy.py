@@ -110,8 +110,8 @@ def prior() -> ActionPrior:
     return made
 
 
-def policy(kind: str, state_dim: int = 4, *, copies: int = 1, seed: int = 0, **options: Any) -> Any:
-    options = dict(angles=(), target_std=1.0, copies=copies, seed=seed) | options
+def policy(kind: str, state_dim: int = 4, *, seed: int = 0, **options: Any) -> Any:
+    options = dict(angles=(), target_std=1.0, seed=seed) | options
     if kind == "onestep":
         return OneStepPolicy(state_dim, DU, hidden=16, **options).double()
     return SegmentPolicy(
@@ -190,7 +190,7 @@ def test_a_model_that_cannot_step_predicts_segments_of_one_action() -> None:
 
 @KINDS
 def test_acting_on_is_acting_anew_on_the_last_steps(kind: str) -> None:
-    actor, past, target = policy(kind, copies=2), some_past(6, 4), normal(6, 2, seed=3)
+    actor, past, target = policy(kind), some_past(6, 4), normal(6, 2, seed=3)
     act, recent = actor.begin(past, target), past
     for k in range(7):
         x, u = recent.states[:, -1], recent.actions[:, -1]
@@ -256,7 +256,7 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
             return torch.from_numpy(self.env.rollout(actions.detach().numpy())).float()
 
     actor, target = (
-        policy(kind, 6, angles=(0, 1), target_std=0.1, copies=2).float(),
+        policy(kind, 6, angles=(0, 1), target_std=0.1).float(),
         0.1 * normal(4, 2).float(),
     )
     env = gymnasium.make_vec("tsm/Reacher-v0", num_envs=4)
@@ -278,32 +278,30 @@ def test_a_policy_acts_in_an_environment_as_in_a_model_of_it(kind: str) -> None:
 def test_a_policy_learned_through_the_true_model_arrives(kind: str) -> None:
     def distance(learner: Any) -> dict[str, Tensor]:
         end = imagine(learner, Sled(), start, target, horizon=10).states[:, -1]
-        return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
+        return {"distance": (end[:, :2] - target).norm(dim=1).mean()}
 
     actor, drawn = policy(kind), around()(50, torch.Generator().manual_seed(9))
     start, target = (part.double() for part in drawn)
     curve = learn(
         actor, Sled(0.01), horizon=10, episodes=20, iterations=90, record_every=45, measure=distance
     )
-    (before,), _, (after,) = curve.measured["distance"]
+    before, _, after = curve.measured["distance"]
     assert after < 0.2 * before
     assert curve.iteration == [0, 45, 90]
-    assert curve.predicted[2][0] > curve.predicted[1][0] > curve.predicted[0][0]
+    assert curve.predicted[2] > curve.predicted[1] > curve.predicted[0]
 
 
 @KINDS
 def test_short_pieces_and_a_value_teach_what_whole_episodes_do(kind: str) -> None:
     def distance(learner: Any) -> dict[str, Tensor]:
         end = imagine(learner, Sled(), start, target, horizon=20).states[:, -1]
-        return {"distance": (end[:, :2] - target).norm(dim=1).mean()[None]}
+        return {"distance": (end[:, :2] - target).norm(dim=1).mean()}
 
     actor, drawn = policy(kind), around()(50, torch.Generator().manual_seed(9))
     start, target = (part.double() for part in drawn)
     settings: dict[str, Any] = dict(horizon=20, bootstrap=3, gamma=0.9, noise=0.1, clip=1.0)
     settings |= dict(episodes=20, iterations=150, record_every=75)
-    (before,), _, (after,) = learn(actor, Sled(0.01), measure=distance, **settings).measured[
-        "distance"
-    ]
+    before, _, after = learn(actor, Sled(0.01), measure=distance, **settings).measured["distance"]
     assert after < 0.3 * before
 
 
@@ -315,25 +313,25 @@ def test_a_value_says_what_the_rest_of_an_episode_is_worth() -> None:
     for _ in range(200):
         past, target = ahead.begin(*around()(50, random))
         seen = imagine(actor, world, past, target, horizon=5, noise=0.2, generator=random)
-        rewards = arrive(target)(*seen)[None]
+        rewards = arrive(target)(*seen)
         ahead.learn(ahead.objective(seen, rewards)[1], adam)
     start, target = (part.repeat_interleave(100, 0) for part in around()(30, random))
     whole = imagine(actor, world, start, target, horizon=40, noise=0.2, generator=random)
     worth = discounted(arrive(target)(*whole), 0.8).unflatten(0, (30, 100)).mean(1)
-    said = ahead.value.output(start, target[None])[0, ::100, 0]
+    said = ahead.value.output(start, target)[::100, 0]
     assert torch.corrcoef(torch.stack([said, worth]))[0, 1] > 0.9
     assert said.mean().item() == pytest.approx(worth.mean().item(), rel=0.2)
 
 
 def test_a_policy_sees_how_far_and_which_way_each_place_is_from_the_next() -> None:
     actor = policy("onestep", 4, places=(0, 2))
-    goals = normal(1, 3, 2)
+    goals = normal(3, 2)
     states = torch.tensor([[0.0, 0.0, 3.0, 4.0]]).double().expand(3, -1)
     seen: list[Tensor] = []
     actor.net[0].register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     actor.output(states, goals)
     way = torch.tensor([3.0, 4.0, 5.0, 0.6, 0.8]).double()
-    torch.testing.assert_close(seen[0][0, 0, 6:11], way)
+    torch.testing.assert_close(seen[0][0, 6:11], way)
     with pytest.raises(ValueError, match=r"places is \(3,\); expected dimensions from 0 to 2"):
         policy("onestep", 4, places=(3,))
 
@@ -341,7 +339,7 @@ def test_a_policy_sees_how_far_and_which_way_each_place_is_from_the_next() -> No
 @pytest.mark.parametrize("name", ["tsm", "lstm", "ensemble"])
 @KINDS
 def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, name: str) -> None:
-    actor, world = policy(kind, DX, copies=2), model(name)
+    actor, world = policy(kind, DX), model(name)
     start, target = 0.1 * normal(4, DX), normal(4, 2, seed=1)
 
     def value() -> Tensor:
@@ -364,38 +362,6 @@ def test_the_gradient_of_the_return_is_that_of_finite_differences(kind: str, nam
                 p -= sign * size * d
     torch.testing.assert_close(slope, (ends[0] - ends[1]) / (2 * size), rtol=1e-5, atol=1e-8)
     assert abs(slope) > 1e-4
-
-
-@pytest.mark.parametrize("name", ["tsm", "ensemble"])
-@KINDS
-def test_copies_learn_as_they_would_alone(kind: str, name: str) -> None:
-    world, options = (
-        model(name),
-        LearningOptions(horizon=5, episodes=4, iterations=3, record_every=3, clip=0.5),
-    )
-
-    def starts(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        return torch.zeros(n, DX, dtype=torch.float64), torch.rand(
-            n, 2, generator=generator, dtype=torch.float64
-        )
-
-    def learned(copies: int, seed: int) -> tuple[Any, LearningCurve]:
-        actor = policy(kind, DX, copies=copies, seed=seed)
-        curve = learn_policy(actor, world, arrive, starts, options, seed=7 + seed)
-        return actor, curve
-
-    together, curve = learned(3, 0)
-    for m in range(3):
-        alone, own = learned(1, m)
-        for (name, p), q in zip(together.named_parameters(), alone.parameters(), strict=True):
-            torch.testing.assert_close(
-                p[m : m + 1] if p.requires_grad else p, q, msg=lambda text, name=name: name + text
-            )
-        torch.testing.assert_close(
-            torch.tensor(curve.predicted)[:, m : m + 1], torch.tensor(own.predicted)
-        )
-    first = next(together.parameters() if kind == "onestep" else together.head.parameters())
-    assert not torch.equal(first[0], first[1])
 
 
 def test_what_is_learned_is_the_policy_alone_and_not_the_model_or_the_prior() -> None:
@@ -433,28 +399,26 @@ def test_a_policy_sees_states_as_its_model_does_unless_it_was_fitted_before(kind
 def test_learning_that_was_stopped_continues_as_if_it_had_not(
     kind: str, bootstrap: int, tmp_path: Path
 ) -> None:
-    def stop_late(actor: Any) -> dict[str, Tensor]:
+    def stop_late(actor: Any) -> dict[str, float]:
         asked.append(weights(actor))
         if len(asked) == 4:  # at iterations 0, 2, 4 and 6
             raise KeyboardInterrupt
-        return {"asked": torch.tensor([float(len(asked))])}
+        return {"asked": float(len(asked))}
 
     asked: list[dict[str, Tensor]] = []
     whole, stopped = policy(kind), policy(kind)
     settings: dict[str, Any] = dict(
         iterations=8, bootstrap=bootstrap, checkpoint=tmp_path / "policy"
     )
-    curve = learn(
-        whole, measure=lambda _: {"asked": torch.ones(1)}, iterations=8, bootstrap=bootstrap
-    )
+    curve = learn(whole, measure=lambda _: {"asked": 1.0}, iterations=8, bootstrap=bootstrap)
     with pytest.raises(KeyboardInterrupt):
         learn(stopped, measure=stop_late, **settings)
     anew = policy(kind)
-    again = learn(anew, measure=lambda _: {"asked": torch.ones(1)}, **settings)
+    again = learn(anew, measure=lambda _: {"asked": 1.0}, **settings)
     assert same(weights(anew), weights(whole))
     assert again.iteration == curve.iteration == [0, 2, 4, 6, 8]
     assert again.predicted == curve.predicted
-    assert again.measured["asked"] == [[1.0], [2.0], [3.0], [1.0], [1.0]]
+    assert again.measured["asked"] == [1.0, 2.0, 3.0, 1.0, 1.0]
     others = (
         (policy(kind), {"horizon": 6}, "horizon is 5 in the file, expected 6; .*"),
         (policy(kind, seed=3), {}, "began with is '.*' in the file, expected '.*'"),
@@ -466,14 +430,14 @@ def test_learning_that_was_stopped_continues_as_if_it_had_not(
 
 def test_what_is_measured_may_be_no_number_and_comes_back_from_a_checkpoint(tmp_path: Path) -> None:
     def measure(_: Any) -> dict[str, Tensor]:
-        return {"distance": torch.tensor([math.nan]), "bound": torch.tensor([-math.inf])}
+        return {"distance": torch.tensor(math.nan), "bound": torch.tensor(-math.inf)}
 
     curves = [
         learn(policy("onestep"), measure=measure, checkpoint=tmp_path / "policy") for _ in range(2)
     ]
     for curve in curves:
         assert np.isnan(curve.measured["distance"]).all()
-        assert curve.measured["bound"] == [[-math.inf]] * 3
+        assert curve.measured["bound"] == [-math.inf] * 3
 
 
 def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> None:
@@ -493,19 +457,13 @@ def test_a_checkpoint_of_other_starts_or_targets_is_refused(tmp_path: Path) -> N
 
 
 def test_a_callback_sees_every_record_of_learning_and_leaves_the_bits_alone() -> None:
-    alone, watched, seen = (
-        policy("onestep", copies=2),
-        policy("onestep", copies=2),
-        list[Progress](),
-    )
-    settings: dict[str, Any] = dict(measure=lambda _: {"asked": torch.tensor([1.0, 3.0])})
+    alone, watched, seen = policy("onestep"), policy("onestep"), list[Progress]()
+    settings: dict[str, Any] = dict(measure=lambda _: {"asked": torch.tensor([2.0])})
     learn(alone, **settings)
     curve = learn(watched, callback=seen.append, **settings)
     assert same(weights(watched), weights(alone))
     assert [one.step for one in seen] == curve.iteration == [0, 2, 4]
-    assert [one.values["predicted"] for one in seen] == [
-        sum(copies) / 2 for copies in curve.predicted
-    ]
+    assert [one.values["predicted"] for one in seen] == curve.predicted
     assert [one.values["asked"] for one in seen] == [2.0] * 3
 
 
@@ -524,7 +482,7 @@ def test_targets_fill_the_disc_evenly_and_starts_are_among_those_given() -> None
 
 @KINDS
 def test_a_policy_comes_back_from_its_file(kind: str, tmp_path: Path) -> None:
-    actor, path = policy(kind, copies=2), tmp_path / "policy.safetensors"
+    actor, path = policy(kind), tmp_path / "policy.safetensors"
     actor.features.fit(normal(5, 8, 4))
     artifacts.save_model(path, actor.float(), {"fingerprint": {"env": "tsm/Reacher-v0"}})
     again = artifacts.load_model(path, type(actor), expect={"env": "tsm/Reacher-v0"})
@@ -582,7 +540,6 @@ def test_a_policy_of_another_environment_is_refused(kind: str) -> None:
 def test_pasts_and_targets_that_do_not_fit_are_refused() -> None:
     past = some_past(4, 4)
     for actor, target, message in (
-        (policy("onestep", copies=3), torch.zeros(4, 2), "4 episodes do not divide among 3 copies"),
         (
             policy("onestep"),
             torch.zeros(3, 2),
@@ -601,8 +558,8 @@ def test_pasts_and_targets_that_do_not_fit_are_refused() -> None:
         match="the past holds 2 steps, SegmentPolicy needs 4; collect or execute with past_len=4",
     ):
         policy("segment").begin(past.last(2), torch.zeros(4, 2))
-    with pytest.raises(ValueError, match="copies is 0"):
-        policy("onestep", copies=0)
+    with pytest.raises(ValueError, match="measure gave 2 values of 'both'; expected one"):
+        learn(policy("onestep"), measure=lambda _: {"both": torch.zeros(2)})
 
 
 @pytest.mark.parametrize("fault", ["states", "gradient"])

@@ -135,12 +135,12 @@ def train(checkpoint: Path | None, loss: Any = None, **settings: Any) -> str:
 
 
 def learn(checkpoint: Path | None) -> str:
-    """The same of two copies of a policy, in a model that is not trained."""
+    """The same of a policy, in a model that is not trained."""
 
     def near(target: Tensor) -> Reward:
         return lambda states, actions: -(states[..., 1:] - target[:, None]).square().sum(-1)
 
-    policy, model = OneStepPolicy(3, 2, angles=(0,), hidden=8, copies=2), new_model(tiny)
+    policy, model = OneStepPolicy(3, 2, angles=(0,), hidden=8), new_model(tiny)
     starts = episodes_from(torch.from_numpy(TRAIN.states[:, 0]))
     options = LearningOptions(horizon=6, episodes=4, iterations=24, record_every=4)
     curve = learn_policy(policy, model, near, starts, options, checkpoint=checkpoint)

@@ -1,6 +1,6 @@
 """Layers of segment models and policies: gated causal convolutions (Eq. 1), an encoder (A.1).
 
-Letters in shapes: B batch, M models side by side, P positions in time, C channels, dz latent size.
+Letters in shapes: B batch, P positions in time, C channels, dz latent size.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,21 +62,19 @@ class GatedLayer(nn.Module):
         h = tanh(W_f * s + V_f^T z) . sigmoid(W_g * s + V_g^T z)
 
     As one matrix product over the two taps, s_{t-d} and s_t, the same function serves all positions
-    (B, P, C), one (B, C) and one of M models (M, B, C).
+    (B, P, C) and one (B, C). ``taps``: W_f and W_g; ``out``: 1x1, residual and skip.
 
     Args:
-        taps: W_f and W_g, 2 C -> 2 C.
-        out: 1x1, residual and skip, C -> 2 C.
+        channels: C.
         residual: without only for an ablation (section 3.1).
         skip: without only for an ablation.
     """
 
-    def __init__(
-        self, taps: nn.Module, out: nn.Module, *, residual: bool = True, skip: bool = True
-    ) -> None:
+    def __init__(self, channels: int, *, residual: bool = True, skip: bool = True) -> None:
         super().__init__()
         self.residual, self.skip = residual, skip
-        self.taps, self.out = taps, out
+        self.taps = nn.Linear(2 * channels, 2 * channels)
+        self.out = nn.Linear(channels, 2 * channels)
 
     def forward(self, earlier: Tensor, now: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs at t - d and t (..., C), V z (..., 2 C) -> the next layer's input and the skip."""
@@ -132,12 +130,7 @@ class CausalDecoder(nn.Module):
         self.dilations, self.plain = tuple(dilations), plain
         # Plain: neither residual nor skip connections but the last layer's output.
         self.layers = nn.ModuleList(
-            GatedLayer(
-                nn.Linear(2 * channels, 2 * channels),
-                nn.Linear(channels, 2 * channels),
-                residual=not plain,
-                skip=not plain or last,
-            )
+            GatedLayer(channels, residual=not plain, skip=not plain or last)
             for last in [*[False] * (len(dilations) - 1), True]
         )
         # V_f, V_g of every layer

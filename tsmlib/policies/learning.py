@@ -9,8 +9,7 @@ or, with ``LearningOptions.with_value``, of pieces of an episode and the value o
     SegmentPolicy    Z ~ N(pi(X-, U-, g), sd^2)      acts by the first action that the prior decodes
 
 g is the target, so one policy serves every instance of a task. The real environment is never asked
-while learning. Copy m of a policy starts from weights and learns from noise drawn from ``seed + m``
-alone, as it would on its own.
+while learning.
 
 Letters in shapes: as in ``networks``; n episodes, T horizon.
 """
@@ -38,9 +37,9 @@ from tsmlib.models.base import Model, as_dynamics
 from tsmlib.policies.imagination import imagine
 from tsmlib.policies.networks import Policy
 from tsmlib.policies.options import LearningCurve, LearningOptions
-from tsmlib.policies.value import RATE, Bootstrap, Lesson, clip_gradients, discounted
+from tsmlib.policies.value import RATE, Bootstrap, Lesson, discounted
 from tsmlib.rewards import Reward, fingerprint, rewarded
-from tsmlib.sampling import Noise, SeparateNoise
+from tsmlib.sampling import Noise
 from tsmlib.storage import artifacts
 from tsmlib.storage.files import Json, PathLike
 from tsmlib.training.callbacks import Callback, Progress
@@ -51,7 +50,7 @@ from tsmlib.trajectory import Segment
 RewardFor = Callable[[Tensor], Reward]  # targets (R, dg) -> reward
 # n, generator -> starting states (n, dx), targets (n, dg)
 Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]
-Measure = Callable[[Policy], Mapping[str, Tensor]]  # named numbers, one per copy (M,)
+Measure = Callable[[Policy], Mapping[str, float | Tensor]]  # named numbers
 
 
 @torch.enable_grad()  # see training.fit
@@ -68,7 +67,7 @@ def learn_policy(
     progress: str | bool = "",
     callback: Callback | None = None,
 ) -> LearningCurve:
-    """Improve all copies of a policy inside a model, by Adam on the discounted return (Eq. 4).
+    """Improve a policy inside a model, by Adam on the discounted return (Eq. 4).
 
     Episodes and noise are functions of (seed, iteration), so a run that is resumed from
     ``checkpoint`` continues as if it had not stopped. The model is left as it was. A policy whose
@@ -81,8 +80,8 @@ def learn_policy(
             ``tsmlib.rewards.reach``.
         draw: (n, generator) -> starts (n, dx) and targets (n, dg) of episodes.
         options: the schedule; the paper's without.
-        seed: of copy 0; copy m has seed + m.
-        measure: policy -> named numbers (M,), one per copy, at every record.
+        seed: of episodes and noise.
+        measure: policy -> named numbers, at every record.
         checkpoint: a folder of its own; one of another run is refused.
         progress: whether to show a progress bar, or its title.
         callback: called with a ``Progress`` at every record, the one before the first update too.
@@ -130,9 +129,9 @@ def learn_policy(
                     group["lr"] = rate * RATE if name == "value" else rate
             objective, lesson = learner.objective(iteration)
             optimizer.zero_grad(set_to_none=True)
-            (-objective.mean(1).sum()).backward()
-            gradients = [p.grad for p in trained if p.grad is not None]
-            if not torch.isfinite(clip_gradients(gradients, options.clip)).all():
+            (-objective.mean()).backward()
+            norm = nn.utils.clip_grad_norm_(trained, options.clip or torch.inf)
+            if not torch.isfinite(norm):
                 raise state.stopped("the gradient of the return is not finite", iteration)
             optimizer.step()
             if learner.ahead is not None and lesson is not None:
@@ -181,7 +180,7 @@ class _Learner:
     ahead: Bootstrap | None = None
 
     def drawn(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Starts (n, dx) and targets (n, dg) of one copy, checked."""
+        """Starts (n, dx) and targets (n, dg), checked."""
         both = self.draw(n, generator)
         require_type("what draw gave", both, tuple, "two tensors, starts and targets")
         start, target = both
@@ -191,16 +190,13 @@ class _Learner:
             as_tensor("draw's targets", target, (n, self.policy.target_dim), dtype=dtype),
         )
 
-    def episodes(self, iteration: int, n: int) -> tuple[Tensor, Tensor, SeparateNoise]:
-        """Starts (R, dx) and targets (R, dg) of n episodes of each copy, and their noise."""
-        seeds = [(self.seed + m) * 1_000_003 + iteration for m in range(self.policy.copies)]
-        generators = tuple(torch.Generator().manual_seed(seed) for seed in seeds)
-        episodes = [self.drawn(n, generator) for generator in generators]
-        start, target = (torch.cat(part) for part in zip(*episodes, strict=True))
-        return start, target, SeparateNoise(generators)
+    def episodes(self, iteration: int, n: int) -> tuple[Tensor, Tensor, Noise]:
+        """Starts (n, dx) and targets (n, dg) of n episodes, and their noise."""
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + iteration)
+        return *self.drawn(n, generator), generator
 
     def objective(self, iteration: int) -> tuple[Tensor, Lesson | None]:
-        """What the policy improves (M, B), and what the value is to learn, if there is one."""
+        """What the policy improves (R,), and what the value is to learn, if there is one."""
         o, (start, target, noise) = self.options, self.episodes(iteration, self.options.episodes)
         if self.ahead is None:
             _, rewards = self.imagined(start, target, noise, o.horizon, iteration)
@@ -212,7 +208,7 @@ class _Learner:
     def imagined(
         self, start: Tensor | Segment, target: Tensor, noise: Noise, steps: int, iteration: int
     ) -> tuple[Segment, Tensor]:
-        """Episodes, and the rewards (M, B, T) of each of their steps; a record's without noise."""
+        """Episodes, and the rewards (R, T) of each of their steps; a record's without noise."""
         spread = self.options.noise if torch.is_grad_enabled() else 0.0
         seen = imagine(
             self.policy,
@@ -235,7 +231,7 @@ class _Learner:
                 "the reward has no gradient: write it with differentiable torch operations on the "
                 "states or actions (no comparisons, rounding, .detach(), .item() or numpy)"
             )
-        return seen, rewards.unflatten(0, (self.policy.copies, -1))
+        return seen, rewards
 
     def reward_for(self, target: Tensor) -> Reward:
         """The reward of some targets (R, dg)."""
@@ -259,7 +255,6 @@ class _Learner:
         digest = artifacts.digest(model.state_dict()) if isinstance(model, nn.Module) else ""
         identity: dict[str, Json] = {
             "policy": type(self.policy).__name__,
-            "copies": self.policy.copies,
             "model": f"{type(model).__name__} {digest}",
             "reward of chance": list(chance),
         }
@@ -273,25 +268,19 @@ class _Learner:
         with torch.no_grad():  # the same episodes every time
             at = self.options.iterations
             _, rewards = self.imagined(*self.episodes(at, 50), self.options.horizon, at)
-        predicted = rewards.sum(-1).mean(1)
+        record = {"predicted": float(rewards.sum(-1).mean())}
         curve = self.state.curve
         curve.iteration.append(self.state.step)
         curve.seconds.append(self.state.seconds)
-        curve.predicted.append(predicted.tolist())
-        newest = {"predicted": curve.predicted[-1]}
-        for name, values in (measure(self.policy) if measure else {}).items():
-            numbers = torch.as_tensor(values).double().flatten().tolist()  # may be no number
-            if len(numbers) != self.policy.copies:
-                raise ValueError(
-                    f"measure gave {len(numbers)} values of {name!r}; expected one for each of the "
-                    f"{self.policy.copies} copies"
-                )
-            curve.measured.setdefault(name, []).append(numbers)
-            newest[name] = numbers
-        self.state.keep(-predicted.mean().item())
+        curve.predicted.append(record["predicted"])
+        for name, value in (measure(self.policy) if measure else {}).items():
+            if (n := torch.as_tensor(value).numel()) != 1:
+                raise ValueError(f"measure gave {n} values of {name!r}; expected one")
+            record[name] = float(value)  # may be no number
+            curve.measured.setdefault(name, []).append(record[name])
+        self.state.keep(-record["predicted"])
         if callback is not None:
-            means = {name: sum(values) / len(values) for name, values in newest.items()}
-            callback(Progress(self.state.step, self.state.seconds, means))
+            callback(Progress(self.state.step, self.state.seconds, record))
 
 
 def learning_rate(iteration: int, lr: float, decay: float, final: float) -> float:

@@ -1,7 +1,6 @@
 """Policies: a one-step network and a segment policy that acts through the prior (section 4.3).
 
-Letters in shapes: M copies of a policy, B episodes of each, R = M B rows laid out copy by copy, L
-past length, dx, du, dz, dg size of state, action, code, target.
+Letters in shapes: R episodes, L past length, dx, du, dz, dg size of state, action, code, target.
 """
 
 from __future__ import annotations
@@ -16,17 +15,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tsmlib.checks import (
-    as_tensor,
-    require_counts,
-    require_number,
-    require_seed,
-    require_type,
-)
+from tsmlib.checks import as_tensor, require_counts, require_number, require_type
 from tsmlib.collection import Controller
 from tsmlib.models.action_prior import ActionPrior
 from tsmlib.models.base import Model
-from tsmlib.models.config import Configured
+from tsmlib.models.config import Configured, weights_from
 from tsmlib.models.features import Features
 from tsmlib.models.layers import GatedLayer, advance, on_device_of
 from tsmlib.storage.files import Json
@@ -37,7 +30,7 @@ Act = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 class Policy(Configured):
-    """M copies of pi(. | past, target), asked one step at a time: the base of all policies.
+    """pi(. | past, target), asked one step at a time: the base of all policies.
 
     ``features`` standardise its states once they have statistics, by ``fit`` or from the model that
     it learns in.
@@ -47,7 +40,6 @@ class Policy(Configured):
         target_dim: dg.
         angles: state dimensions in radians.
         target_std: metres, what a target counts in.
-        copies: M.
 
     Attributes:
         past_len: L, steps of past that it reads.
@@ -67,11 +59,10 @@ class Policy(Configured):
         *,
         angles: tuple[int, ...],
         target_std: float,
-        copies: int,
     ) -> None:
         super().__init__()
-        require_counts(state_dim=state_dim, target_dim=target_dim, copies=copies)
-        self.state_dim, self.target_dim, self.copies = state_dim, target_dim, copies
+        require_counts(state_dim=state_dim, target_dim=target_dim)
+        self.state_dim, self.target_dim = state_dim, target_dim
         self.target_std = require_number("target_std", target_std, 0, above=True)
         self.features = Features(state_dim, angles)
 
@@ -91,14 +82,14 @@ class Policy(Configured):
         raise NotImplementedError
 
     def goals(self, past: Segment, target: Tensor) -> Tensor:
-        """Scale targets and lay them out copy by copy, as the network sees them.
+        """Scale targets, as the network sees them.
 
         Args:
             past: states (R, L, dx) in physical units, and the actions (R, L, du) that led to them.
             target: (R, dg), in the task's unit, metres for places.
 
         Returns:
-            Targets (M, B, dg), in units of ``target_std``.
+            Targets (R, dg), in units of ``target_std``.
 
         Raises:
             ValueError: past or target do not fit the policy.
@@ -114,10 +105,8 @@ class Policy(Configured):
                 f"the past holds {steps} steps, {name} needs {self.past_len}; collect or execute "
                 f"with past_len={self.past_len}"
             )
-        if rows % self.copies:
-            raise ValueError(f"{rows} episodes do not divide among {self.copies} copies of {name}")
         target = as_tensor("target", target, (rows, self.target_dim), dtype=past.states.dtype)
-        return self.by_copy(target / self.target_std)
+        return target / self.target_std
 
     def take_statistics(self, model: Model) -> None:
         """Take the statistics of a model's features, where the policy has none of its own.
@@ -139,38 +128,6 @@ class Policy(Configured):
                 stacklevel=3,
             )
 
-    def by_copy(self, rows: Tensor) -> Tensor:
-        """Lay rows out copy by copy.
-
-        Args:
-            rows: (R, k).
-
-        Returns:
-            The same numbers as (M, B, k).
-        """
-        return rows.unflatten(0, (self.copies, -1))
-
-
-class BatchedLinear(nn.Module):
-    """M linear layers side by side, (M, B, in) -> (M, B, out), drawn as torch draws one."""
-
-    def __init__(self, inputs: int, outputs: int, generators: Sequence[torch.Generator]) -> None:
-        super().__init__()
-        bound = inputs**-0.5 if inputs else 0.0  # no input: the target of a task without targets
-
-        def drawn(*shape: int) -> nn.Parameter:
-            return nn.Parameter(
-                torch.stack(
-                    [torch.rand(shape, generator=g) * 2 * bound - bound for g in generators]
-                )
-            )
-
-        self.weight = drawn(inputs, outputs)  # (M, in, out)
-        self.bias = drawn(1, outputs)  # (M, 1, out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
-
 
 class OneStepPolicy(Policy):
     """pi(u_t | x_t, g): a fully connected network of the present state and target (A.3).
@@ -188,8 +145,7 @@ class OneStepPolicy(Policy):
         places: first dimensions of places (dg,) in the state that are to meet one after the other,
             and the last of them the target, as fingertip and object: the network sees how far and
             in which direction each is from the next; none without.
-        copies: M, side by side.
-        seed: of the weights of copy 0; copy m has seed + m.
+        seed: of the weights.
 
     Raises:
         ValueError: a place that does not lie in the state.
@@ -208,10 +164,9 @@ class OneStepPolicy(Policy):
         layers: int = 2,
         target_std: float = 0.1,
         places: Sequence[int] = (),
-        copies: int = 1,
         seed: int = 0,
     ) -> None:
-        super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
+        super().__init__(state_dim, target_dim, angles=angles, target_std=target_std)
         require_counts(action_dim=action_dim, hidden=hidden, layers=layers)
         self.action_dim = self.output_dim = action_dim
         if any(type(d) is not int or not 0 <= d <= state_dim - target_dim for d in places):
@@ -220,10 +175,10 @@ class OneStepPolicy(Policy):
                 f"{state_dim - target_dim}, at each of which a place of {target_dim} numbers begins"
             )
         self.places = tuple(places)
-        generators = _generators(copies, seed)
         seen = self.features.dim + target_dim + len(self.places) * (2 * target_dim + 1)
         widths = [seen, *[hidden] * layers, action_dim]
-        self.net = nn.ModuleList(BatchedLinear(i, o, generators) for i, o in pairwise(widths))
+        with weights_from(seed):
+            self.net = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(widths))
         with torch.no_grad():
             for parameter in self.net[-1].parameters():
                 parameter.mul_(0.1)
@@ -244,7 +199,7 @@ class OneStepPolicy(Policy):
         goals = self.goals(past, target)
 
         def act(x: Tensor, u: Tensor, noise: Tensor | None) -> Tensor:
-            mean = self.output(x, goals).tanh().flatten(0, 1)
+            mean = self.output(x, goals).tanh()
             return mean if noise is None else (mean + noise).clamp(-1, 1)
 
         return act
@@ -254,19 +209,18 @@ class OneStepPolicy(Policy):
 
         Args:
             x: states (R, dx), physical units.
-            goals: (M, B, dg), as ``goals`` gives them.
+            goals: (R, dg), as ``goals`` gives them.
 
         Returns:
-            (M, B, du).
+            (R, du).
         """
-        seen = [self.by_copy(self.features(x)), goals]  # (M, B, .)
-        x = self.by_copy(x / self.target_std)
-        places = [x[..., d : d + self.target_dim] for d in self.places]
+        seen, x = [self.features(x), goals], x / self.target_std
+        places = [x[:, d : d + self.target_dim] for d in self.places]
         for here, there in pairwise([*places, goals]):
             way = there - here
             length = (way.square().sum(-1, keepdim=True) + 1e-6).sqrt()
             seen += [way, length, way / length]
-        s = torch.cat(seen, dim=-1)  # (M, B, in)
+        s = torch.cat(seen, dim=-1)
         for i, layer in enumerate(self.net):
             s = layer(F.relu(s) if i else s)
         return s
@@ -290,8 +244,7 @@ class SegmentPolicy(Policy):
         channels: of every layer.
         dilations: of the layers; their sum and one is the receptive field, H by default.
         target_std: what a target counts in, metres.
-        copies: M, side by side.
-        seed: of the weights of copy 0; copy m has seed + m.
+        seed: of the weights.
     """
 
     def __init__(
@@ -304,10 +257,9 @@ class SegmentPolicy(Policy):
         channels: int = 32,
         dilations: Sequence[int] = (1, 2, 4, 2),
         target_std: float = 0.1,
-        copies: int = 1,
         seed: int = 0,
     ) -> None:
-        super().__init__(state_dim, target_dim, angles=angles, target_std=target_std, copies=copies)
+        super().__init__(state_dim, target_dim, angles=angles, target_std=target_std)
         hint = 'an ActionPrior, such as tsmlib.load_pretrained("prior", env=env)'
         require_type("prior", prior, (ActionPrior, Mapping), hint)
         require_counts(channels=channels)
@@ -317,15 +269,12 @@ class SegmentPolicy(Policy):
         self.past_len = max(1 + sum(dilations), self.prior.past_len)
         self.dilations = tuple(dilations)
 
-        generators = _generators(copies, seed)
-        self.inlet = BatchedLinear(self.features.dim + self.action_dim, channels, generators)
-        # Drawn before all the outs.
-        taps = [BatchedLinear(2 * channels, 2 * channels, generators) for _ in dilations]
-        outs = [BatchedLinear(channels, 2 * channels, generators) for _ in dilations]
-        self.layers = nn.ModuleList(map(GatedLayer, taps, outs))
-        # V_f, V_g of every layer.
-        self.codes = BatchedLinear(target_dim, 2 * channels * len(dilations), generators)
-        self.head = BatchedLinear(channels, self.output_dim, generators)
+        with weights_from(seed):
+            self.inlet = nn.Linear(self.features.dim + self.action_dim, channels)
+            self.layers = nn.ModuleList(GatedLayer(channels) for _ in dilations)
+            # V_f, V_g of every layer.
+            self.codes = nn.Linear(target_dim, 2 * channels * len(dilations))
+            self.head = nn.Linear(channels, self.output_dim)
 
     def begin(self, past: Segment, target: Tensor) -> Act:
         """Read the past but for its last step; inputs of layers are carried from step to step.
@@ -342,19 +291,19 @@ class SegmentPolicy(Policy):
         """
         codes = self.codes(self.goals(past, target))
         past = past.last(self.past_len)
-        zeros = codes.new_zeros(*codes.shape[:2], self.inlet.bias.shape[-1])
+        zeros = codes.new_zeros(len(codes), self.inlet.out_features)
         cache = [[zeros] * dilation for dilation in self.dilations]
 
         def read(x: Tensor, u: Tensor) -> Tensor:
-            inputs = self.by_copy(torch.cat([self.features(x), u / self.prior.std], dim=-1))
-            return advance(self.inlet, self.layers, inputs, codes, cache)  # (M, B, C)
+            inputs = torch.cat([self.features(x), u / self.prior.std], dim=-1)
+            return advance(self.inlet, self.layers, inputs, codes, cache)  # (R, C)
 
         for x, u in list(zip(past.states.unbind(1), past.actions.unbind(1), strict=True))[:-1]:
             read(x, u)
         actions = deque(past.actions[:, :-1].unbind(1), maxlen=self.prior.past_len)
 
         def act(x: Tensor, u: Tensor, noise: Tensor | None) -> Tensor:
-            z = self.head(F.relu(read(x, u))).flatten(0, 1)  # (R, dz)
+            z = self.head(F.relu(read(x, u)))  # (R, dz)
             actions.append(u)
             return self.prior.first(
                 torch.stack(tuple(actions), dim=1), z if noise is None else z + noise
@@ -383,8 +332,3 @@ def controller(policy: Policy, target: Tensor) -> Controller:
         return act(states[:, -1], actions[:, -1], None)[:, None].to(past.states.device)
 
     return control
-
-
-def _generators(copies: int, seed: int) -> list[torch.Generator]:
-    seed = require_seed("seed", seed)
-    return [torch.Generator().manual_seed(seed + m) for m in range(copies)]

@@ -17,12 +17,12 @@ class LearningOptions:
         horizon: T, steps of an imagined episode.
         gamma: discount per step, above 0 and at most 1.
         noise: standard deviation of the policy's output.
-        episodes: imagined per update, of each copy.
+        episodes: imagined per update.
         iterations: updates; at 2200 the rate has decayed (A25).
         lr: learning rate of Adam.
         lr_decay: per 100 iterations, above 0 and at most 1.
         lr_final: where the decay ends.
-        clip: norm that each copy's gradient is shortened to; 0 never, the paper states none.
+        clip: norm that the gradient is shortened to; 0 never, the paper states none.
         record_every: iterations between records; a checkpoint is written as often.
         bootstrap: H, steps of an update, after which a learned value stands for the rest of the
             episode; 0 for the paper's way, whole episodes and no value.
@@ -84,17 +84,17 @@ class LearningCurve(Curve):
 
     Attributes:
         iteration: updates done.
-        predicted: undiscounted predicted return of each copy, mean over the same 50 episodes.
-        measured: by name what ``measure`` returned for each copy, such as the executed return.
+        predicted: undiscounted predicted return, mean over the same 50 episodes.
+        measured: by name what ``measure`` returned, such as the executed return.
     """
 
     unit: ClassVar[str] = "iteration"
     remedy: ClassVar[str] = "Check that the reward's gradient is finite everywhere, or clip"
     iteration: list[int] = field(default_factory=list)
-    predicted: list[list[float]] = field(default_factory=list)
-    measured: dict[str, list[list[float]]] = field(default_factory=dict)
+    predicted: list[float] = field(default_factory=list)
+    measured: dict[str, list[float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         ends = self.predicted[:: max(1, len(self.predicted) - 1)]
-        returns = " to ".join(f"{sum(copies) / len(copies):.4g}" for copies in ends)
+        returns = " to ".join(f"{value:.4g}" for value in ends)
         return f"LearningCurve({max(self.iteration, default=0)} iterations, return {returns})"

@@ -11,7 +11,6 @@ Letters in shapes: as in ``networks``; H steps of a piece.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 
 import torch
@@ -23,7 +22,7 @@ from tsmlib.policies.networks import OneStepPolicy, Policy
 from tsmlib.policies.options import LearningOptions
 from tsmlib.trajectory import Segment, initial_past
 
-Lesson = tuple[Tensor, Tensor]  # states (R, H, dx) and the returns (M, B, H) from each of them
+Lesson = tuple[Tensor, Tensor]  # states (R, H, dx) and the returns (R, H) from each of them
 
 HIDDEN = 256  # units of the value's two layers
 LAMBDA = 0.95
@@ -35,15 +34,6 @@ def discounted(rewards: Tensor, gamma: float) -> Tensor:
     """sum_t gamma^t r_t over the last dimension, the first step in full (Eq. 4 up to gamma)."""
     steps = torch.arange(rewards.shape[-1], dtype=rewards.dtype, device=rewards.device)
     return (rewards * gamma**steps).sum(-1)
-
-
-def clip_gradients(gradients: Sequence[Tensor], norm: float) -> Tensor:
-    """Shorten each copy's gradients (M, ...) to ``norm`` unless it is 0; the norms before (M,)."""
-    norms = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
-    if norm:
-        for g in gradients:
-            g *= (norm / norms).clamp(max=1).reshape(-1, *[1] * (g.ndim - 1))
-    return norms
 
 
 class Bootstrap(nn.Module):
@@ -72,20 +62,18 @@ class Bootstrap(nn.Module):
             hidden=HIDDEN,
             target_std=policy.target_std,
             places=policy.places,
-            copies=policy.copies,
             seed=seed,
         )
         like = next(policy.parameters())
         self.value.to(like)
         self.value.features.load_state_dict(policy.features.state_dict())
         self.slow = deepcopy(self.value).requires_grad_(False)
-        rows, steps = policy.copies * options.episodes, imagined_past(policy, model)
+        rows, steps = options.episodes, imagined_past(policy, model)
         self.register_buffer("states", like.new_zeros(rows, steps, policy.state_dim))
         self.register_buffer("actions", like.new_zeros(rows, steps, policy.action_dim))
         self.register_buffer("target", like.new_zeros(rows, policy.target_dim))
         # Steps that are left; first ones end one after the other.
-        ends = torch.arange(options.episodes) * options.horizon // options.episodes
-        self.register_buffer("left", -ends.repeat(policy.copies))
+        self.register_buffer("left", -(torch.arange(rows) * options.horizon // rows))
 
     def begin(self, start: Tensor, target: Tensor) -> tuple[Segment, Tensor]:
         """Pasts and targets of the next piece.
@@ -110,12 +98,12 @@ class Bootstrap(nn.Module):
 
         Args:
             seen: states (R, H, dx) and actions (R, H, du).
-            rewards: (M, B, H).
+            rewards: (R, H).
 
         Returns:
-            J (M, B), with a gradient; and the lesson.
+            J (R,), with a gradient; and the lesson.
         """
-        gamma, steps, before = self.options.gamma, rewards.shape[2], self.states[:, -1:]
+        gamma, steps, before = self.options.gamma, rewards.shape[1], self.states[:, -1:]
         last = self._values(self.slow, seen.states[:, -1:])[..., 0]
         objective = discounted(rewards, gamma) + gamma**steps * last
         with torch.no_grad():
@@ -136,7 +124,7 @@ class Bootstrap(nn.Module):
         """Bring V nearer to the returns, every other step at a time, and V' to V.
 
         Args:
-            lesson: states (R, H, dx) and their returns (M, B, H).
+            lesson: states (R, H, dx) and their returns (R, H).
             optimizer: of the value's weights.
         """
         states, returns = lesson
@@ -144,16 +132,15 @@ class Bootstrap(nn.Module):
         for first in range(min(2, states.shape[1])):
             error = self._values(self.value, states[:, first::2]) - returns[..., first::2]
             optimizer.zero_grad(set_to_none=True)
-            error.square().mean((1, 2)).sum().backward()
-            clip_gradients([p.grad for p in weights if p.grad is not None], self.options.clip)
+            error.square().mean().backward()
+            nn.utils.clip_grad_norm_(weights, self.options.clip or torch.inf)
             optimizer.step()
             with torch.no_grad():
                 for slow, p in zip(self.slow.parameters(), self.value.parameters(), strict=True):
                     slow.lerp_(p, SLOW)
 
     def _values(self, value: OneStepPolicy, states: Tensor) -> Tensor:
-        """(M, B, K) of states (R, K, dx), under the targets of the episodes."""
+        """(R, K) of states (R, K, dx), under the targets of the episodes."""
         goals = (self.target / value.target_std)[:, None].expand(-1, states.shape[1], -1)
-        goals = value.by_copy(goals.flatten(0, 1))
-        found: Tensor = value.output(states.flatten(0, 1), goals)[..., 0]
-        return found.unflatten(1, (-1, states.shape[1]))
+        found = value.output(states.flatten(0, 1), goals.flatten(0, 1))
+        return found.unflatten(0, (-1, states.shape[1]))[..., 0]
