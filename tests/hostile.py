@@ -85,36 +85,6 @@ class DelayInAnObject(Cart):
         return self.line.later(float(u[0]))
 
 
-class DelayWithMethods(DelayInAnObject):
-    """Says how its state is saved."""
-
-    def save_state(self) -> Any:
-        return self.x, self.line.held
-
-    def restore_state(self, state: Any) -> None:
-        self.x, self.line.held = state
-
-
-class HalfASave(DelayInAnObject):
-    """Forgets the line."""
-
-    def save_state(self) -> Any:
-        return self.x
-
-    def restore_state(self, state: Any) -> None:
-        self.x = state
-
-
-class SavesToAFile(Cart):
-    """Its methods of these names are something else."""
-
-    def save_state(self, path: str) -> None:
-        raise AssertionError
-
-    def restore_state(self, path: str, strict: bool) -> None:
-        raise AssertionError
-
-
 class LateObject(Cart):
     line, taken = None, 0
 
@@ -157,18 +127,6 @@ class Views(Cart):
     def step(self, u: np.ndarray) -> Any:
         self.x[1] += 0.1 * float(u[0])
         self.place += 0.1 * self.x[1]
-        return self.seen(), 0.0, False, False, {}
-
-
-class TwoNames(Cart):
-    """Two names for one array, which stay that in a snapshot."""
-
-    def begin(self) -> None:
-        self.same = self.x
-
-    def step(self, u: np.ndarray) -> Any:
-        self.same[1] += 0.1 * float(u[0])
-        self.x[0] += 0.1 * self.same[1]
         return self.seen(), 0.0, False, False, {}
 
 
@@ -401,12 +359,6 @@ class LosesMass(HalfCheetahEnv):
         return super().step(u)
 
 
-class KeepsAView(HalfCheetahEnv):
-    def __init__(self) -> None:
-        super().__init__()
-        self.place = self.data.qpos[:3]
-
-
 @dataclass(frozen=True)
 class Hostile:
     """One environment, and what has to come of it.
@@ -430,15 +382,11 @@ HOSTILE = {
     for kind, expected in {
         NoRenderMode: {},
         HandsOutItsBuffer: {},
-        DelayInAnObject: {"oracle": "DelayInAnObject.line is or holds a Line"},
-        DelayWithMethods: {},
-        SavesToAFile: {},
-        HalfASave: {"oracle": "the same seed and actions do not repeat it"},
+        DelayInAnObject: {},
         LateObject: {},
-        DelayInAClosure: {"oracle": "DelayInAClosure.later is or holds a function"},
-        DelayInASlot: {"oracle": "DelayInASlot keeps its state in __slots__"},
-        Views: {"oracle": "attributes x and place are views of the same numbers"},
-        TwoNames: {},
+        DelayInAClosure: {},
+        DelayInASlot: {},
+        Views: {},
         DictObservation: {"names": ("speed", "position[0]")},
         TupleObservation: {"names": ("item0[0]", "item1.v[0,0]")},
         Goal: {"names": GOAL},
@@ -451,7 +399,7 @@ HOSTILE = {
             "repeats": False,
         },
         CountsItsResets: {"warns": "two resets with seed 0 gave", "repeats": False},
-        UnseededNoise: {"oracle": "the same seed and actions do not repeat it: x. of episode 0"},
+        UnseededNoise: {"oracle": "the same seed and actions do not repeat it, x. of episode 0"},
         GlobalNoise: {"oracle": "the same seed and actions do not repeat it"},
         SeededNoise: {},
         UnequalBounds: {},
@@ -474,8 +422,7 @@ HOSTILE = {
         Far: {},
         FallsSoon: {},
         Domain: {"names": CHEETAH},
-        LosesMass: {"names": CHEETAH, "oracle": "its steps change its MuJoCo model"},
-        KeepsAView: {"names": CHEETAH, "oracle": "KeepsAView.place is a view of a PyCapsule"},
+        LosesMass: {"names": CHEETAH, "oracle": "the same seed and actions do not repeat it"},
     }.items()
 }
 HOSTILE["Wrapped"] = Hostile(Wrapped.make)

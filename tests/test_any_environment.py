@@ -168,9 +168,7 @@ def test_hostile_environments_give_what_stepping_gives_or_an_error_that_says_why
     task = tsmlib.Task.from_env(env_id, n=2, horizon=12, reward=still, seed=3)
     candidates = torch.stack([random_actions(2, 12, task.action_dim, seed) for seed in range(3)])
     if expected.oracle:
-        with pytest.raises(
-            UnsupportedEnvironment, match=f"no oracle and no replay: .*{expected.oracle}"
-        ):
+        with pytest.raises(UnsupportedEnvironment, match=f"has no oracle: .*{expected.oracle}"):
             tsmlib.simulator_predictor(task)(candidates)
         return
     predict = tsmlib.simulator_predictor(task)
@@ -180,10 +178,6 @@ def test_hostile_environments_give_what_stepping_gives_or_an_error_that_says_why
     ):  # asked again, it says the same
         for one, own in zip(predicted, candidates, strict=True):
             torch.testing.assert_close(one, tsmlib.execute(task, own).states[:, 1:], rtol=0, atol=0)
-
-
-def test_the_table_is_long_enough() -> None:
-    assert len(HOSTILE) >= 40
 
 
 # Names of robots ----------------------------------------------------------------------------------

@@ -328,19 +328,6 @@ class ControlEnv(gymnasium.Env):
         reward = self.task.reward(states, actions)
         return reward if self.task.guide is None else reward + self.task.guide(states, actions)
 
-    def save_state(self) -> np.ndarray:
-        """All that the future depends on; ``restore_state`` brings it back bit for bit."""
-        kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        physics = np.empty(mujoco.mj_stateSize(self.model, kind))
-        mujoco.mj_getState(self.model, self.data, physics, kind)
-        return np.concatenate([self.target, physics])
-
-    def restore_state(self, state: np.ndarray) -> None:
-        """Go on from what ``save_state`` gave."""
-        self.target, physics = np.split(state.copy(), [len(self.target)])
-        kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        mujoco.mj_setState(self.model, self.data, physics, kind)
-
     def _put(self, place: np.ndarray, speed: np.ndarray) -> None:
         self.data.qpos[:], self.data.qvel[:] = place, speed
         mujoco.mj_forward(self.model, self.data)

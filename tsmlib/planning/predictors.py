@@ -17,9 +17,8 @@ from torch import Tensor
 
 from tsmlib.checks import MOST, as_tensor, described, require_count, require_seed
 from tsmlib.collection import collect, open_loop
-from tsmlib.envs.snapshots import Oracle
 from tsmlib.envs.spec import EnvSpec, is_arm
-from tsmlib.envs.stepping import UnsupportedEnvironment, make_simulation
+from tsmlib.envs.stepping import Stepping, UnsupportedEnvironment, copies, make_simulation
 from tsmlib.models.base import Model, as_dynamics, members, rollout
 from tsmlib.planning.base import Predictor
 from tsmlib.planning.tasks import Task
@@ -263,8 +262,9 @@ def simulator_predictor(
     """Predict by executing in the true simulator, S = 1. Not differentiable.
 
     In MuJoCo what follows is what would have followed, up to rounding; in pymunk, contacts that
-    last forget the force with which they press. Of an episode that ended the last state repeats;
-    ``rewards.until`` says what counts then.
+    last forget the force with which they press. A foreign environment plays each candidate from the
+    reset on. Of an episode that ended the last state repeats; ``rewards.until`` says what counts
+    then.
 
     Args:
         env: a task, whose starts are predicted from; or the id of an arm.
@@ -275,7 +275,8 @@ def simulator_predictor(
         The predictor, of actions (C, B, T, du).
 
     Raises:
-        UnsupportedEnvironment: no state can be set, or an arm has noise or delay.
+        UnsupportedEnvironment: the same seed and actions do not repeat an episode, or an arm has
+            noise or delay.
         ValueError: an id without ``start``.
     """
     task = env if isinstance(env, Task) else None
@@ -326,14 +327,46 @@ def _replayed(task: Task, done: Tensor, actions: Tensor) -> Tensor:
 
 
 def _of_seeds(task: Task, done: Tensor | None) -> SimulatorPredictor:
-    """Episodes that begin with a task's seeds, and go on after ``done`` (B, t, du)."""
+    """Episodes that begin with a task's seeds and go on after ``done`` (B, t, du).
+
+    An observation is not all of a state: each candidate is played from the reset on.
+    """
     before = np.zeros((len(task), 0, task.action_dim)) if done is None else done.numpy()
-    begun = Oracle(task.env, task.seeds, before)
+
+    def made() -> Stepping:
+        return Stepping(copies(task.env, len(task)), env_id=task.env)
+
+    def played(run: Stepping, actions: np.ndarray) -> np.ndarray:
+        run.reset(seed=task.seeds)
+        run.rollout(before)
+        return run.rollout(actions)
+
+    run, checked = made(), False
+    played(run, before[:, :0])
+    start = torch.from_numpy(run.last).float()
 
     def outcomes(actions: Tensor) -> Tensor:
-        return torch.from_numpy(begun.outcomes(actions.numpy())).float()
+        nonlocal checked
+        states = np.stack([played(run, candidate) for candidate in actions.numpy()])
+        if not checked:
+            with closing(made()) as other:
+                for one in (other, run):
+                    _require_repeated(run, states[-1], played(one, actions[-1].numpy()))
+        checked = True
+        return torch.from_numpy(states).float()
 
-    return SimulatorPredictor(torch.from_numpy(begun.last).float(), outcomes)
+    return SimulatorPredictor(start, outcomes)
+
+
+def _require_repeated(run: Stepping, first: np.ndarray, again: np.ndarray) -> None:
+    """UnsupportedEnvironment where an episode (B, T, dx) comes out otherwise when played again."""
+    for i, t, d in np.argwhere(first != again)[:1]:
+        raise UnsupportedEnvironment(
+            f"{run.id} has no oracle: the same seed and actions do not repeat it, {run.names[d]} "
+            f"of episode {i} after {t + 1} steps is {first[i, t, d]:g} and then "
+            f"{again[i, t, d]:g}. Plan through a model instead, tsmlib.model_predictor; or let it "
+            "draw from self.np_random, and begin anew at every reset"
+        )
 
 
 def _reached(task: Task, done: Tensor) -> np.ndarray:
