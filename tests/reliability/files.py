@@ -35,7 +35,7 @@ from reliability.world import (
     refusal,
     rng,
 )
-from tsmlib.contrib.minari import load_minari, save_minari
+from tsmlib.contrib.minari import load_minari
 from tsmlib.envs import fingerprint
 from tsmlib.envs.spec import ENV_IDS
 from tsmlib.models.action_prior import ActionPrior
@@ -248,6 +248,27 @@ def _malice() -> Outcome:
     return found
 
 
+def minari_of(name: str, data: Trajectories) -> Path:
+    """The folder of a data set of these episodes that Minari itself wrote."""
+    import minari
+    from gymnasium.spaces import Box
+
+    episodes = []
+    for x, u in map(data.episode, range(len(data))):
+        last = np.arange(len(u)) == len(u) - 1
+        about = dict(rewards=np.zeros(len(u)), terminations=last & False, truncations=last)
+        episodes.append(minari.data_collector.EpisodeBuffer(observations=x, actions=u, **about))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = minari.create_dataset_from_buffers(
+            name,
+            episodes,
+            observation_space=Box(-np.inf, np.inf, (data.robot.state_dim,)),
+            action_space=Box(-1, 1, (data.robot.action_dim,)),
+        )
+    return Path(made.spec.data_path).parent
+
+
 def hostile_minari(trials: int = 0) -> Outcome:
     """R6: Minari data sets that point elsewhere, lie about size or name code: refused or read
     harmlessly, in 2 s.
@@ -256,9 +277,9 @@ def hostile_minari(trials: int = 0) -> Outcome:
     """
     found = Outcome()
     with folder() as place, mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(place)):
-        whole = save_minari("tsm/made/random-v0", TRAIN)
+        whole = minari_of("tsm/made/random-v0", TRAIN)
         found.count(*harmless(whole, TRAIN, "a whole one", refused=False))
-        one = save_minari("tsm/made/one-v0", TRAIN.take(slice(1)))
+        one = minari_of("tsm/made/one-v0", TRAIN.take(slice(1)))
         file, metadata = one / "data" / "main_data.hdf5", one / "data" / "metadata.json"
         good, stated = file.read_bytes(), json.loads(metadata.read_text())
         for name, make in hostile_hdf5(place).items():

@@ -268,43 +268,22 @@ def _in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray
     return radius * np.array([np.cos(angle), np.sin(angle)])
 
 
-class ArmEnv(Variant, gymnasium.Env):
-    """One arm: the vector environment of the same id with N = 1, so single and bulk simulation
-    agree bit for bit.
+class OneEnv(gymnasium.Env):
+    """One episode: a vector environment of ours with N = 1, so single and bulk simulation agree bit
+    for bit.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
-    angles = (0, 1)
-    dt = DT
-
-    def __init__(
-        self,
-        env_id: str,
-        render_mode: str | None = None,
-        noise: float = 0.0,
-        delay: int = 0,
-        **changes: Unpack[Changes],
-    ) -> None:
-        plain = EnvSpec.parse(env_id).varied(**changes)
-        name = replace(plain, noise=noise, delay=delay).registered().id
-        self._made: Any = gymnasium.make_vec(name, num_envs=1, render_mode=render_mode)
-        vector = self._made.unwrapped
-        assert isinstance(vector, ArmVectorEnv)
-        self.vector, self.env_id, self.render_mode = vector, plain.registered().id, render_mode
-        self.names, self.units, self.task = vector.names, vector.units, vector.task
-        self.physics = vector.physics
-        self.observation_space = vector.single_observation_space
-        self.action_space = vector.single_action_space
-
-    @property
-    def target(self) -> np.ndarray:
-        """The task's target (2,)."""
-        return self.vector.target[0]
+    def __init__(self, made: Any) -> None:
+        self._made, self.vector = made, made.unwrapped
+        self.render_mode, self.physics = self.vector.render_mode, self.vector.physics
+        self.names, self.units = self.vector.names, self.vector.units
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
-        """As `ArmVectorEnv.reset`; ``options["states"]`` is (dx,), ``options["target"]`` (2,)."""
+        """As of the vector environment, with options of one episode: states (dx,) and so on."""
         super().reset(seed=seed)
         options = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
         states, info = self._made.reset(seed=seed, options=options)
@@ -327,3 +306,28 @@ class ArmEnv(Variant, gymnasium.Env):
 
     def close(self) -> None:
         self._made.close()
+
+
+class ArmEnv(Variant, OneEnv):
+    """One arm."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
+    angles, dt = (0, 1), DT
+
+    def __init__(
+        self,
+        env_id: str,
+        render_mode: str | None = None,
+        noise: float = 0.0,
+        delay: int = 0,
+        **changes: Unpack[Changes],
+    ) -> None:
+        plain = EnvSpec.parse(env_id).varied(**changes)
+        name = replace(plain, noise=noise, delay=delay).registered().id
+        super().__init__(gymnasium.make_vec(name, num_envs=1, render_mode=render_mode))
+        self.env_id, self.task = plain.registered().id, plain.task
+
+    @property
+    def target(self) -> np.ndarray:
+        """The task's target (2,)."""
+        return self.vector.target[0]

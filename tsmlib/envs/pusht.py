@@ -25,6 +25,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from tsmlib.checks import require_choice, require_count
+from tsmlib.envs.arm import OneEnv
 from tsmlib.envs.pusht_field import (
     ENV_ID,
     GOAL,
@@ -234,40 +235,14 @@ class _Episode:
         return (x, y, *self.tee.position, self.tee.angle, vx, vy)
 
 
-class PushTEnv(gymnasium.Env):
-    """One field: `PushT` with N = 1, so single and bulk simulation agree bit for bit."""
+class PushTEnv(OneEnv):
+    """One field."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}  # noqa: RUF012
-    names, units, angles, dt = NAMES, UNITS, (4,), DT
+    angles, dt = (4,), DT
 
     def __init__(self, env_id: str = ENV_ID, render_mode: str | None = None) -> None:
-        self.vector = PushT(1, env_id, render_mode=render_mode)
-        self.render_mode, self.physics = render_mode, self.vector.physics
-        self.observation_space = self.vector.single_observation_space
-        self.action_space = self.vector.single_action_space
-
-    def reset(
-        self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[np.ndarray, Info]:
-        """As `PushT.reset`, with ``options["states"]`` (7,) and ``options["goal"]`` (7,)."""
-        super().reset(seed=seed)
-        given = {key: np.asarray(value)[None] for key, value in (options or {}).items()}
-        states, info = self.vector.reset(seed=seed, options=given)
-        return states[0], {"goal": info["goal"][0]}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """One step by an action (2,). Never terminates; the registered time limit truncates."""
-        states, reward, _, _, info = self.vector.step(np.asarray(action)[None])
-        return states[0], float(reward[0]), False, False, {"goal": info["goal"][0]}
-
-    def rollout(self, actions: np.ndarray) -> np.ndarray:
-        """States (T, 7) after actions (T, 2)."""
-        return self.vector.rollout(np.asarray(actions)[None])[0]
-
-    def render(self) -> np.ndarray | None:
-        """A uint8 image (height, width, 3), or None without ``render_mode="rgb_array"``."""
-        images = self.vector.render()
-        return None if images is None else images[0]
+        super().__init__(PushT(1, env_id, render_mode=render_mode))
 
 
 def weak_policy(generator: torch.Generator, *, near: float = 100.0) -> Callable[[Segment], Tensor]:
