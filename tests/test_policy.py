@@ -512,7 +512,7 @@ BAD: dict[str, tuple[Callable[[Tensor, Tensor], Any], str]] = {
         "the reward is nan for target 0 at step 0, although the state there is finite",
     ),
     "infinite": (
-        lambda x, u: x.sum(-1) / 0,
+        lambda x, u: x.square().sum(-1) / 0,
         r"the reward is inf for target \d+ at step 0, although the state there is finite",
     ),
     "no gradient": (lambda x, u: (x[..., 0] > 0).double(), "the reward has no gradient"),

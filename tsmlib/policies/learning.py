@@ -274,8 +274,9 @@ class _Learner:
         curve.seconds.append(self.state.seconds)
         curve.predicted.append(record["predicted"])
         for name, value in (measure(self.policy) if measure else {}).items():
-            if (n := torch.as_tensor(value).numel()) != 1:
-                raise ValueError(f"measure gave {n} values of {name!r}; expected one")
+            value = torch.as_tensor(value).detach()
+            if value.numel() != 1:
+                raise ValueError(f"measure gave {value.numel()} values of {name!r}; expected one")
             record[name] = float(value)  # may be no number
             curve.measured.setdefault(name, []).append(record[name])
         self.state.keep(-record["predicted"])
