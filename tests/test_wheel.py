@@ -186,6 +186,15 @@ def test_what_ships_in_the_other_wheel_is_found_and_compared_and_else_is_named(
     assert f"tsmlib-models is 0.0.9, and tsmlib is {tsmlib.__version__}" in done.stderr
 
 
+def test_a_command_whose_extra_is_missing_says_what_to_type(commands: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.modules['pandas'] = None; import tsmlib.__main__ as m; m.main(['claims'])"
+    )
+    done = run(tmp_path, str(commands / "python"), "-c", program)
+    assert "claims needs pandas, missing here; type" in done.stderr
+    assert "pip install 'tsmlib[study]'" in done.stderr
+
+
 def test_the_address_of_the_repository_is_written_once_where_it_is_stated(
     release: ModuleType, tmp_path: Path
 ) -> None:

@@ -46,7 +46,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if words[0] == "notebooks":
         return _copy_notebooks(words[1:])
-    return importlib.import_module(REPRODUCTION).main(words)
+    try:
+        return importlib.import_module(REPRODUCTION).main(words)
+    except ModuleNotFoundError as error:  # such as pandas
+        again = f"{sys.executable} -m pip install 'tsmlib[study]'"
+        print(f"error: {words[0]} needs {error.name}, missing here; type: {again}", file=sys.stderr)
+        return 1
 
 
 def _copy_notebooks(words: Sequence[str]) -> int:
