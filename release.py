@@ -105,8 +105,9 @@ def core(source: Path, folder: Path) -> None:
 
 def models(source: Path, page: Path, folder: Path) -> None:
     """The wheel tsmlib-models: models and tables of data/, and the explorer's page."""
-    if not (page / "index.html").exists():
-        raise ReleaseError(f"there is no page in {page}: type make explorer")
+    licences = sorted((page / "vendor").glob("LICENSE*"))  # MuJoCo's
+    if not (page / "index.html").exists() or not licences:
+        raise ReleaseError(f"there is no page with its licences in {page}: type make explorer")
     for built in (page / "src").glob("*.js"):
         if built.read_bytes() != (source / "explorer" / "src" / built.name).read_bytes():
             raise ReleaseError(f"{built} is not of explorer/src as it is: type make explorer")
@@ -124,7 +125,7 @@ def models(source: Path, page: Path, folder: Path) -> None:
             "Files of [tsmlib](https://pypi.org/project/tsmlib/).\n"
         )
         shutil.copy(source / "LICENSE", place)
-        for path in (page / "vendor").glob("LICENSE*"):  # MuJoCo's
+        for path in licences:
             shutil.copy(path, Path(place) / f"{path.stem}-mujoco{path.suffix}")
         wheel(Path(place), folder)
 

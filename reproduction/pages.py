@@ -111,7 +111,8 @@ def fill(page: Path) -> Path:
         make, rows = TABLES[place[2]]
         return f"{place[1]}{make(published(rows))}\n{place[3]}"
 
-    page.write_text(MARK.sub(filled, page.read_text()))
+    text = MARK.sub(filled, page.read_text(encoding="utf-8"))
+    page.write_text(text, encoding="utf-8")
     return page
 
 

@@ -17,7 +17,9 @@ def completed(argv: list[str]) -> list[str]:
     root = notebook.parent.parent
     if not notebook.match("notebooks/*.ipynb") or not (root / "reproduction").is_dir():
         return argv
-    if unknown := [name for name in given if f'"{name} = ' not in notebook.read_text()]:
+    if unknown := [
+        name for name in given if f'"{name} = ' not in notebook.read_text(encoding="utf-8")
+    ]:
         sys.exit(f"error: {notebook.name} has no parameter {unknown[0]!r}")
     folder = root / "runs" / given["scale"] / f"seed{given['seed']}"
     folder.mkdir(parents=True, exist_ok=True)

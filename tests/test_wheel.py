@@ -56,6 +56,10 @@ def dist(release: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     page = tmp_path_factory.mktemp("page")
     (page / "index.html").write_text("the explorer")
     (page / "manifest.json").write_text("{}")
+    with pytest.raises(release.ReleaseError, match="no page with its licences .* make explorer"):
+        release.models(source, page, made)
+    (page / "vendor").mkdir()
+    (page / "vendor" / "LICENSE").write_text("MuJoCo's")
     release.core(source, made)
     release.models(source, page, made)
     return made
@@ -116,6 +120,7 @@ def test_a_wheel_holds_both_packages_and_all_that_ships(wheel: Path) -> None:
     (other,) = wheel.parent.glob("tsmlib_models-*.whl")
     with zipfile.ZipFile(other) as archive:
         more = {name.removeprefix("tsmlib_models/") for name in archive.namelist()}
+    assert any(name.endswith("/LICENSE-mujoco") for name in more)
     assert files(ROOT / "data") <= own | more
     assert {"tsmlib/py.typed", "reproduction/Snakefile"} <= held
     assert wheel.stat().st_size < LARGEST

@@ -200,7 +200,7 @@ class FromLogs:
         parquet, root = _module("pyarrow.parquet", "lerobot"), Path(folder)
         wanted = {"observation.state": "", "action": "action."}
         try:
-            info = json.loads((root / "meta" / "info.json").read_text())
+            info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
             names = {key: _features(info["features"][key], key) for key in wanted}
             files = sorted((root / "data").rglob("*.parquet"))
             columns = [*wanted, "episode_index", "timestamp"]

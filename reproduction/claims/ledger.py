@@ -108,7 +108,7 @@ def claims(path: Path = LEDGER, *, subject: str = "tsm") -> list[Claim]:
         The claims.
     """
     found: dict[str, Claim] = {}
-    text = re.sub(r'"tsm(?=["-])', f'"{subject}', path.read_text())
+    text = re.sub(r'"tsm(?=["-])', f'"{subject}', path.read_text(encoding="utf-8"))
     entries = tomllib.loads(text)
     for name, entry in entries.items():
         written = list(entry.pop("compare", []))
@@ -159,7 +159,7 @@ def page(verdicts: Sequence[Verdict]) -> str:
     words = [verdict.word for verdict in verdicts]
     counts = {word: words.count(word) for word in dict.fromkeys(words)}
     loader = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True)
-    template = loader.from_string(TEMPLATE.read_text())
+    template = loader.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(verdicts=verdicts, counts=counts)
 
 
@@ -168,7 +168,7 @@ def write(docs: Path) -> list[Path]:
     verdicts = [judge(claim) for claim in claims()]
     table, text = RESULTS / "08_claims.csv", docs / "claims.md"
     as_table(verdicts).to_csv(table, index=False, lineterminator="\n")
-    text.write_text(page(verdicts))
+    text.write_text(page(verdicts), encoding="utf-8")
     return [table, text]
 
 
