@@ -1,6 +1,6 @@
 // How the search of the site ranks: guides first, then other pages, and last the reference.
 var Scorer = {
-  score: ([page, , , , score]) => score + (page.startsWith('howto/') ? 10 : /^(api|_modules)\//.test(page) ? -30 : 0),
+  score: ([page, , , , score]) => score + (page.startsWith('howto/') ? 8 : /^(api|_modules)\//.test(page) ? -30 : 0),
   objNameMatch: 11,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },

@@ -69,10 +69,10 @@ export class Direct {
 /**
  * Cross-entropy method (planners.py): sample around a mean, refit it to the elites, keep the best ever seen.
  *
- * judge(rows, parameters) -> promise of returns, rows a multiple of 4 up to CAPACITY. Yields after each iteration, so
+ * near: the noise of every other first candidate, as a share of the others'. judge(rows, parameters) -> promise of returns, rows a multiple of 4 up to CAPACITY. Yields after each iteration, so
  * that whoever asks can show it or stop; its last value is { parameters, value }.
  */
-export async function* cem(space, judge, { start = new Float32Array(space.size), candidates = CAPACITY, iterations = 6, elites = Math.max(2, Math.floor(candidates / 10)), keep = 0.1, seed = 0 } = {}) {
+export async function* cem(space, judge, { start = new Float32Array(space.size), candidates = CAPACITY, iterations = 6, elites = Math.max(2, Math.floor(candidates / 10)), keep = 0.1, seed = 0, near = 1 } = {}) {
   const n = space.size, draw = normal(seed), noise = new Float32Array(n);
   const mean = Float64Array.from(start), deviation = new Float64Array(n).fill(space.scale);
   const judgeOne = async parameters => {
@@ -88,7 +88,7 @@ export async function* cem(space, judge, { start = new Float32Array(space.size),
     const parameters = new Float32Array(candidates * n);
     for (let row = 0; row < candidates; row++) {
       space.noise(draw, noise);
-      for (let i = 0; i < n; i++) parameters[row * n + i] = mean[i] + deviation[i] * noise[i];
+      for (let i = 0; i < n; i++) parameters[row * n + i] = mean[i] + (iteration || row % 2 === 0 ? 1 : near) * deviation[i] * noise[i];
     }
     if (iteration) parameters.set(mean, 0); // in the place of the best so far, whose return is known
     const found = await judge(candidates, parameters);

@@ -11,6 +11,7 @@ const FEWEST = 12; // candidates of a later plan, at least
 const ROUNDS = 8; // searches for the first plan, at most
 const PATIENCE = 2; // searches in a row that better nothing, after which it ends
 const BETTER = 0.05; // of return, by which a search has to better the best plan
+const NEAR = 0.3; // share of its noise by which half of a later search stays near what is left of the plan before
 const ALONE = 8; // rows in which CEM judges its start and its last mean
 const L = 10, DU = 2;
 
@@ -144,7 +145,7 @@ export async function* attempt(library, scene, { first = { candidates: CAPACITY,
     let best = null, idle = 0;
     for (let round = 0; round < (from ? 1 : rounds) && idle < PATIENCE; round++) {
       const draws = seed + 1000 * from + 17 * round;
-      const planning = cem(search, (rows, parameters) => judge(library, question, rows, parameters), { start: round % 2 ? best.parameters : left, candidates, iterations, seed: draws });
+      const planning = cem(search, (rows, parameters) => judge(library, question, rows, parameters), { start: round % 2 ? best.parameters : left, candidates, iterations, seed: draws, near: from ? NEAR : 1 });
       let step = await planning.next();
       for (; !step.done; step = await planning.next()) yield { type: 'progress', from, round, ...step.value, of: iterations };
       const { parameters } = step.value, plan = search.decode(4, repeated(parameters, 4)).slice(0, horizon * DU);
