@@ -129,6 +129,16 @@ def models(source: Path, page: Path, folder: Path) -> None:
         wheel(Path(place), folder)
 
 
+def with_addresses(readme: str, url: str) -> str:
+    """README with addresses in place of paths, as a package index shows it."""
+
+    def address_of(found: re.Match[str]) -> str:
+        kind = "raw" if found[2].startswith("figures/") else "blob"
+        return f"{found[1]}{url}/{kind}/v{version()}/{found[2]}"
+
+    return re.sub(r'(\]\(|src=")(?!https?:|#)([^)"\s]+)', address_of, readme)
+
+
 def metadata(folder: Path, date: str, text: str) -> None:
     """What Zenodo and a citation need, and the notes of the release."""
     citation = (ROOT / "CITATION.cff").read_text()
@@ -166,6 +176,9 @@ def build(*, draft: bool = False) -> Path:
         for name in listed.splitlines():
             (Path(place) / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, Path(place) / name)
+        if stated := re.search(r'^Homepage = "(.+)"', (ROOT / "pyproject.toml").read_text(), re.M):
+            readme = Path(place) / "README.md"
+            readme.write_text(with_addresses(readme.read_text(), stated[1]))
         core(Path(place), DIST)
         models(Path(place), PAGE, DIST)
     shutil.make_archive(str(DIST / f"tsmlib-{version()}-site"), "zip", SITE)
@@ -229,6 +242,9 @@ def address(url: str, root: Path = ROOT) -> None:
     )
     text = re.sub(r"^repository-code: .*\n", "", citation.read_text(), flags=re.M)
     citation.write_text(text.replace("license:", f'repository-code: "{url}"\nlicense:', 1))
+    readme = root / "README.md"
+    cloned = re.sub(r"git clone (<.+?>|https:\S+)", f"git clone {url}", readme.read_text())
+    readme.write_text(cloned)
     for name in ON_COLAB:
         path = root / "notebooks" / f"{name}.ipynb"
         notebook = json.loads(path.read_text())

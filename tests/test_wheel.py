@@ -203,15 +203,20 @@ def test_a_command_whose_extra_is_missing_says_what_to_type(commands: Path, tmp_
 def test_the_address_of_the_repository_is_written_once_where_it_is_stated(
     release: ModuleType, tmp_path: Path
 ) -> None:
-    for name in ("pyproject.toml", "CITATION.cff", "notebooks"):
+    for name in ("pyproject.toml", "CITATION.cff", "README.md", "notebooks"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     for owner in ("somebody", "another"):
         release.address(f"https://github.com/{owner}/tsmlib", tmp_path)
-    for name in ("pyproject.toml", "CITATION.cff", "notebooks/11_pusht.ipynb"):
+    for name in ("pyproject.toml", "CITATION.cff", "README.md", "notebooks/11_pusht.ipynb"):
         text = (tmp_path / name).read_text()
         assert "another/tsmlib" in text
         assert "somebody" not in text
+    shown = release.with_addresses("[a](docs/b.md) ![c](figures/d.png) [e](https://f)", "https://g")
+    tag = f"v{tsmlib.__version__}"
+    assert shown == (
+        f"[a](https://g/blob/{tag}/docs/b.md) ![c](https://g/raw/{tag}/figures/d.png) [e](https://f)"
+    )
     with pytest.raises(release.ReleaseError, match="expected https://github.com/OWNER/NAME"):
         release.address("example.org", tmp_path)
 
