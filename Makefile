@@ -54,7 +54,9 @@ lint: $(READY)
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports
 
-release: explorer docs
+release: $(READY)
+	$(PY) release.py check $(ARGS)
+	$(MAKE) explorer docs
 	$(PY) release.py $(ARGS)
 
 # Needs uv (pip install uv). Versions stay where they can; new ones: make lock ARGS=--upgrade. torch.lock is written by hand.

@@ -1,7 +1,7 @@
 """Everything of a release into dist/, and tried: ``make release``, which builds explorer and docs.
 
 ``--draft`` allows uncommitted changes and a changelog without a date.
-``try`` tries dist/ again.
+``check`` says at once what would be refused. ``try`` tries dist/ again.
 ``address https://github.com/OWNER/tsmlib`` writes where the repository lies to the files that
 state it.
 """
@@ -61,7 +61,7 @@ def version() -> str:
 
 
 def notes(*, draft: bool) -> tuple[str, str]:
-    """The date of the version and what the changelog says of it."""
+    """The date of the version and what the changelog says of it, of a tree that is committed."""
     text, number = (ROOT / "CHANGELOG.md").read_text(), version()
     section = re.search(rf"^## {re.escape(number)}, (.+?)\n(.*?)(?=^## |\Z)", text, re.M | re.S)
     if section is None:
@@ -71,6 +71,10 @@ def notes(*, draft: bool) -> tuple[str, str]:
         raise ReleaseError(
             f"CHANGELOG.md dates {number} {date!r}: expected YYYY-MM-DD; or type: "
             "make release ARGS=--draft"
+        )
+    if not draft and run("git", "status", "--porcelain"):
+        raise ReleaseError(
+            "files are not committed: commit them, or type: make release ARGS=--draft"
         )
     return date, section[2].strip() + "\n"
 
@@ -162,10 +166,6 @@ def metadata(folder: Path, date: str, text: str) -> None:
 def build(*, draft: bool = False) -> Path:
     """Make dist/ anew, and its checksums last."""
     date, text = notes(draft=draft)
-    if not draft and run("git", "status", "--porcelain"):
-        raise ReleaseError(
-            "files are not committed: commit them, or type: make release ARGS=--draft"
-        )
     if not (SITE / "index.html").exists():
         raise ReleaseError(f"there is no documentation in {SITE}: type make docs")
     PLAIN["SOURCE_DATE_EPOCH"] = run("git", "log", "-1", "--format=%ct")  # the same bytes again
@@ -259,18 +259,20 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--draft", action="store_true")
-    parser.add_argument("words", nargs="*", metavar="try | address URL")
+    parser.add_argument("words", nargs="*", metavar="check | try | address URL")
     given = parser.parse_args()
     try:
         if not given.words:
             build(draft=given.draft)
             attempt()
+        elif given.words == ["check"]:
+            notes(draft=given.draft)
         elif given.words == ["try"]:
             attempt()
         elif len(given.words) == 2 and given.words[0] == "address":
             address(given.words[1])
         else:
-            parser.error("expected nothing, or: try, or: address URL")
+            parser.error("expected nothing, or: check, try, address URL")
     except ReleaseError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
