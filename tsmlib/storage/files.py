@@ -107,8 +107,8 @@ def writer_lock(folder: PathLike, purpose: str) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _acquire(lock, holder)
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
+    except (OSError, NotImplementedError) as error:  # the second of an older filelock
+        if isinstance(error, OSError) and error.errno not in NO_LOCKS:
             raise _cannot_write(f"in {folder}", error) from error
         warnings.warn(
             f"{folder} is on a file system without locks (flock): see to it that no other process "
