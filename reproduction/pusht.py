@@ -163,7 +163,7 @@ def main(words: Sequence[str] | None = None) -> None:
             plans = partial(trial, model, protocol=word, seed=seed)
             add("egocentric", word, seed, given.pairs, plans)
             add("one plan", word, seed, given.pairs, partial(plans, once=True))
-    for word in given.protocols:
+    for word in given.protocols.replace("A", ""):  # 300 steps would take it ten minutes a pair
         plans = partial(trial, None, protocol=word, seed=0)
         add("simulator", word, 0, given.simulator, plans)
         more = partial(plans, candidates=4 * SEARCH["candidates"], elites=4 * SEARCH["elites"])
