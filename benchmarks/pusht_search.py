@@ -36,7 +36,7 @@ METHODS = {  # method -> candidates
     "smooth noise": 16,
     "1/f noise": 16,
     "codes": 16,
-    "codes, same seconds": 6,
+    "codes, 6 candidates": 6,
     "proposal": 16,
 }
 
