@@ -142,18 +142,21 @@ export async function* attempt(library, scene, { first = { candidates: CAPACITY,
     search = searchSpace(space, prior, past, horizon);
     const { candidates, iterations } = from ? affordable(again, rate, horizon, budget) : first;
     const question = { task, model, space, past, horizon, target };
+    const planOf = parameters => search.decode(4, repeated(parameters, 4)).slice(0, horizon * DU);
     let best = null, idle = 0;
     for (let round = 0; round < (from ? 1 : rounds) && idle < PATIENCE; round++) {
       const draws = seed + 1000 * from + 17 * round;
       const planning = cem(search, (rows, parameters) => judge(library, question, rows, parameters), { start: round % 2 ? best.parameters : left, candidates, iterations, seed: draws, near: from ? NEAR : 1 });
       let step = await planning.next();
       for (; !step.done; step = await planning.next()) yield { type: 'progress', from, round, ...step.value, of: iterations };
-      const { parameters } = step.value, plan = search.decode(4, repeated(parameters, 4)).slice(0, horizon * DU);
       if (!round) rate = (performance.now() - began) / ((candidates * iterations + ALONE) * horizon);
-      const { value } = judged(network, past, plan, horizon, seed + 1000 * from + 2, target, place);
-      idle = best && !(value > best.value + BETTER) ? idle + 1 : 0;
-      if (best && !(value > best.value)) continue;
-      best = { value, plan, parameters };
+      const value = one => judged(network, past, planOf(one), horizon, seed + 1000 * from + 2, target, place).value;
+      // What is left of the plan before goes on unless the new one is better in the mean over samples.
+      const parameters = from && !(value(step.value.parameters) > value(left)) ? left : step.value.parameters;
+      const plan = planOf(parameters), worth = value(parameters);
+      idle = best && !(worth > best.value + BETTER) ? idle + 1 : 0;
+      if (best && !(worth > best.value)) continue;
+      best = { value: worth, plan, parameters };
       const { mode, samples, value: fresh } = judged(network, past, plan, horizon, seed + 1000 * from + 1, target, place);
       if (!from) {
         predicted = fresh;
