@@ -28,7 +28,7 @@ from tsmlib.trajectory import Trajectories
 TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "64_codes.csv"
 ARMS = ("Reacher", "ReacherObstacle", "ReacherPush")
 BASELINES = ("onestep", "multistep", "lstm")
-MODELS = ("tsm", "tsm+codes", "tsm+prior", "rtsm")
+MODELS = ("tsm", "tsm+codes", "rtsm")
 SEED, EPISODES, SAMPLES, START, STEPS = 1_000_064, 300, 16, 10, 90
 
 
@@ -66,9 +66,8 @@ def codes(model: tsmlib.TSM, data: Trajectories) -> dict[str, float]:
     starts = torch.arange(START, data.horizon - length + 1, length)
     episodes = torch.arange(len(data)).repeat_interleave(len(starts))
     window = data.windows(episodes, starts.repeat(len(data)), model.past_len, length)
-    mean, log_variance = model.posterior(*window)
-    prior = model.prior(window.past, window.future.actions)
-    nats = latent.kl_by_dimension(mean, log_variance, *prior).sum(1)
+    mean, log_variance = model.encode(window.future.states)
+    nats = latent.kl_by_dimension(mean, log_variance).sum(1)
     effects = latent.total_effects(model, window, torch.Generator().manual_seed(0))
     return {
         "nats": float(nats.mean()),

@@ -104,7 +104,7 @@ def network(model: nn.Module) -> tuple[dict[str, Json], Arrays]:
             return {"kind": "prior", **shape}, {"std": model.std} | of_stack(
                 model.decoder, model.std
             )
-        case TSM() if model.code_prior is None:
+        case TSM():
             shape = {
                 "dilations": list(model.decoder.dilations),
                 "codes": model.latent_dim,

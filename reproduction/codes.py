@@ -59,11 +59,10 @@ def _encoded(
     """KL, active dimensions and reconstruction, of all segments, without and with a touch."""
     past, future = seen.window.past, seen.window.future
     with torch.no_grad():
-        mean, log_variance = model.posterior(past, future)
-        prior = model.prior(past, future.actions)
+        mean, log_variance = model.encode(future.states)
         twice = torch.stack([model.decode(past, future.actions, mean) for _ in range(2)])
     yield {"metric": "fixed_code_variance", "value": float(twice.var(0, correction=0).mean())}
-    kl = latent.kl_by_dimension(mean, log_variance, *prior)
+    kl = latent.kl_by_dimension(mean, log_variance)
     yield {"metric": "active_units", "value": float(latent.active_units(mean).sum())}
     for i, value in enumerate(kl.mean(0).tolist()):
         yield {"metric": "kl_dimension", "value": value, "dimension": i}

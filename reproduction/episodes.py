@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium
@@ -58,8 +58,6 @@ def make_model(run: Run, name: str, word: str, path: Path) -> torch.nn.Module:
     if spec.group != "prior" and copies(env) > 1:
         train = symmetric(train)
     net = spec.load().for_data(train, seed=run.seed, **spec.arguments(EnvSpec.parse(env)))
-    if spec.begins:
-        net.take_decoder(load_model(run, name, spec.begins))
     stages = schedules.schedule(spec, EnvSpec.parse(env), run.pick(0.0, 0.5, 1.0))
     checkpoints = []
     for key, stage in zip(schedules.keys(stages), stages, strict=True):
@@ -71,6 +69,7 @@ def make_model(run: Run, name: str, word: str, path: Path) -> torch.nn.Module:
         kept = {"checkpoint": checkpoints[-1], "progress": title}
         tsmlib.fit(net, train, held_out, options, loss, seed=run.seed, **kept)
     header = {"fingerprint": fingerprint(env), "model": word, "seed": run.seed, "scale": run.scale}
+    header |= {"schedule": [asdict(stage) for stage in stages]}
     artifacts.save_model(path, net, header)
     for checkpoint in checkpoints:
         shutil.rmtree(checkpoint)

@@ -39,7 +39,7 @@ FILTERED = ("tsm", "rtsm", *BASELINES, "none", "filter", "exponential")
 
 
 def _scores(run: Run) -> list[str]:
-    whole = (*zoo.words("dynamics"), "tsm+codes", "tsm+prior")
+    whole = (*zoo.words("dynamics"), "tsm+codes")
     pairs = product(ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), whole))
     return [f"scores/{arm}/{word}" for arm, word in pairs]
 
@@ -54,7 +54,7 @@ def _ablation(run: Run) -> list[str]:
 
 
 def _codes(run: Run) -> list[tuple[str, str]]:
-    words = run.pick(("tsm",), ("tsm",), ("tsm", "tsm+codes", "tsm+prior"))
+    words = run.pick(("tsm",), ("tsm",), ("tsm", "tsm+codes"))
     return [*product(ARMS, words), ("ReacherPush", "rtsm")]
 
 
@@ -165,8 +165,7 @@ def _data_of(arm: str, *splits: str) -> list[str]:
 
 
 def _model_inputs(run: Run, words: list[str]) -> list[str]:
-    begins = [f"models/{words[0]}/{first}"] if (first := zoo.find(words[1]).begins) else []
-    return begins + _data_of(words[0], "train", "validation")
+    return _data_of(words[0], "train", "validation")
 
 
 def _prior_of(arm: str) -> str:

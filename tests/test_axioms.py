@@ -38,8 +38,6 @@ class Case:
     losses: its loss methods, each with the prefixes of the parameters that it leaves alone.
     stochastic: whether a generator makes a difference. recall: (model, window) -> its best account
     of a future that it has seen.
-    foresees: whether codes are drawn for a whole plan, so that an action moves earlier states of
-    its segment.
     """
 
     build: Callable[[int], Any]
@@ -47,7 +45,6 @@ class Case:
     constant: tuple[int, ...] = ()
     losses: tuple[tuple[str, tuple[str, ...]], ...] = (("loss", ()),)
     stochastic: bool = True
-    foresees: bool = False
     recall: Callable[[Any, Window], Tensor] = lambda model, seen: predict_segment(
         model, seen.past, seen.future.actions
     )
@@ -61,18 +58,15 @@ class Case:
 
 
 def by_code(model: TSM, seen: Window) -> Tensor:
-    return model.decode(seen.past, seen.future.actions, model.posterior(*seen)[0])
+    return model.decode(seen.past, seen.future.actions, model.encode(seen.future.states)[0])
 
 
-def with_learned_prior(dx: int) -> TSM:
-    """A learned prior that has learned something: an untrained one is N(0, I)."""
-    options = dict(prior="learned", full_encoder=True, residual="distance")
-    model = TSM(dx, DU, angles=ANGLES, **options, **SMALL)
-    nn.init.normal_(model.code_prior.project.weight, std=0.1)
-    return model
-
-
-TSM_LOSSES = (("loss", ()), ("teacher_forced_loss", ()), ("energy_loss", ("encoder",)))
+TSM_LOSSES = (
+    ("loss", ()),
+    ("teacher_forced_loss", ()),
+    ("energy_loss", ("encoder",)),
+    ("encoder_loss", ("decoder",)),
+)
 SAME = dict(losses=TSM_LOSSES, recall=by_code)
 ANGLES = (0, 1)  # as the arm's
 SMALL = dict(channels=8, segment_len=10, beta=0.1)
@@ -88,7 +82,6 @@ MODELS = {
         constant=(6, 7, 8, 9),
         **SAME,
     ),
-    "tsm, learned prior": Case(with_learned_prior, foresees=True, **SAME),
     "onestep": Case(
         lambda dx: OneStep(dx, DU, angles=ANGLES, hidden=16, layers=2),
         stochastic=False,
@@ -214,8 +207,7 @@ def test_an_action_changes_no_state_before_it(case: Case, k: int) -> None:
     before, after = (
         rollout(model, past, u, generator=generator()) for u in (future.actions, other)
     )
-    begun = k - k % model.segment_len if case.foresees else k
-    assert torch.equal(before[:, :begun], after[:, :begun])
+    assert torch.equal(before[:, :k], after[:, :k])
     moving = [d for d in range(case.state_dim) if d not in case.constant]
     assert (before[:, k] != after[:, k])[
         :, moving
@@ -366,11 +358,9 @@ def test_a_predicted_segment_is_differentiable_in_its_code(name: str) -> None:
 
 def test_every_loss_is_differentiable_in_every_parameter_it_uses(case: Case) -> None:
     model = case.model()
-    # One term of a learned prior holds the posterior fixed, and with it the past it reads.
-    held, segments = (("encoder",), 1) if case.foresees else ((), 2)
-    seen = window(case, model.past_len, segments * model.segment_len)
+    seen = window(case, model.past_len, 2 * model.segment_len)
     for loss, unused in case.losses:
-        used = parameters(model, but=(*unused, *held))
+        used = parameters(model, but=unused)
         assert_gradient(
             lambda loss=loss: getattr(model, loss)(seen, generator()), list(used.values())
         )
@@ -501,8 +491,7 @@ def test_one_code_is_one_future(name: str) -> None:
     torch.testing.assert_close(states[:2], states[2:], rtol=1e-12, atol=1e-12)
     assert (states[0] - states[1]).abs().max() > 1e-3
     mode = model.predict_segment(past, actions)
-    z = model.draw(past, actions) if isinstance(model, TSM) else torch.zeros(4, 8).double()
-    assert torch.equal(mode, model.decode(past, actions, z))
+    assert torch.equal(mode, model.decode(past, actions, torch.zeros(4, 8).double()))
 
 
 def test_what_never_moves_stays_exactly_where_it_is(case: Case) -> None:

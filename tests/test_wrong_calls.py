@@ -45,11 +45,8 @@ KINDS = {name: getattr(tsmlib, name) for name in SMALL}
 MORE = {  # arguments beside those above
     "TSM": dict(
         beta=1.0,
-        full_encoder=False,
         head_channels=0,
         plain=False,
-        prior="normal",
-        residual="square",
     ),
     "Ensemble": dict(gaussian=True),
     "ActionPrior": dict(beta=0.03),

@@ -88,7 +88,6 @@ class ModelSpec:
         budget: seconds of training of its own, in place of the environment's.
         planned: whether figure 6 plans with it.
         pushing: its stages there, where they differ.
-        begins: word of the model whose decoder it begins with (``TSM.take_decoder``).
     """
 
     word: str
@@ -100,7 +99,6 @@ class ModelSpec:
     budget: float | None = None
     planned: bool = False
     pushing: tuple[Stage, ...] = ()
-    begins: str = ""
 
     def load(self) -> type[torch.nn.Module]:
         """The class."""
@@ -142,12 +140,6 @@ def _wide(env: EnvSpec) -> dict[str, Json]:
     return {"channels": 64, "head_channels": 128} if env.has_block else {}
 
 
-def _alive(env: EnvSpec) -> dict[str, Json]:
-    """Codes that carry something."""
-    options: dict[str, Json] = {"prior": "learned", "residual": "distance", "beta": 0.05}
-    return _wide(env) | options | {"full_encoder": True}
-
-
 # The models, in the order in which they are drawn: Okabe and Ito's colours, distinct with any
 # colour vision ----------------------------------------------------------------------------------
 
@@ -163,16 +155,27 @@ def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
     return ModelSpec(word, look, _TSM, _PAPER, lambda env: _wide(env) | arguments, "choice")
 
 
+_LIVE = (  # the paper's loss, the energy score of samples, and an encoder of what became of it
+    _PAPER[0],
+    Stage(Updates("loss", 1, batch=128, muon=_SLOW, span=(0.0, 0.3)), (25, 16), 0.225),
+    Stage(Updates("energy_loss", 1, batch=128, muon=_SLOW, span=(0.3, 1.0)), (18, 12), 0.525),
+    Stage(Updates("encoder_loss", 1, batch=128, muon=_SLOW), (25, 16), 0.05),
+)
 _H20 = _choice(  # receptive field 2 H
     "tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)
 )
 _LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
-_REVIVED = (
-    Stage(Updates("loss", 1, lr=1e-3, batch=128, muon=_SLOW), (16, 10), 0.5),
-    Stage(Updates("energy_loss", 1, lr=1e-3, batch=128, muon=_SLOW), (8, 5), 0.5),
-)
 _MODELS = (
     ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
+    ModelSpec(  # the paper's N(0, I) with codes in use: a smaller beta, chosen on validation
+        "tsm+codes",
+        Look("TSM, codes in use", "#1F77B4", "<"),
+        _TSM,
+        _LIVE,
+        lambda env: _wide(env) | {"beta": 0.3},
+        "ablation",
+        planned=True,
+    ),
     ModelSpec(
         "rtsm",
         Look("recurrent TSM", "#0B2F8A", "*"),
@@ -180,28 +183,6 @@ _MODELS = (
         _recurrent(0.01),
         planned=True,
         pushing=_recurrent(0.005),
-    ),
-    ModelSpec(  # the paper's N(0, I) with codes in use: a smaller beta, chosen on validation
-        "tsm+codes",
-        Look("TSM, codes in use", "#1F77B4", "<"),
-        _TSM,
-        _REVIVED,
-        lambda env: _wide(env) | {"beta": 0.3},
-        "ablation",
-        budget=200.0,
-        planned=True,
-        begins="tsm",
-    ),
-    ModelSpec(  # codes with a learned prior, then the energy score of samples from it
-        "tsm+prior",
-        Look("TSM + code prior", "#2E86C1", ">"),
-        _TSM,
-        _REVIVED,
-        _alive,
-        "ablation",
-        budget=200.0,
-        planned=True,
-        begins="tsm",
     ),
     ModelSpec(  # the energy score in place of squared error and KL
         "tsm+energy",

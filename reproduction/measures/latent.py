@@ -15,7 +15,7 @@ from torch import Tensor
 from reproduction.measures.futures import Coded, SampledFutures
 from tsmlib.evaluation import prediction, scoring
 from tsmlib.models.features import Features
-from tsmlib.models.layers import kl_divergence, sample_posterior
+from tsmlib.models.layers import kl_from_standard_normal, sample_posterior
 from tsmlib.models.tsm import TSM
 from tsmlib.sampling import standard_normal
 from tsmlib.trajectory import Segment, Window
@@ -24,16 +24,14 @@ from tsmlib.trajectory import Segment, Window
 ACTIVE = 0.01
 
 
-def kl_by_dimension(mean: Tensor, log_variance: Tensor, *prior: Tensor) -> Tensor:
-    """KL(Q(Z_i) || P(Z_i)) in nats of each code dimension and segment, (N, dz).
+def kl_by_dimension(mean: Tensor, log_variance: Tensor) -> Tensor:
+    """KL(Q(Z_i) || N(0, 1)) in nats of each code dimension and segment, (N, dz).
 
     Args:
         mean: (N, dz), of the encoder.
         log_variance: (N, dz).
-        prior: the same two of ``TSM.prior``; none for N(0, I).
     """
-    m, log_v = prior or (torch.zeros_like(mean), torch.zeros_like(mean))
-    return kl_divergence(*(part[..., None] for part in (mean, log_variance, m, log_v)))
+    return kl_from_standard_normal(mean[..., None], log_variance[..., None])
 
 
 def active_units(mean: Tensor) -> Tensor:
@@ -50,7 +48,9 @@ def total_effects(model: Coded, window: Window, generator: torch.Generator) -> T
     part in it.
     """
     past, actions = window.past, window.future.actions[:, : model.code_len]
-    z, again = (_drawn(model, past, actions, generator) for _ in range(2))
+    z, again = (
+        standard_normal((len(actions), model.latent_dim), generator, actions) for _ in range(2)
+    )
     states = model.decode(past, actions, z)
     moved = []
     for i in range(model.latent_dim):
@@ -64,14 +64,14 @@ def total_effects(model: Coded, window: Window, generator: torch.Generator) -> T
 def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> dict[str, Tensor]:
     """Error (N,) of the next segment, root mean square over features and steps, by its code.
 
-    ``posterior``: drawn from Q, which has seen the segment; ``prior``: drawn from the prior;
-    ``zero``: the prior's mean, which is z = 0 of N(0, I).
+    ``posterior``: drawn from Q, which has seen the segment; ``prior``: drawn from N(0, I);
+    ``zero``: z = 0.
     """
     future = Segment(*(part[:, : model.code_len] for part in window.future))
     codes = {
-        "posterior": sample_posterior(*model.posterior(window.past, future), generator),
-        "prior": model.draw(window.past, future.actions, generator=generator),
-        "zero": model.draw(window.past, future.actions),
+        "posterior": sample_posterior(*model.encode(future.states), generator),
+        "prior": model.draw(window.past, generator),
+        "zero": model.draw(window.past, None),
     }
     errors = {}
     for word, z in codes.items():
@@ -80,13 +80,6 @@ def reconstruction(model: TSM, window: Window, generator: torch.Generator) -> di
         )
         errors[word] = difference.square().mean((1, 2)).sqrt()
     return errors
-
-
-def _drawn(model: Coded, past: Segment, actions: Tensor, generator: torch.Generator) -> Tensor:
-    """Codes (N, dz) of the model's prior."""
-    if isinstance(model, TSM):
-        return model.draw(past, actions, generator=generator)
-    return standard_normal((len(actions), model.latent_dim), generator, actions)
 
 
 def deviations(seen: SampledFutures, features: Features) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ class Rollout(nn.Module):
     def _segment(self, past: Segment, moves: Tensor) -> Tensor:
         if not isinstance(self.model, TSM):
             return predict_segment(self.model, past, moves)
-        step = self.model.begin(past, planned=moves)  # operations that can be traced
+        step = self.model.begin(past)  # operations that can be traced
         return torch.stack([step(u) for u in moves.unbind(1)], dim=1)
 
 
