@@ -167,9 +167,9 @@ _H20 = _choice(  # receptive field 2 H
 _LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
 _MODELS = (
     ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
-    ModelSpec(  # the paper's N(0, I) with codes in use: a smaller beta, chosen on validation
+    ModelSpec(  # the same network, half of the time on its own samples; beta by validation
         "tsm+codes",
-        Look("TSM, codes in use", "#1F77B4", "<"),
+        Look("TSM, trained on samples", "#1F77B4", "<"),
         _TSM,
         _LIVE,
         lambda env: _wide(env) | {"beta": 0.3},

@@ -66,7 +66,7 @@ class Verdict:
         if self.claim.definition:
             return "true by definition"
         if self.claim.untested:
-            return "not tested with codes in use"
+            return "not tested"
         if any(not control.holds for control in self.controls):
             return "not testable"
         hold, fail, _ = self.counts
@@ -80,7 +80,7 @@ class Verdict:
         if self.claim.definition:
             return f"True by definition. {self.claim.definition}"
         if self.claim.untested:
-            return f"Not tested with codes in use. {self.claim.untested}"
+            return f"Not tested. {self.claim.untested}"
         if self.word == "not testable":
             return f"Not testable. {self.claim.note}"
         hold, places = self.counts[0], dict[str, list[bool | None]]()
