@@ -56,9 +56,7 @@ def agree(found: Tensor, expected: Tensor, device: str) -> bool:
     )
 
 
-@pytest.fixture(
-    params=["tsm", "tsm, state skip", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"]
-)
+@pytest.fixture(params=["tsm", "onestep", "lstm", "ensemble", "ensemble+mse, obstacle"])
 def case(request: pytest.FixtureRequest) -> Case:
     return MODELS[request.param]
 
