@@ -30,7 +30,7 @@ from tsmlib.trajectory import Trajectories
 from tsmlib.zoo import find
 
 EPISODES = 1450  # of play, a quarter of the shipped model's
-SECONDS = 45.0
+SECONDS = 200.0
 WORDS = ("egocentric", "world", "rtsm", "onestep", "tsm", "lstm", "ensemble+mse")
 SEARCH = {"candidates": 64, "elites": 8, "iterations": 3}
 Stages = list[tuple[str, TrainingOptions, float]]  # loss, options, share of the seconds
