@@ -1,12 +1,12 @@
-"""What the codes of TSM carry, and what its samples are worth: data/results/64_codes.csv.
+"""What the codes of TSM carry, and what its samples are worth: data/results/codes.csv.
 
     python benchmarks/codes.py
 
-Models of the three MuJoCo arms, shipped or made (TSM_RUN_DIR), on 300 fresh episodes, 16 samples,
-90 steps after 10. Energy score and its median over episodes, in deviations of the data, the smaller
-the better; what 80 % intervals hold; and of a model with an encoder the nats of a segment's code,
-its active dimensions and how far another code moves the next segment. ``ahead of ...``: the share
-of episodes on which a segment model has the smaller energy score, and half its 95 % interval.
+Shipped models of the three MuJoCo arms on 300 fresh episodes, 16 samples, 90 steps after 10. Energy
+score and its median over episodes, in deviations of the data, the smaller the better; what 80 %
+intervals hold; and of a model with an encoder the nats of a segment's code, its active dimensions
+and how far another code moves the next segment. ``ahead of ...``: the share of episodes on which a
+segment model has the smaller energy score.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from pathlib import Path
 import torch
 
 import tsmlib
-from reproduction.episodes import load_model, random_data
+from reproduction.episodes import random_data
 from reproduction.measures import latent
-from reproduction.runs import Run, env_id
+from reproduction.runs import env_id
 from tsmlib.evaluation import scoring
-from tsmlib.pretrained import PRETRAINED
 from tsmlib.trajectory import Trajectories
 
-TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "64_codes.csv"
+TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "codes.csv"
 ARMS = ("Reacher", "ReacherObstacle", "ReacherPush")
 BASELINES = ("onestep", "multistep", "lstm")
 MODELS = ("tsm", "tsm+codes", "rtsm")
@@ -47,16 +46,6 @@ def scores(model: torch.nn.Module, data: Trajectories) -> tuple[dict[str, float]
         "coverage of 80 %": float(held.mean()) if several else float("nan"),
     }
     return means, energy.mean(1)
-
-
-def ahead(own: torch.Tensor, rivals: dict[str, torch.Tensor]) -> dict[str, float]:
-    """Shares of episodes on which a score is smaller than those of others."""
-    found = dict[str, float]()
-    for word, other in rivals.items():
-        share = float((own < other).float().mean())
-        found[f"ahead of {word}"] = share
-        found[f"ahead of {word}, half"] = 1.96 * (share * (1 - share) / len(own)) ** 0.5
-    return found
 
 
 @torch.no_grad()
@@ -83,25 +72,19 @@ def rows() -> Iterator[dict[str, str]]:
         data = random_data(env_id(arm), EPISODES, seed=SEED)
         rivals = dict[str, torch.Tensor]()
         for word in (*BASELINES, *MODELS):
-            if (model := load(arm, word)) is None:
-                continue
+            model = tsmlib.load_pretrained(word, env=env_id(arm))
             found, each = scores(model, data)
             if word in BASELINES:
                 rivals[word] = each
             else:
-                found |= ahead(each, rivals)
+                shares = {
+                    rival: float((each < other).float().mean()) for rival, other in rivals.items()
+                }
+                found |= {f"ahead of {rival}": share for rival, share in shares.items()}
             if isinstance(model, tsmlib.TSM):
                 found |= codes(model, data)
             spelled = {name: f"{value:.4g}" for name, value in found.items() if value == value}
             yield {"arm": arm, "model": word} | spelled
-
-
-def load(arm: str, word: str) -> torch.nn.Module | None:
-    """A model that ships, or that was made at scale paper with seed 0; None without either."""
-    if (PRETRAINED / arm / f"{word}.safetensors").exists():
-        return tsmlib.load_pretrained(word, env=env_id(arm))
-    run = Run("paper", 0)
-    return load_model(run, arm, word) if run.path(f"models/{arm}/{word}").exists() else None
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How often the executed return of a chosen plan lies in its 90 % interval: 68_conformal.csv.
+"""How often the executed return of a chosen plan lies in its 90 % interval: conformal.csv.
 
     python benchmarks/conformal.py
 
@@ -22,7 +22,7 @@ from tsmlib.evaluation.conformal import Conformal
 from tsmlib.planning.tasks import Task
 from tsmlib.pretrained import draw_task, load_pusht
 
-TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "68_conformal.csv"
+TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "conformal.csv"
 ARMS = ("tsm/Reacher-v0", "tsm/ReacherPush-v1")
 FRESH, SEED, LEVEL, STEPS = 200, 1_000_068, 0.9, 25
 SEARCH = {"candidates": 64, "elites": 8, "iterations": 4}

@@ -21,7 +21,7 @@ from tsmlib.statistics import interval
 
 BASELINES = ("onestep", "multistep", "lstm")
 OURS = ("tsm+codes", "tsm", "rtsm")
-SUBJECTS = {"tsm+codes": "TSM, trained on samples", "rtsm": "recurrent TSM"}
+SUBJECTS = ("tsm+codes", "rtsm")
 Tables = Callable[[str], pd.DataFrame]
 
 
@@ -72,26 +72,22 @@ def ahead(tables: Tables = results) -> Figure:
     over seeds. The interval resamples episodes or targets; half of them is level.
     """
     panels: dict[str, dict[str, np.ndarray]] = {}
-    episodes = pd.read_csv(RESULTS / "64_codes.csv").set_index(["arm", "model"])
+    episodes = pd.read_csv(RESULTS / "codes.csv").set_index(["arm", "model"])
     for arm, title in ARMS.items():
-        for subject, name in SUBJECTS.items():
-            line = episodes.loc[(arm, subject)]
-            for rival in BASELINES:
-                share, half = line[f"ahead of {rival}"], line[f"ahead of {rival}, half"]
-                panels.setdefault(f"{title}: predictions of {name}", {})[rival] = _share(
-                    share, half
-                )
+        for subject in SUBJECTS:
+            line, panel = episodes.loc[(arm, subject)], f"{title}: predictions of {_name(subject)}"
+            panels[panel] = {word: _share(line[f"ahead of {word}"], 300) for word in BASELINES}
     rows = select(
         tables("05_control_rows"), planner="cem", execution="open loop", search_space="latent"
     )
     rows = select(rows, env=PLACES["ReacherPush"])
-    for subject, name in SUBJECTS.items():
+    for subject in SUBJECTS:
         own = _by_target(rows, subject, "return_true")
+        panel = panels.setdefault(f"pushing: plans through {_name(subject)}", {})
         for rival in BASELINES:
             other = _by_target(rows, rival, "return_true")
             share = float(np.mean((own > other) + 0.5 * (own == other)))
-            half = 1.96 * np.sqrt(share * (1 - share) / len(own))
-            panels.setdefault(f"pushing: plans through {name}", {})[rival] = _share(share, half)
+            panel[rival] = _share(share, len(own))
     label = "share of episodes, or targets, on which it is ahead"
     figure = plots.forest(panels, x_label=label, reference=0.5, better="right", columns=2)
     for ax in figure.axes:
@@ -137,8 +133,13 @@ def rounds(tables: Tables = results) -> Figure:
     return figure
 
 
-def _share(share: float, half: float) -> np.ndarray:
-    """Low, middle and high of a share."""
+def _name(word: str) -> str:
+    return zoo.look(word).name
+
+
+def _share(share: float, n: int) -> np.ndarray:
+    """A share of n with its 95 % interval: low, middle and high."""
+    half = 1.96 * np.sqrt(share * (1 - share) / n)
     return np.array([max(0.0, share - half), share, min(1.0, share + half)])
 
 
