@@ -27,7 +27,7 @@ from tsmlib.trajectory import Trajectories
 TABLE = Path(__file__).resolve().parents[1] / "data" / "results" / "codes.csv"
 ARMS = ("Reacher", "ReacherObstacle", "ReacherPush")
 BASELINES = ("onestep", "multistep", "lstm")
-MODELS = ("tsm", "tsm+codes", "rtsm")
+MODELS = ("tsm", "rtsm")
 SEED, EPISODES, SAMPLES, START, STEPS = 1_000_064, 300, 16, 10, 90
 
 

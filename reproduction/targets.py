@@ -39,8 +39,8 @@ FILTERED = ("tsm", "rtsm", *BASELINES, "none", "filter", "exponential")
 
 
 def _scores(run: Run) -> list[str]:
-    whole = (*zoo.words("dynamics"), "tsm+codes")
-    pairs = product(ARMS, run.pick(("tsm", "onestep"), zoo.words("dynamics"), whole))
+    words = zoo.words("dynamics")
+    pairs = product(ARMS, run.pick(("tsm", "onestep"), words, words))
     return [f"scores/{arm}/{word}" for arm, word in pairs]
 
 
@@ -53,11 +53,6 @@ def _ablation(run: Run) -> list[str]:
     return [f"scores/ReacherPush/{word}" for word in words]
 
 
-def _codes(run: Run) -> list[tuple[str, str]]:
-    words = run.pick(("tsm",), ("tsm",), ("tsm", "tsm+codes"))
-    return [*product(ARMS, words), ("ReacherPush", "rtsm")]
-
-
 def plans_of(run: Run, arm: str) -> list[str]:
     """The plans of table 05, by name."""
     words = run.pick(
@@ -67,8 +62,7 @@ def plans_of(run: Run, arm: str) -> list[str]:
     )
     names = [f"{word}-{space}-cem" for word in words for space in ("latent", "direct")]
     if run.scale == "paper":
-        pairs = product(("latent", "direct"), ("adam", "adam+starts"))
-        names += [f"tsm-{space}-{planner}" for space, planner in pairs]
+        names += [f"tsm-{space}-adam+starts" for space in ("latent", "direct")]
         names.append("tsm-latent-adam-iterations500")
         names += [f"{word}-direct-cem+white" for word in words]
     if arm == "ReacherPush" and run.scale != "laptop":
@@ -82,11 +76,12 @@ def _trials(run: Run) -> list[str]:
 
 
 def policies_of(run: Run) -> list[str]:
-    """The policies of tables 05 and 06: through the prior, and for the paper's model and the
-    baselines direct."""
+    """The policies of tables 05 and 06: through the prior, and for the paper's model, which was
+    trained by its loss alone, and the baselines direct."""
     if run.scale != "paper":
         return ["tsm-latent"]
-    return ["tsm-latent", "tsm-direct", "rtsm-latent", *(f"{word}-direct" for word in BASELINES)]
+    codes, torques = ("tsm+elbo", "rtsm"), ("tsm+elbo", *BASELINES)
+    return [*(f"{word}-latent" for word in codes), *(f"{word}-direct" for word in torques)]
 
 
 def _learning(run: Run, arms: tuple[str, ...]) -> list[str]:
@@ -137,7 +132,7 @@ TABLES: dict[str, Callable[[Run], list[str]]] = {  # name -> the rows that it ho
     "03_predict": _scores,
     "03_episodes": _episodes,
     "03_ablation": _ablation,
-    "04_latent": lambda run: [f"codes/{arm}/{word}" for arm, word in _codes(run)],
+    "04_latent": lambda run: [*(f"codes/{arm}/tsm" for arm in ARMS), "codes/ReacherPush/rtsm"],
     "05_control": lambda run: _trials(run) + _learning(run, ("Reacher", "ReacherPush")),
     "05_control_rows": _trials,
     "06_robustness": _robustness,

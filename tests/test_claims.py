@@ -172,12 +172,6 @@ def test_a_claim_whose_control_fails_is_not_testable() -> None:
     assert ledger.judge(claim, planted(0.2)).word == "not testable"
 
 
-def test_another_model_takes_the_place_of_the_papers() -> None:
-    ours = {claim.id: claim for claim in ledger.claims(subject="rtsm")}
-    assert ours["C32"].comparisons[0].a == "rtsm-direct-cem"
-    assert ours["C10"].comparisons[0].b == "tsm+plain"
-
-
 def test_the_published_findings_are_those_of_the_published_tables() -> None:
     """A part of them is judged again; each line of the table is a comparison of the ledger."""
     table = pd.read_csv(RESULTS / "08_claims.csv")

@@ -108,16 +108,7 @@ class ModelSpec:
 
 # Training stages and arguments -----------------------------------------------------------------
 
-_SLOW = 0.003  # rate of Muon of TSM, which diverges at a higher
-
-
-def _free(loss: str, rates: tuple[float, float]) -> tuple[Stage, Stage]:
-    """Teacher forcing for a quarter of the time, then free-running over two chained segments."""
-    teacher = Updates("teacher_forced_loss", 1, future_len=10, lr=4e-3, muon=_SLOW)
-    return (
-        Stage(teacher, (30, 20), 0.25),
-        Stage(Updates(loss, 1, batch=128, muon=_SLOW), rates, 0.75),
-    )
+_SLOW = 0.003  # rate of Muon of TSM, which diverged at 0.02
 
 
 def _baseline(loss: str, rate: float) -> tuple[Stage]:
@@ -146,34 +137,35 @@ def _wide(env: EnvSpec) -> dict[str, Json]:
 _TSM, _ONE_STEP, _ENSEMBLE = (
     f"tsmlib.models.{name}" for name in ("tsm:TSM", "baselines:OneStep", "ensemble:Ensemble")
 )
-_PAPER = _free("loss", (16, 10.5))
-
-
-def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
-    """One of the paper's choices, changed; as many updates as TSM."""
-    look = Look(f"TSM, {name}", colour)
-    return ModelSpec(word, look, _TSM, _PAPER, lambda env: _wide(env) | arguments, "choice")
-
-
-_LIVE = (  # the paper's loss, the energy score of samples, and an encoder of what became of it
-    _PAPER[0],
+_ELBO = (  # teacher forcing for a quarter of the time, then free-running over two segments
+    Stage(Updates("teacher_forced_loss", 1, future_len=10, lr=4e-3, muon=_SLOW), (30, 20), 0.25),
+    Stage(Updates("loss", 1, batch=128, muon=_SLOW), (16, 10.5), 0.75),
+)
+_SAMPLES = (  # the energy score of samples for most of it, and an encoder of what became of it
+    _ELBO[0],
     Stage(Updates("loss", 1, batch=128, muon=_SLOW, span=(0.0, 0.3)), (25, 16), 0.225),
     Stage(Updates("energy_loss", 1, batch=128, muon=_SLOW, span=(0.3, 1.0)), (18, 12), 0.525),
     Stage(Updates("encoder_loss", 1, batch=128, muon=_SLOW), (25, 16), 0.05),
 )
+
+
+def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
+    """The paper's loss alone, with one of its choices changed; as many updates as without."""
+    look = Look(f"TSM, paper's loss, {name}", colour)
+    return ModelSpec(word, look, _TSM, _ELBO, lambda env: _wide(env) | arguments, "choice")
+
+
 _H20 = _choice(  # receptive field 2 H
     "tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)
 )
-_LONG = replace(_PAPER[0], updates=replace(_PAPER[0].updates, future_len=20))
+_LONG = replace(_ELBO[0], updates=replace(_ELBO[0].updates, future_len=20))
 _MODELS = (
-    ModelSpec("tsm", Look("TSM", "#3D9BE0", "o"), _TSM, _PAPER, _wide, planned=True),
-    ModelSpec(  # the same network, half of the time on its own samples; beta by validation
-        "tsm+codes",
-        Look("TSM, trained on samples", "#1F77B4", "<"),
+    ModelSpec(  # half of the time on its own samples; beta by validation
+        "tsm",
+        Look("TSM", "#3D9BE0", "o"),
         _TSM,
-        _LIVE,
+        _SAMPLES,
         lambda env: _wide(env) | {"beta": 0.3},
-        "ablation",
         planned=True,
     ),
     ModelSpec(
@@ -183,14 +175,6 @@ _MODELS = (
         _recurrent(0.01),
         planned=True,
         pushing=_recurrent(0.005),
-    ),
-    ModelSpec(  # the energy score in place of squared error and KL
-        "tsm+energy",
-        Look("TSM + energy", "#56B4E9", "p"),
-        _TSM,
-        _free("energy_loss", (11, 6.9)),
-        _wide,
-        "ablation",
     ),
     ModelSpec(
         "onestep",
@@ -236,9 +220,12 @@ _MODELS = (
         group="prior",
         budget=100.0,
     ),
+    ModelSpec(
+        "tsm+elbo", Look("TSM, paper's loss", "#56B4E9", "p"), _TSM, _ELBO, _wide, "ablation"
+    ),
     _choice("tsm+plain", "no skip connections", "#6C8EBF", plain=True),
     _choice("tsm+h1", "H = 1", "#A6C8E0", segment_len=1),
-    replace(_H20, stages=(_LONG, _PAPER[1])),
+    replace(_H20, stages=(_LONG, _ELBO[1])),
 )
 ZOO = {spec.word: spec for spec in _MODELS}
 LOOKS = {  # of what is run and drawn beside the models; greys for what is no method

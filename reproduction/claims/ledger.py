@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -97,19 +96,17 @@ class Verdict:
         return f"{said[0].upper()}{said[1:]} {self.claim.note}".strip()
 
 
-def claims(path: Path = LEDGER, *, subject: str = "tsm") -> list[Claim]:
+def claims(path: Path = LEDGER) -> list[Claim]:
     """The claims in the order of the paper; those that rest on others have their comparisons.
 
     Args:
         path: of the ledger.
-        subject: the model in place of the paper's own, such as "rtsm".
 
     Returns:
         The claims.
     """
     found: dict[str, Claim] = {}
-    text = re.sub(r'"tsm(?=["-])', f'"{subject}', path.read_text(encoding="utf-8"))
-    entries = tomllib.loads(text)
+    entries = tomllib.loads(path.read_text(encoding="utf-8"))
     for name, entry in entries.items():
         written = list(entry.pop("compare", []))
         for other in entry.pop("rests_on", []):
