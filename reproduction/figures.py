@@ -83,7 +83,7 @@ def ahead(tables: Tables = results) -> Figure:
     for subject in OURS:
         own = _by_target(rows, subject, "return_true")
         seeds = set(select(rows, model=subject)["seed"])
-        same = rows[rows["seed"].isin(seeds)]  # as many seeds of each, since costs are skewed
+        same = rows[rows["seed"].isin(seeds)]  # the same seeds, since costs are skewed
         panel = panels.setdefault(f"pushing: plans through {_name(subject)}", {})
         for rival in BASELINES:
             other = _by_target(same, rival, "return_true")
@@ -191,11 +191,8 @@ def figure8(tables: Tables = results) -> Figure:
     Means over training seeds with their 95 % intervals; a policy gives torques, or codes.
     """
     rows = select(tables("06_robustness"), planner="policy", metric="success50")
-    kinds = [
-        *((word, "codes") for word in ("tsm+elbo", "rtsm")),
-        *((word, "torques") for word in BASELINES),
-    ]
-    kinds.insert(1, ("tsm+elbo", "torques"))
+    kinds = [("tsm+elbo", "codes"), ("tsm+elbo", "torques"), ("rtsm", "codes")]
+    kinds += [(word, "torques") for word in BASELINES]
     panels: dict[str, dict[str, np.ndarray]] = {}
     for title, place in {
         "noisy sensors: share within 5 cm": {"noise": 0.25, "delay": None},

@@ -141,7 +141,7 @@ _ELBO = (  # teacher forcing for a quarter of the time, then free-running over t
     Stage(Updates("teacher_forced_loss", 1, future_len=10, lr=4e-3, muon=_SLOW), (30, 20), 0.25),
     Stage(Updates("loss", 1, batch=128, muon=_SLOW), (16, 10.5), 0.75),
 )
-_SAMPLES = (  # the energy score of samples for most of it, and an encoder of what became of it
+_SAMPLES = (  # the energy score of samples for half of it; at last the encoder alone
     _ELBO[0],
     Stage(Updates("loss", 1, batch=128, muon=_SLOW, span=(0.0, 0.3)), (25, 16), 0.225),
     Stage(Updates("energy_loss", 1, batch=128, muon=_SLOW, span=(0.3, 1.0)), (18, 12), 0.525),

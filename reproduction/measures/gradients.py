@@ -34,7 +34,7 @@ def relative_errors(
     value: a function of no arguments that gives a number; variables: leaves of type float64 that it
     reads, as they are again afterwards. Each is moved along its gradient plus a random direction.
     steps: so small that the curvature of a long rollout with contacts does not count, whose share
-    falls with their square; the least error of them, since a ReLU may bend within one.
+    falls with their square; the smallest error counts, since a ReLU may bend within one.
     ValueError where the number does not depend on one of them.
     """
     gradients = torch.autograd.grad(value(), variables, allow_unused=True)
