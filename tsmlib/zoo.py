@@ -83,8 +83,8 @@ class ModelSpec:
         cls: ``module:Class``, imported when first used.
         stages: of its training.
         arguments: of the class, beyond the sizes of states and actions.
-        group: dynamics models are compared everywhere; an ablation is TSM with a part put in or
-            taken away, a choice changes one of the paper's; the prior is the prior.
+        group: dynamics models are compared everywhere; an ablation is TSM by the paper's loss
+            alone, a choice that with one of the paper's choices changed; the prior is the prior.
         budget: seconds of training of its own, in place of the environment's.
         planned: whether figure 6 plans with it.
         pushing: its stages there, where they differ.
@@ -137,12 +137,15 @@ def _wide(env: EnvSpec) -> dict[str, Json]:
 _TSM, _ONE_STEP, _ENSEMBLE = (
     f"tsmlib.models.{name}" for name in ("tsm:TSM", "baselines:OneStep", "ensemble:Ensemble")
 )
-_ELBO = (  # teacher forcing for a quarter of the time, then free-running over two segments
-    Stage(Updates("teacher_forced_loss", 1, future_len=10, lr=4e-3, muon=_SLOW), (30, 20), 0.25),
+_TEACHER = Stage(
+    Updates("teacher_forced_loss", 1, future_len=10, lr=4e-3, muon=_SLOW), (30, 20), 0.25
+)
+_ELBO = (  # the paper's loss: true states for a quarter of the time, then its own over two segments
+    _TEACHER,
     Stage(Updates("loss", 1, batch=128, muon=_SLOW), (16, 10.5), 0.75),
 )
 _SAMPLES = (  # the energy score of samples for half of it; at last the encoder alone
-    _ELBO[0],
+    _TEACHER,
     Stage(Updates("loss", 1, batch=128, muon=_SLOW, span=(0.0, 0.3)), (25, 16), 0.225),
     Stage(Updates("energy_loss", 1, batch=128, muon=_SLOW, span=(0.3, 1.0)), (18, 12), 0.525),
     Stage(Updates("encoder_loss", 1, batch=128, muon=_SLOW), (25, 16), 0.05),
@@ -158,7 +161,7 @@ def _choice(word: str, name: str, colour: str, **arguments: Json) -> ModelSpec:
 _H20 = _choice(  # receptive field 2 H
     "tsm+h20", "H = 20", "#1F4E79", segment_len=20, dilations=(1, 2, 4, 8, 16, 8)
 )
-_LONG = replace(_ELBO[0], updates=replace(_ELBO[0].updates, future_len=20))
+_LONG = replace(_TEACHER, updates=replace(_TEACHER.updates, future_len=20))
 _MODELS = (
     ModelSpec(  # half of the time on its own samples; beta by validation
         "tsm",

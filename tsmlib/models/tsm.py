@@ -201,7 +201,7 @@ class TSM(StateModel):
         return self._bound(window, generator, forced=False)
 
     def encoder_loss(self, window: Window, generator: torch.Generator) -> Tensor:
-        """Compute ``loss`` with the decoder held: what ``energy_loss`` made of it is encoded anew.
+        """Compute ``loss`` with the decoder held, so that the encoder alone is trained.
 
         Args:
             window: past (B, L, .) and future (B, n H, .), in physical units; actions in [-1, 1].
