@@ -22,6 +22,7 @@ from tsmlib.planning.base import Plan
 from tsmlib.planning.execution import Trial
 from tsmlib.planning.predictors import JUDGING, expected_predictor, fresh_predictor
 from tsmlib.planning.tasks import Task
+from tsmlib.rewards import push, reach
 from tsmlib.storage import artifacts
 
 KEPT = 4  # samples of the predicted states that a file holds
@@ -31,6 +32,8 @@ TORQUES: dict[str, Callable[[Task], torch.Tensor]] = {
     "zero": Task.idle_actions,
 }
 RMS = 0.1  # of the data's torques
+WHITE = {"smoothness": 0.0}
+NOISE = {"cem+white": WHITE | {"rms": RMS}, "adam+rough": WHITE | {"rms": 0.5}}
 OPEN, CLOSED = "open loop", "closed loop"
 
 
@@ -42,7 +45,8 @@ class How:
         model: a word of the zoo, "oracle" (the simulator), "random" or "zero".
         space: "latent" (Eq. 3) or "direct" (Eq. 2).
         planner: "cem" (noise as smooth as the data, as iCEM), "cem+white", "mppi", "adam" (from
-            zero) or "adam+starts" (from sampled candidates).
+            zero), "adam+starts" (from sampled candidates) or "adam+rough" (from white noise of
+            half of the full torque, or codes of N(0, I), without the penalty of torques).
         every: steps until the arm plans again; 0 executes the plan open loop, as the paper.
         iterations: of the planner; 0 is the scale's own number.
     """
@@ -87,8 +91,7 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
     task = the_task(run, name, how)
     prior = load_prior(run, name) if how.space == "latent" else None
     net = None if how.model == "oracle" else load_model(run, name, how.model)
-    white = how.planner == "cem+white"
-    space = tsmlib.LatentActions(prior, task.horizon) if prior else _direct(task, white=white)
+    space = tsmlib.LatentActions(prior, task.horizon) if prior else _direct(task, how.planner)
     planner = _planner(run, how)
     judge = expected_predictor if how.planner.startswith("cem") else None
     if how.every:
@@ -98,7 +101,7 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
             keep["judge"] = partial(judge, samples=JUDGING)
         done = tsmlib.mpc(task, net, space, planner, **keep).plan
         return replace(done, seconds=first.seconds + done.seconds)
-    began = time.perf_counter()
+    began, reward = time.perf_counter(), task.reward
     start: int | torch.Tensor = len(task)
     if net is None:
         predict = tsmlib.simulator_predictor(task)
@@ -109,7 +112,10 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
     if how.planner == "adam+starts":
         drawn = {"candidates": _candidates(run), "keep": 2, "seed": run.seed}
         start = sampled_starts(predict, task.reward, space, len(task), **drawn)
-    found = planner(predict, task.reward, space, start, progress=f"{name} {plan}")
+    if how.planner == "adam+rough":
+        start = space.scale * space.noise(1, len(task), torch.Generator().manual_seed(run.seed))
+        reward = (push if task.name == "push" else reach)(task.target, torque_weight=0.0)
+    found = planner(predict, reward, space, start, progress=f"{name} {plan}")
     found = replace(found, seconds=time.perf_counter() - began)
     if net is None:
         return found
@@ -234,7 +240,7 @@ def _candidates(run: Run) -> int:
 def _planner(run: Run, how: How) -> Callable[..., Plan]:
     """The planner with its budget; a plan that is made again needs fewer iterations."""
     n = _candidates(run)
-    if how.planner in ("adam", "adam+starts"):
+    if how.planner.startswith("adam"):
         usual = run.pick(2, 20, 20) if how.every else run.pick(3, 100, 100)
         return partial(tsmlib.adam, iterations=how.iterations or usual)
     usual = run.pick(1, 3, 4) if how.every else run.pick(2, 8, 10)
@@ -244,6 +250,6 @@ def _planner(run: Run, how: How) -> Callable[..., Plan]:
     return partial(tsmlib.cem, elites=max(2, n // 10), screened=SCREENED, **budget)
 
 
-def _direct(task: Task, *, white: bool = False) -> tsmlib.DirectActions:
-    smooth = {"smoothness": 0.0} if white else {}
-    return tsmlib.DirectActions(task.horizon, task.action_dim, rms=RMS, **smooth)
+def _direct(task: Task, planner: str = "") -> tsmlib.DirectActions:
+    noise = NOISE.get(planner, {"rms": RMS})
+    return tsmlib.DirectActions(task.horizon, task.action_dim, **noise)

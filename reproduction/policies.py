@@ -57,12 +57,12 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
     else:
         policy = tsmlib.OneStepPolicy(dx, du, **how)
     policy.features.fit(data)
-    n = run.pick(4, 300, 2200)
+    n = run.pick(4, 300, 2200 if task.name == "reach" else 880)
     options = tsmlib.LearningOptions(
         horizon=task.horizon,
         iterations=n,
         episodes=run.pick(4, 20, 20),
-        record_every=max(1, n // 10),
+        record_every=run.pick(1, 30, 220),
     )
     if space == "value":
         n = run.pick(4, 500, 3000)

@@ -35,6 +35,8 @@ ARMS = ("Reacher", "ReacherObstacle", "ReacherPush")
 EVERY_ARM = tuple(EnvSpec.parse(env).name for env in ENV_IDS)
 BASELINES = ("onestep", "multistep", "lstm")
 IMPERFECT = ("Reacher-noise0.25", "Reacher-delay5")
+SPACES = ("latent", "direct")
+ADAM = ("adam+starts", "adam+rough")
 
 
 def _scores(run: Run) -> list[str]:
@@ -59,11 +61,10 @@ def plans_of(run: Run, arm: str) -> list[str]:
         ("rtsm", "onestep"),
         tuple(word for word, spec in zoo.ZOO.items() if spec.planned),
     )
-    names = [f"{word}-{space}-cem" for word in words for space in ("latent", "direct")]
+    names = [f"{word}-{space}-cem" for word, space in product(words, SPACES)]
     if run.scale == "paper":
-        names += [f"tsm-{space}-adam+starts" for space in ("latent", "direct")]
-        names.append("tsm-latent-adam-iterations500")
-        names += [f"{word}-direct-cem+white" for word in words]
+        names += [f"tsm-{space}-{planner}" for space, planner in product(SPACES, ADAM)]
+        names += ["tsm-latent-adam-iterations500", "tsm-direct-cem+white"]
     if arm == "ReacherPush" and run.scale != "laptop":
         names += [f"{word}-latent-cem-every10" for word in (*words, "oracle")]
     return [*names, "oracle-latent-cem", "zero", "random"]
@@ -99,9 +100,9 @@ def _robustness(run: Run) -> list[str]:
 
 def _torques(run: Run) -> list[str]:
     words = run.pick(("tsm",), ("oracle",), ("tsm", "rtsm", "oracle"))
-    sources = [f"{word}-{space}-cem" for word in words for space in ("latent", "direct")]
+    sources = [f"{word}-{space}-cem" for word, space in product(words, SPACES)]
     if run.scale == "paper":
-        sources += ["tsm-latent-adam+starts", "tsm-direct-adam+starts"]
+        sources += [f"tsm-{space}-{planner}" for space, planner in product(SPACES, ADAM)]
     sources += ["data", "sampled", "reconstructed"]
     names = [f"torques/{arm}/{s}" for arm, s in product(("Reacher", "ReacherPush"), sources)]
     return names + [f"signals/{arm}/tsm" for arm in ("Reacher", "ReacherPush")]

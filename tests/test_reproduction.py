@@ -156,6 +156,7 @@ EXAMPLES = (  # one target of each kind
     "filters/Reacher-noise0.25/filter",
     "plans/Reacher/tsm-latent-cem",
     "plans/Reacher/tsm-latent-cem-every10",
+    "plans/Reacher/tsm-direct-adam+rough",
     "trials/Reacher/tsm-latent-cem",
     "trials/Reacher/zero",
     "torques/Reacher/sampled",
