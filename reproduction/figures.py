@@ -191,7 +191,7 @@ def figure8(tables: Tables = results) -> Figure:
     Means over training seeds with their 95 % intervals; a policy gives torques, or codes.
     """
     rows = select(tables("06_robustness"), planner="policy", metric="success50")
-    kinds = [("tsm+elbo", "codes"), ("tsm+elbo", "torques"), ("rtsm", "codes")]
+    kinds = [("tsm", "codes"), ("tsm", "torques"), ("rtsm", "codes")]
     kinds += [(word, "torques") for word in BASELINES]
     panels: dict[str, dict[str, np.ndarray]] = {}
     for title, place in {

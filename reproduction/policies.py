@@ -57,7 +57,7 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
     else:
         policy = tsmlib.OneStepPolicy(dx, du, **how)
     policy.features.fit(data)
-    n = run.pick(4, 300, 2200 if task.name == "reach" else 880)
+    n = run.pick(4, 300, 2200 if name == "Reacher" else 880)
     options = tsmlib.LearningOptions(
         horizon=task.horizon,
         iterations=n,
