@@ -22,8 +22,15 @@ NATS = 0.1  # per step: log-likelihoods
 DRAWS, LEVEL = 2000, 0.95  # of the bootstrap
 
 COSTS = ("return_true", "return_predicted", "gap")
-LOWER = ("gap", "final_distance", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged")
-LOWER += ("moves_untouched", "penetrates", "violations_worst", "error_prior", "error_posterior")
+LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged")
+LOWER += (
+    "final_distance",
+    "moves_untouched",
+    "penetrates",
+    "violations_worst",
+    "error_prior",
+    "error_posterior",
+)
 SIZES = ("exploitation_gap",)  # taken without their sign
 RATIOS = ("gradient_snr", "samples_to_90")  # compared by their logarithms
 LOWER += SIZES
