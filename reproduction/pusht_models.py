@@ -61,7 +61,7 @@ def train(
     seed: int,
 ) -> tuple[int, float]:
     """As many updates as fit in the seconds, by the time that a few take: updates and seconds."""
-    total, spent, left = 0, 0.0, 1.0
+    total, spent, left = 0, 0.0, sum(share for *_, share in parts)
     for loss, options, share in parts:
         trial = copy.deepcopy(model)
         marks = []
