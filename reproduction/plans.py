@@ -32,8 +32,10 @@ TORQUES: dict[str, Callable[[Task], torch.Tensor]] = {
     "zero": Task.idle_actions,
 }
 RMS = 0.1  # of the data's torques
-WHITE = {"smoothness": 0.0}
-NOISE = {"cem+white": WHITE | {"rms": RMS}, "adam+rough": WHITE | {"rms": 0.5}}
+NOISE = {  # of torques, by planner
+    "cem+white": {"rms": RMS, "smoothness": 0.0},
+    "adam+rough": {"rms": 0.5, "smoothness": 0.0},
+}
 OPEN, CLOSED = "open loop", "closed loop"
 
 

@@ -76,8 +76,8 @@ def _trials(run: Run) -> list[str]:
 
 
 def policies_of(run: Run, arm: str) -> list[str]:
-    """The policies of tables 05 and 06: through the prior, and direct. Those of pushing that are
-    published are of ``tsm+elbo``, the paper's model by the paper's loss alone."""
+    """The policies of tables 05 and 06, through the prior and direct. At paper scale those of
+    pushing are of ``tsm+elbo``, by the paper's loss alone."""
     if run.scale != "paper":
         return ["tsm-latent"]
     ours = "tsm+elbo" if arm == "ReacherPush" else "tsm"

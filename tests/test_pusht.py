@@ -301,13 +301,12 @@ def test_the_shipped_model_predicts_a_second_of_play_within_pixels(data):
     assert off.median() < 2
 
 
-def test_stages_with_shares_above_one_are_trained_within_the_seconds(data):
+def test_stages_whose_shares_add_up_to_more_than_one_are_all_trained(data):
     net = tsmlib.OneStep.for_data(data, hidden=8)
     few = tsmlib.TrainingOptions(past_len=1, future_len=2, batch_size=8, warmup=1)
     parts = [("loss", few, 0.5), ("loss", few, 0.5), ("loss", few, 0.05)]
-    updates, spent = pusht_models.train(net, parts, data, data, 0.0, 0)
+    updates, _ = pusht_models.train(net, parts, data, data, 0.0, 0)
     assert updates == 20 * len(parts)
-    assert spent > 0
 
 
 def test_the_tables_command_goes_from_play_to_rows_and_makes_none_twice(tmp_path):

@@ -22,18 +22,11 @@ NATS = 0.1  # per step: log-likelihoods
 DRAWS, LEVEL = 2000, 0.95  # of the bootstrap
 
 COSTS = ("return_true", "return_predicted", "gap")
-LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged")
-LOWER += (
-    "final_distance",
-    "moves_untouched",
-    "penetrates",
-    "violations_worst",
-    "error_prior",
-    "error_posterior",
-)
 SIZES = ("exploitation_gap",)  # taken without their sign
 RATIOS = ("gradient_snr", "samples_to_90")  # compared by their logarithms
-LOWER += SIZES
+LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged", *SIZES)
+LOWER += ("final_distance", "moves_untouched", "penetrates", "violations_worst")
+LOWER += ("error_prior", "error_posterior")
 PLACES = {"Reacher": "tsm/Reacher-v0", "ReacherObstacle": "tsm/ReacherObstacle-v0"}
 PLACES |= {"ReacherPush": "tsm/ReacherPush-v1"}
 Tables = Callable[[str], pd.DataFrame]
