@@ -111,11 +111,12 @@ def make_plan(run: Run, name: str, plan: str) -> Plan:
         predict = judge(net, task.past(net.past_len), samples=JUDGING, seed=run.seed)
     else:
         predict = tsmlib.model_predictor(net, task.past(net.past_len), seed=run.seed)
-    if how.planner == "adam+starts":
-        drawn = {"candidates": _candidates(run), "keep": 2, "seed": run.seed}
+    rough = how.planner == "adam+rough"
+    if rough or how.planner == "adam+starts":
+        count, keep = (1, 1) if rough else (_candidates(run), 2)
+        drawn = {"candidates": count, "keep": keep, "seed": run.seed}
         start = sampled_starts(predict, task.reward, space, len(task), **drawn)
-    if how.planner == "adam+rough":
-        start = space.scale * space.noise(1, len(task), torch.Generator().manual_seed(run.seed))
+    if rough:
         reward = (push if task.name == "push" else reach)(task.target, torque_weight=0.0)
     found = planner(predict, reward, space, start, progress=f"{name} {plan}")
     found = replace(found, seconds=time.perf_counter() - began)

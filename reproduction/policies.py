@@ -62,7 +62,7 @@ def make_policy(run: Run, name: str, policy_name: str, path: Path) -> Policy:
         horizon=task.horizon,
         iterations=n,
         episodes=run.pick(4, 20, 20),
-        record_every=run.pick(1, 30, 220),
+        record_every=run.pick(1, 30, 110),
     )
     if space == "value":
         n = run.pick(4, 500, 3000)

@@ -23,8 +23,8 @@ DRAWS, LEVEL = 2000, 0.95  # of the bootstrap
 
 COSTS = ("return_true", "return_predicted", "gap")
 SIZES = ("exploitation_gap",)  # taken without their sign
-RATIOS = ("gradient_snr", "samples_to_90")  # compared by their logarithms
-LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "samples_to_90", "diverged", *SIZES)
+RATIOS = ("gradient_snr",)  # compared by their logarithms
+LOWER = ("gap", "energy_score_noise", "nrmse", "rmse_clean", "diverged", *SIZES)
 LOWER += ("final_distance", "moves_untouched", "penetrates", "violations_worst")
 LOWER += ("error_prior", "error_posterior")
 PLACES = {"Reacher": "tsm/Reacher-v0", "ReacherObstacle": "tsm/ReacherObstacle-v0"}
